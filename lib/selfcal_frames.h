@@ -1,5 +1,5 @@
 /* The telemetry frame format in numbers. selfcal.dbc describes every item.
- * Generated: python -m selfcal.frames_codegen. Do not edit. */
+ * Generated: python -m selfcal.wire.frames_codegen. Do not edit. */
 #ifndef SELFCAL_FRAMES_H
 #define SELFCAL_FRAMES_H
 

@@ -11,9 +11,9 @@ NOT_ALL := ACCEPT=1 takes the figures of all images as they are: no TARGET, no S
 # The default sensor is the default model's; another one has a part's file that begins with its name.
 OTHER_SENSOR := $(filter-out adis16405,$(SENSOR))
 IMAGES = $(BUILD)/$(1)$(OTHER_SENSOR:%=-%)
-PART := tools/selfcal/models/parts/$(OTHER_SENSOR)
+PART := tools/selfcal/model/models/parts/$(OTHER_SENSOR)
 SENSOR_MODEL := $(firstword $(if $(OTHER_SENSOR),$(wildcard $(PART)*.yaml) $(PART).yaml) \
-                            tools/selfcal/models/default.yaml)
+                            tools/selfcal/model/models/default.yaml)
 
 firmware: setup-dev firmware-images $(if $(ACCEPT),bench-images)
 	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(BOARDS)))$(BIN)/python tests/bench/image_sizes.py \

@@ -25,11 +25,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.engines.library import Bank
-from selfcal.model import Handling, Model
+from selfcal.bank.library import Bank
+from selfcal.model.file import Handling, Model
+from selfcal.model.tables import Tables, make_tables
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
-from selfcal.tables import Tables, make_tables
-from selfcal.wire import choices
+from selfcal.wire.frames import choices
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")
 LAWS = ("constant", "random_walk", "gauss_markov")

@@ -24,10 +24,10 @@ import pytest
 
 import selfcal
 from selfcal import cli
-from selfcal.loaders import Format, child
-from selfcal.loaders.table import Hints
-from selfcal.recording import Recording, load
-from selfcal.result import AxisResult
+from selfcal.bank.result import AxisResult
+from selfcal.logs.loaders import Format, child
+from selfcal.logs.loaders.table import Hints
+from selfcal.logs.recording import Recording, load
 
 # A shell's background job ignores an interrupt, and so would every program that a test starts and interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -167,7 +167,7 @@ needs_multicast = pytest.mark.skipif(not _multicast(), reason="NO MULTICAST: ip 
 
 def _forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
     """As the product's child, without the start of a new Python and of the reader's library for each file."""
-    for module in (f"selfcal.loaders.{one.module}", one.library):
+    for module in (f"selfcal.logs.loaders.{one.module}", one.library):
         if module:
             import_module(module)
     number = os.fork()

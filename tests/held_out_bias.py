@@ -27,16 +27,16 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from selfcal.ahead import Known, error_ahead
-from selfcal.engines.library import Bank
-from selfcal.model import DEFAULT, Model
-from selfcal.recording import as_float, load
-from selfcal.regressors import columns_of, mask_of, offered
-from selfcal.result import HALF_90
-from selfcal.tables import make_tables
+from selfcal.bank.library import Bank
+from selfcal.bank.result import HALF_90
+from selfcal.logs.recording import as_float, load
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.regressors import columns_of, mask_of, offered
+from selfcal.model.tables import make_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
+from selfcal.wire.ahead import Known, error_ahead
 
 LENGTH_S, HORIZONS_S = 2400, (10, 60, 300)
 #: Of real recordings: their names, the rest, the horizons, and the block that shows the bias, s.

@@ -35,14 +35,14 @@ import yaml
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from selfcal.engines.library import Bank
-from selfcal.model import DEFAULT, Group, Model, Prior
-from selfcal.one_over_f import SURE, weigh, with_white
-from selfcal.recording import as_float
-from selfcal.result import AxisResult
-from selfcal.summary import summarize
-from selfcal.tables import Tables, make_tables
-from selfcal.units import FLICKER_FLOOR
+from selfcal.adequacy.one_over_f import SURE, weigh, with_white
+from selfcal.adequacy.summary import summarize
+from selfcal.bank.library import Bank
+from selfcal.bank.result import AxisResult
+from selfcal.base.units import FLICKER_FLOOR
+from selfcal.logs.recording import as_float
+from selfcal.model.file import DEFAULT, Group, Model, Prior
+from selfcal.model.tables import Tables, make_tables
 from selfcal.verbs.identify import identify
 
 Floats = NDArray[np.float64]

@@ -1,4 +1,4 @@
-"""What a warm start gains in the first minutes, and whether its intervals hold (tools/selfcal/warm.py).
+"""What a warm start gains in the first minutes, and whether its intervals hold (tools/selfcal/diagnosis/warm.py).
 
     python tests/warm_start.py --records 400 --seed 1
 
@@ -28,13 +28,13 @@ import yaml
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from selfcal.engines.library import Bank
-from selfcal.model import DEFAULT, Model
-from selfcal.result import HALF_90
-from selfcal.tables import Tables, make_tables
+from selfcal.bank.library import Bank
+from selfcal.bank.result import HALF_90
+from selfcal.diagnosis.warm import RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, load, warmed
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.tables import Tables, make_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.simulate import simulate
-from selfcal.warm import RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, load, warmed
 
 #: The part, gx: deg/s/sqrt(Hz), deg/s^2/sqrt(Hz), deg/s/degC.
 PART = {"N": 0.04, "K": 1.0e-3, "coefficient": 0.1}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from selfcal.laws import PLAIN
+from selfcal.model.laws import PLAIN
 
 from agreement import LIMITS, MODEL, a_record, compare, hold, tables_of
 from conftest import shared_recording

@@ -19,14 +19,14 @@ import yaml
 from scipy import integrate, stats
 from test_docs import assert_alike
 
-from selfcal.engines.library import Bank
-from selfcal.engines.reference import identify_axis
-from selfcal.errors import UserError
-from selfcal.model import DEFAULT, Model, Prior
-from selfcal.recording import save
-from selfcal.result import HALF_90
+from selfcal.bank.library import Bank
+from selfcal.bank.reference import identify_axis
+from selfcal.bank.result import HALF_90
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
+from selfcal.model.file import DEFAULT, Model, Prior
+from selfcal.model.tables import make_tables
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
-from selfcal.tables import make_tables
 from selfcal.verbs.fleet import fleet
 from selfcal.verbs.identify import identify
 

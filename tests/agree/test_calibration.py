@@ -23,9 +23,9 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from selfcal.laws import NAMED, PLAIN, SUMS
-from selfcal.model import Model
-from selfcal.spread import Row, spread
+from selfcal.batch.spread import Row, spread
+from selfcal.model.file import Model
+from selfcal.model.laws import NAMED, PLAIN, SUMS
 from selfcal.studies.montecarlo import rows_of
 
 from conftest import ROOT

@@ -15,10 +15,10 @@ import yaml
 from scipy import stats
 
 from selfcal import _reference
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.laws import NAMED
-from selfcal.model import DEFAULT, Model
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.laws import NAMED
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
 
 from agreement import (

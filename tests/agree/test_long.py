@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from selfcal import _reference
-from selfcal.engines.library import Bank
-from selfcal.model import Model
-from selfcal.tables import make_tables
+from selfcal.bank.library import Bank
+from selfcal.model.file import Model
+from selfcal.model.tables import make_tables
 from selfcal.verbs.codegen import coarsest_exponent
 
 from conftest import worst_difference

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from selfcal.errors import UserError
-from selfcal.model import Model
+from selfcal.base.errors import UserError
+from selfcal.model.file import Model
 from selfcal.studies.montecarlo import montecarlo, show
 
 #: 400 records a law, one hour at 1 Hz, as the issue asks.

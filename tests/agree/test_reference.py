@@ -13,11 +13,11 @@ import pytest
 from scipy import integrate, interpolate, special, stats
 
 from selfcal import _reference
-from selfcal.engines import reference
-from selfcal.engines.reference import identify_axis
-from selfcal.errors import UserError
-from selfcal.laws import NAMED, PLAIN, named
-from selfcal.model import Group, Prior
+from selfcal.bank import reference
+from selfcal.bank.reference import identify_axis
+from selfcal.base.errors import UserError
+from selfcal.model.file import Group, Prior
+from selfcal.model.laws import NAMED, PLAIN, named
 
 DT = 0.7
 BIAS_SD = 3.0

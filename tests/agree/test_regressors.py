@@ -15,14 +15,14 @@ import pytest
 from scipy import stats
 
 from selfcal import _library32
-from selfcal.engines import reference
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.laws import PLAIN
-from selfcal.model import MOST_COLUMNS, Model
-from selfcal.recording import save
+from selfcal.bank import reference
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
+from selfcal.model.file import MOST_COLUMNS, Model
+from selfcal.model.laws import PLAIN
+from selfcal.model.tables import make_tables
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
-from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 

@@ -18,13 +18,13 @@ import pytest
 from scipy.interpolate import BSpline
 from scipy.stats import binom
 
-from selfcal.engines.library import Bank
-from selfcal.engines.reference import identify_axis
-from selfcal.errors import UserError
-from selfcal.laws import PLACES
-from selfcal.recording import load
+from selfcal.bank.library import Bank
+from selfcal.bank.reference import identify_axis
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import load
+from selfcal.model.laws import PLACES
+from selfcal.model.tables import AxisTable, Tables, make_grid, make_tables
 from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.tables import AxisTable, Tables, make_grid, make_tables
 from selfcal.verbs.simulate import simulate
 
 from agreement import (

@@ -17,14 +17,14 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
-from selfcal.engines.library import Bank
-from selfcal.engines.reference import identify_axis
-from selfcal.errors import UserError
-from selfcal.laws import PLACES, SUMS
-from selfcal.model import Model
-from selfcal.result import in_unit
+from selfcal.bank.library import Bank
+from selfcal.bank.reference import identify_axis
+from selfcal.bank.result import in_unit
+from selfcal.base.errors import UserError
+from selfcal.model.file import Model
+from selfcal.model.laws import PLACES, SUMS
+from selfcal.model.tables import make_tables
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
-from selfcal.tables import make_tables
 from selfcal.verbs.codegen import codegen
 
 from agreement import (

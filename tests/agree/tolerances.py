@@ -27,13 +27,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from selfcal.engines import reference
-from selfcal.engines.library import Bank
-from selfcal.laws import NAMED, PLAIN, SUMS
-from selfcal.recording import load
-from selfcal.result import AxisResult
+from selfcal.bank import reference
+from selfcal.bank.library import Bank
+from selfcal.bank.result import AxisResult
+from selfcal.logs.recording import load
+from selfcal.model.laws import NAMED, PLAIN, SUMS
+from selfcal.model.tables import make_tables
 from selfcal.studies.montecarlo import draw, montecarlo, simulate_bank_samples
-from selfcal.tables import make_tables
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / folder) for folder in ("common", ".")]
 from agreement import (  # noqa: E402

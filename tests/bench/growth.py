@@ -22,9 +22,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 
-from selfcal.diagnosis.fit import Series, run
-from selfcal.diagnosis.statemodel import Terms
-from selfcal.recording import save
+from selfcal.likelihood.fit import Series, run
+from selfcal.likelihood.statemodel import Terms
+from selfcal.logs.recording import save
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 

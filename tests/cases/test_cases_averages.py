@@ -16,13 +16,13 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from selfcal.blocks import Blocks
-from selfcal.checks import drift_check, judge
-from selfcal.engines.library import Bank
-from selfcal.engines.reference import identify_axis
-from selfcal.model import Model, Prior
-from selfcal.recording import save
-from selfcal.tables import make_tables
+from selfcal.adequacy.checks import drift_check, judge
+from selfcal.bank.blocks import Blocks
+from selfcal.bank.library import Bank
+from selfcal.bank.reference import identify_axis
+from selfcal.logs.recording import save
+from selfcal.model.file import Model, Prior
+from selfcal.model.tables import make_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 

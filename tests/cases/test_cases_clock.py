@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
-from selfcal.recording import load
-from selfcal.sampling import Ambiguous, rate_changes, sampling
-from selfcal.timebase import clock_of
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import load
+from selfcal.logs.sampling import Ambiguous, rate_changes, sampling
+from selfcal.logs.timebase import clock_of
 from selfcal.verbs.identify import identify
 
 from conftest import case_records

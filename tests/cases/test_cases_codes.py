@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal.codes import uneven_of
-from selfcal.diagnosis.statemodel import Array
-from selfcal.held import slower
-from selfcal.lattice import lattice_of
-from selfcal.model import Model
-from selfcal.recording import save
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import save
+from selfcal.model.file import Model
+from selfcal.readings.codes import uneven_of
+from selfcal.readings.held import slower
+from selfcal.readings.lattice import lattice_of
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.simulate import simulate
 

@@ -15,11 +15,11 @@ from drifts import LAWS, assert_held, noise, recorded
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from selfcal import units
+from selfcal.base import units
+from selfcal.base.results import IdentifiedAxis
 from selfcal.diagnosis.causes import colored_noise
-from selfcal.diagnosis.state import NET_LEAST
-from selfcal.lattice import WHITE_REMAINDERS, Lattice, lattice_of
-from selfcal.results import IdentifiedAxis
+from selfcal.likelihood.state import NET_LEAST
+from selfcal.readings.lattice import WHITE_REMAINDERS, Lattice, lattice_of
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 

@@ -16,16 +16,16 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.base.errors import UserError
 from selfcal.diagnosis.cause import Channels
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.forms import added, inconstancy
 from selfcal.diagnosis.loop import LOOKS, diagnose_record
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, State
-from selfcal.errors import UserError
-from selfcal.forms import formed, slope, variance_of
-from selfcal.model import DEFAULT, Model
-from selfcal.recording import load
+from selfcal.likelihood.state import NET_LEAST, State
+from selfcal.logs.recording import load
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.forms import formed, slope, variance_of
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

@@ -17,10 +17,10 @@ from selfcal.diagnosis import loop, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import outliers, step
 from selfcal.diagnosis.finding import Diagnosed, HeldOut
-from selfcal.diagnosis.fit import passed
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State
-from selfcal.diagnosis.statemodel import Terms
+from selfcal.likelihood.fit import passed
+from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State
+from selfcal.likelihood.statemodel import Terms
 
 from conftest import case_records
 

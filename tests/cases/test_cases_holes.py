@@ -20,11 +20,11 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from selfcal.errors import UserError
-from selfcal.methods.problem import Problem
-from selfcal.model import Model
-from selfcal.recording import load
-from selfcal.spread import Row, spread
+from selfcal.base.errors import UserError
+from selfcal.batch.spread import Row, spread
+from selfcal.logs.recording import load
+from selfcal.model.file import Model
+from selfcal.studies.methods.problem import Problem
 from selfcal.studies.montecarlo import montecarlo
 from selfcal.studies.navigate import navigate
 from selfcal.studies.paper import paper
@@ -175,7 +175,7 @@ def test_a_killed_rival_is_no_answer() -> None:
 @pytest.mark.parametrize("address", ["tls://127.0.0.1:9", "ucx://127.0.0.1:9", "inproc://1", "nowhere", "x://y", "\n"])
 def test_a_scheduler_that_cannot_be_is_one_line(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each kind of address fails in its own way."""
-    monkeypatch.setattr("selfcal.spread.PATIENCE_S", 0.5)
+    monkeypatch.setattr("selfcal.batch.spread.PATIENCE_S", 0.5)
     with pytest.raises(UserError, match=r"^--scheduler .*: no Dask scheduler answers \(.*\): start one with") as caught:
         spread(uneven, range(2), settings={}, scheduler=address)
     assert "\n" not in str(caught.value)

@@ -21,17 +21,17 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal.dbc_file import Names, dbc
+from selfcal.base.errors import UserError, remark
 from selfcal.diagnosis.extend import as_text
-from selfcal.errors import UserError, remark
-from selfcal.export import FORMS, write_export
-from selfcal.model import DEFAULT, Model
-from selfcal.recording import load, save
-from selfcal.tables import make_tables
+from selfcal.diagnosis.warm import load as load_start
+from selfcal.logs.recording import load, save
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.tables import make_tables
+from selfcal.show.export import FORMS, write_export
 from selfcal.verbs.codegen import bank_bytes, codegen, write_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
-from selfcal.warm import load as load_start
+from selfcal.wire.dbc_file import Names, dbc
 
 from conftest import ROOT, case_records
 

@@ -14,11 +14,11 @@ import can
 import pytest
 from rich.console import Console
 
-from selfcal.errors import UserError
-from selfcal.framelog import FLUSH_S, WRITTEN, FrameLog, FrameWriter
-from selfcal.live import Contact, View
+from selfcal.base.errors import UserError
 from selfcal.verbs import monitor as verb
-from selfcal.wire import Decoder, Streams, frame_crc
+from selfcal.wire.framelog import FLUSH_S, WRITTEN, FrameLog, FrameWriter
+from selfcal.wire.frames import Decoder, Streams, frame_crc
+from selfcal.wire.live import Contact, View
 
 from conftest import COMMAND, case_records, shared_case
 from wire_stream import lines, message, serial_line, stream

@@ -21,12 +21,12 @@ from scipy.signal import lfilter
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
-from selfcal.held import held as held_rows
-from selfcal.lost_words import recurring_of
-from selfcal.model import Model
-from selfcal.readings import evened, look
-from selfcal.recording import Column, Recording, load, save
-from selfcal.sampling import rate_changes, sampling
+from selfcal.logs.recording import Column, Recording, load, save
+from selfcal.logs.sampling import rate_changes, sampling
+from selfcal.model.file import Model
+from selfcal.readings.held import held as held_rows
+from selfcal.readings.lost_words import recurring_of
+from selfcal.readings.readings import evened, look
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify_axis
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from selfcal.errors import UserError
+from selfcal.base.errors import UserError
 from selfcal.verbs.diagnose import diagnose
 
 from conftest import shared_case

@@ -21,10 +21,10 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal.errors import UserError
-from selfcal.loaders import FORMATS, child, format_of
-from selfcal.loaders.table import Hints
-from selfcal.recording import Recording, load, parse_pairs, parse_scales
+from selfcal.base.errors import UserError
+from selfcal.logs.loaders import FORMATS, child, format_of
+from selfcal.logs.loaders.table import Hints
+from selfcal.logs.recording import Recording, load, parse_pairs, parse_scales
 from selfcal.verbs.convert import convert
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -498,7 +498,7 @@ def test_mutated_copies_end_in_one_line(name: str, tmp_path: Path) -> None:
     whole = log.read_bytes()
     one = format_of(log, frames=dbc is not None)
     if one is not None:  # so that each child has the library
-        import_module(f"selfcal.loaders.{one.module}").read(log, {} if dbc is None else {"dbc": str(dbc)})
+        import_module(f"selfcal.logs.loaders.{one.module}").read(log, {} if dbc is None else {"dbc": str(dbc)})
     refused, copies = 0, case_records(10, 1000)
     for _ in range(copies):
         log.write_bytes(mutated(random, whole))
@@ -550,7 +550,7 @@ def test_a_reader_is_bounded(does: str, line: str, tmp_path: Path, monkeypatch: 
         exec(does)
         return []
 
-    monkeypatch.setattr("selfcal.loaders.ulog.read", read)
+    monkeypatch.setattr("selfcal.logs.loaders.ulog.read", read)
     log = tmp_path / "log.ulg"
     log.write_bytes(b"ULog\x01\x12\x35")
     with pytest.raises(UserError) as found:
@@ -561,7 +561,7 @@ def test_a_reader_is_bounded(does: str, line: str, tmp_path: Path, monkeypatch: 
 def test_the_child_is_a_process_of_its_own(drawn: logs.Drawn, tmp_path: Path) -> None:
     """The library of a format is not in this process: `identify` of a ULog imports no pyulog."""
     log = logs.write_ulog(drawn, tmp_path)
-    code = f"import sys; from selfcal.recording import load; load({str(log)!r}); print('pyulog' in sys.modules)"
+    code = f"import sys; from selfcal.logs.recording import load; load({str(log)!r}); print('pyulog' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
     assert done.stdout.strip() == "False"
 
@@ -571,5 +571,5 @@ def test_formats_are_rows() -> None:
     suffixes = [suffix for one in FORMATS for suffix in one.suffixes]
     assert len(set(suffixes)) == len(suffixes)
     for one in FORMATS:
-        assert callable(import_module(f"selfcal.loaders.{one.module}").read)
+        assert callable(import_module(f"selfcal.logs.loaders.{one.module}").read)
         assert one.library or not one.extra

@@ -13,17 +13,17 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from selfcal.base.errors import UserError
 from selfcal.diagnosis import integrity, words
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Record, of_recording
-from selfcal.diagnosis.state import State
-from selfcal.diagnosis.statemodel import Array
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.motion import loud
-from selfcal.readings import look
-from selfcal.recording import Column, Recording, save
+from selfcal.likelihood.state import State
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import Column, Recording, save
+from selfcal.model.file import Model
+from selfcal.readings.motion import loud
+from selfcal.readings.readings import look
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify, identify_axis
 from selfcal.verbs.simulate import simulate

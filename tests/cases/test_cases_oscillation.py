@@ -19,17 +19,17 @@ from scipy.stats import binom
 from swings import Swing, plain_ones
 
 from selfcal import _reference
-from selfcal.allan import terms_of
+from selfcal.adequacy.allan import terms_of
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
 from selfcal.diagnosis import carried
 from selfcal.diagnosis.causes import oscillation
 from selfcal.diagnosis.extend import extended
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.laws import Law, Term
-from selfcal.model import Model
-from selfcal.recording import Column, Recording
-from selfcal.tables import Tables, make_tables
+from selfcal.logs.recording import Column, Recording
+from selfcal.model.file import Model
+from selfcal.model.laws import Law, Term
+from selfcal.model.tables import Tables, make_tables
 
 from agreement import Nodes, assert_prediction_is_that_of_a_gap, compare, hold
 from conftest import case_records

@@ -14,9 +14,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from selfcal.model import Model
-from selfcal.priors import for_record
-from selfcal.recording import load
+from selfcal.logs.recording import load
+from selfcal.model.file import Model
+from selfcal.readings.priors import for_record
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

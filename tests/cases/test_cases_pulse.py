@@ -14,7 +14,7 @@ from scipy.stats import binom
 
 from selfcal.diagnosis.causes import pulse
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.statemodel import Array
 
 from conftest import case_records
 

@@ -17,9 +17,9 @@ from selfcal.diagnosis import score
 from selfcal.diagnosis.causes import shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record, of_recording
-from selfcal.diagnosis.state import NET_LEAST, P_LOOK, State
-from selfcal.diagnosis.statemodel import Array
-from selfcal.model import Model
+from selfcal.likelihood.state import NET_LEAST, P_LOOK, State
+from selfcal.likelihood.statemodel import Array
+from selfcal.model.file import Model
 from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records, shared_recording

@@ -14,10 +14,10 @@ import pytest
 from scipy.stats import binom
 
 from selfcal.diagnosis.causes import periodic, step, variance_change
-from selfcal.diagnosis.fit import Series, finish, run
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, State
-from selfcal.diagnosis.statemodel import Array, Terms
+from selfcal.likelihood.fit import Series, finish, run
+from selfcal.likelihood.state import Look, State
+from selfcal.likelihood.statemodel import Array, Terms
 from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records, shared_case

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
-from selfcal.recording import Recording, load, save
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import Recording, load, save
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 

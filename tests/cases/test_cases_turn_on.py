@@ -16,12 +16,12 @@ import yaml
 from drifts import LAWS, assert_held, clean_ones_named, noise, recorded
 from scipy.stats import binom
 
+from selfcal.base.errors import UserError
 from selfcal.diagnosis.causes import turn_on
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.state import Look
-from selfcal.diagnosis.statemodel import Array
-from selfcal.errors import UserError
-from selfcal.model import DEFAULT
+from selfcal.likelihood.state import Look
+from selfcal.likelihood.statemodel import Array
+from selfcal.model.file import DEFAULT
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay

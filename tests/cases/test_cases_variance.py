@@ -14,10 +14,10 @@ from scipy.stats import binom, poisson
 
 from selfcal.diagnosis.causes import variance_change
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, P_LOOK, Look, State
-from selfcal.diagnosis.statemodel import Array
-from selfcal.forms import variance_of
-from selfcal.recording import save
+from selfcal.likelihood.state import NET_LEAST, P_LOOK, Look, State
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import save
+from selfcal.model.forms import variance_of
 from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records

@@ -20,15 +20,17 @@ import pytest
 from gated import Gated
 from numpy.typing import NDArray
 
-from selfcal import ending, gate
-from selfcal.diagnosis import fit, integrity, loop, work
+from selfcal.base import ending
+from selfcal.base.errors import UserError
+from selfcal.batch.fail_on import outcome
+from selfcal.diagnosis import integrity, loop
 from selfcal.diagnosis.record import of_recording
-from selfcal.errors import UserError
-from selfcal.fail_on import outcome
-from selfcal.model import Model
-from selfcal.recording import Column, Recording, load, save
-from selfcal.regressors import columns_of
-from selfcal.rest import rest_of
+from selfcal.likelihood import fit, work
+from selfcal.logs.recording import Column, Recording, load, save
+from selfcal.model.file import Model
+from selfcal.model.regressors import columns_of
+from selfcal.readings import gate
+from selfcal.readings.rest import rest_of
 from selfcal.verbs import diagnose as diagnose_module
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose

@@ -13,16 +13,16 @@ import pytest
 from drifts import fitted, of_one
 from scipy.stats import binom
 
-from selfcal.checks import against
-from selfcal.diagnosis import pictures
+from selfcal.adequacy.checks import against
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State
-from selfcal.diagnosis.statemodel import Array
 from selfcal.diagnosis.statistics import Statistic, judged
 from selfcal.diagnosis.verdict import coherence, joined, look_of
-from selfcal.model import LARGEST, SMALLEST, Model
+from selfcal.likelihood.state import NET_LEAST, Look, State
+from selfcal.likelihood.statemodel import Array
+from selfcal.model.file import LARGEST, SMALLEST, Model
+from selfcal.show import pictures
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 

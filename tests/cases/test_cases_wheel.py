@@ -22,8 +22,8 @@ from pathlib import Path
 import pytest
 
 import selfcal
-from selfcal import package_codegen
 from selfcal.verbs.demo import SHIPPED
+from selfcal.wire import package_codegen
 
 from conftest import CASE_RECORDS, ROOT
 
@@ -169,7 +169,7 @@ def test_what_the_wheel_has(installed: Installed) -> None:
     names = zipfile.ZipFile(installed.wheel).namelist()
     assert {"selfcal/py.typed", "selfcal/tree/lib/selfcal.h", "selfcal/tree/port/qemu/qemu.mk"} <= set(names)
     assert not [name for name in names if "host_sim" in name]
-    script = "import selfcal.wire as wire; print(wire.ROOT)"
+    script = "import selfcal.wire.frames as wire; print(wire.ROOT)"
     python = installed.environment / "bin" / "python"
     root = subprocess.run([python, "-c", script], cwd=installed.folder, capture_output=True, text=True, check=True)
     assert Path(root.stdout.strip()).is_relative_to(installed.environment)

@@ -14,8 +14,8 @@ from scipy.stats import binom
 
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, State
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.state import NET_LEAST, State
+from selfcal.likelihood.statemodel import Array
 
 from conftest import case_records
 

@@ -17,9 +17,9 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from selfcal.model import PARTS, Model
+from selfcal.model.file import PARTS, Model
 from selfcal.verbs.codegen import codegen
-from selfcal.wire import AxisReport, Decoder
+from selfcal.wire.frames import AxisReport, Decoder
 
 from conftest import CAMPAIGN
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.engines.library import Bank
-from selfcal.gate import Learning
-from selfcal.model import Model
-from selfcal.tables import Tables, gate_table, make_tables
+from selfcal.bank.library import Bank
+from selfcal.model.file import Model
+from selfcal.model.tables import Tables, gate_table, make_tables
+from selfcal.readings.gate import Learning
 
 
 def learning_gate(model: Model, tables: Tables) -> Learning:

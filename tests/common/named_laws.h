@@ -1,4 +1,4 @@
-/* The laws that a model file names (tools/selfcal/laws.py). */
+/* The laws that a model file names (tools/selfcal/model/laws.py). */
 #ifndef TEST_LAWS_H
 #define TEST_LAWS_H
 

@@ -10,10 +10,10 @@ import numpy as np
 from drifts import LAWS, noise, recorded
 from scipy.signal import lfilter
 
-from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import State
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.fit import finish
+from selfcal.likelihood.state import State
+from selfcal.likelihood.statemodel import Array
 
 #: Steps of the difference equation: in a period, and between two readings.
 IN_PERIOD, IN_READING = 400, 4

@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 import numpy as np
 from rich.progress import track
 
-from selfcal.recording import save
+from selfcal.logs.recording import save
 
 from generator import CAUSES, CLEAN, OUTSIDE, PAIRS, SIZES, Effect, Record, draw
 

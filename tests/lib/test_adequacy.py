@@ -17,14 +17,14 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from selfcal.engines.library import Bank
-from selfcal.model import Model
+from selfcal.bank.library import Bank
+from selfcal.model.file import Model
+from selfcal.model.tables import Tables, make_tables
 from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.tables import Tables, make_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
-from selfcal.wire import choices
+from selfcal.wire.frames import choices
 
 MODEL = Model.load(None)
 SUSPECTS = choices("GX_ADEQUACY", "suspicion")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 
 from selfcal import _reference
-from selfcal.allan import terms_of
-from selfcal.engines.library import Bank
-from selfcal.laws import Law, averaged, lost_of
-from selfcal.model import DEFAULT, Model
-from selfcal.tables import Tables, make_tables
+from selfcal.adequacy.allan import terms_of
+from selfcal.bank.library import Bank
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.laws import Law, averaged, lost_of
+from selfcal.model.tables import Tables, make_tables
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -17,15 +17,15 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.model import DEFAULT, Handling, Model
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.model.file import DEFAULT, Handling, Model
+from selfcal.model.tables import Tables, make_tables
 from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.tables import Tables, make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
-from selfcal.wire import choices
+from selfcal.wire.frames import choices
 
 from conftest import ROOT
 

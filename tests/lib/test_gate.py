@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from selfcal import _library32, _library64
-from selfcal.engines.library import Bank
-from selfcal.model import Model
-from selfcal.tables import make_tables
+from selfcal.bank.library import Bank
+from selfcal.model.file import Model
+from selfcal.model.tables import make_tables
 
 from conftest import shared_recording
 

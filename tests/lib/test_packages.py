@@ -20,9 +20,9 @@ from pathlib import Path
 import pytest
 import yaml
 
-from selfcal import package_codegen
-from selfcal.model import Model
+from selfcal.model.file import Model
 from selfcal.verbs.codegen import codegen
+from selfcal.wire import package_codegen
 
 from conftest import ROOT
 
@@ -93,7 +93,7 @@ def prefix(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_is_made_is_up_to_date(tmp_path: Path) -> None:
-    """lib/default/, the versions and the licence are as `python -m selfcal.package_codegen` writes them."""
+    """lib/default/, the versions and the licence are as `python -m selfcal.wire.package_codegen` writes them."""
     fresh = tmp_path / "lib"
     names = ["selfcal.h", *package_codegen.VERSIONS]
     fresh.mkdir()

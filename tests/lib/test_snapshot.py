@@ -12,10 +12,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.model import Model, Regressor
-from selfcal.tables import Tables, make_tables
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.model.file import Model, Regressor
+from selfcal.model.tables import Tables, make_tables
 
 #: 10 Hz averaged to 1 Hz, two axes of the gyro.
 AXES = ("gx", "gy")

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.tables import make_tables
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.model.file import Model
+from selfcal.model.tables import make_tables
 
 #: nat; what the double build is held to against the textbook bank.
 LN_P_DOUBLE = 1e-3

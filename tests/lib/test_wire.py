@@ -25,10 +25,10 @@ import pyte
 import pytest
 from numpy.typing import NDArray
 
-from selfcal import frames_codegen
-from selfcal.dbc_file import Names, dbc
-from selfcal.errors import UserError
-from selfcal.wire import AXES, AxisReport, Decoder, Statistics, Streams, crc12, frame_crc, load_dbc, open_bus
+from selfcal.base.errors import UserError
+from selfcal.wire import frames_codegen
+from selfcal.wire.dbc_file import Names, dbc
+from selfcal.wire.frames import AXES, AxisReport, Decoder, Statistics, Streams, crc12, frame_crc, load_dbc, open_bus
 
 from wire_stream import ROOT, Sent, lines, message, serial_line, stream
 
@@ -56,7 +56,7 @@ def changed_dbc(old: str, new: str) -> cantools.database.can.Database:
 
 
 def test_committed_files_are_the_generated_ones() -> None:
-    """`python -m selfcal.frames_codegen` writes them."""
+    """`python -m selfcal.wire.frames_codegen` writes them."""
     assert DBC.read_text() == dbc()
     assert (ROOT / "lib" / "selfcal_frames.h").read_text() == frames_codegen.header(load_dbc())
     wire = (ROOT / "lib" / "WIRE.md").read_text(encoding="utf-8")

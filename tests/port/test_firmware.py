@@ -18,8 +18,8 @@ import pytest
 from firmware import AXES, QUIET_RATE_HZ, SLOW_RATE_HZ, Board, Tap, image, reports, status
 from gated import Gated
 
-from selfcal.model import Model
-from selfcal.wire import names_of
+from selfcal.model.file import Model
+from selfcal.wire.frames import names_of
 
 P_TOLERANCE, NAT_TOLERANCE, SD_TOLERANCE = 1e-4, 0.01, 0.02
 STATUS_FRAMES = 46

@@ -21,11 +21,11 @@ from firmware import AXES, MANY, QUIET_BANK_HZ, SLOW_RATE_HZ, Board, Tap, image,
 from gated import Gated
 from typer.testing import CliRunner
 
+from selfcal.base.errors import UserError
 from selfcal.cli import app
-from selfcal.errors import UserError
-from selfcal.model import Model
+from selfcal.model.file import Model
 from selfcal.verbs import command as verb
-from selfcal.wire import Decoder, frame_crc, load_dbc, reasons
+from selfcal.wire.frames import Decoder, frame_crc, load_dbc, reasons
 
 KEY = bytes(range(16))
 RATE_HZ, BANK_HZ = SLOW_RATE_HZ, 5.12

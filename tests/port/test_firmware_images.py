@@ -18,13 +18,13 @@ import pytest
 from firmware import ROOT, image
 from image_sizes import FirmwareError, Image
 
-from selfcal import recording as recording_module
-from selfcal.model import Model
-from selfcal.recording import load
+from selfcal.logs import recording as recording_module
+from selfcal.logs.recording import load
+from selfcal.model.file import Model
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.command import build_flag
 from selfcal.verbs.replay import TARGETS, build, emulator, write_rows
-from selfcal.wire import load_dbc
+from selfcal.wire.frames import load_dbc
 
 #: Frames of a status: the items that the DBC has.
 STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})

@@ -30,10 +30,10 @@ from firmware import (
 )
 from unicorn import UC_HOOK_CODE, Uc
 
-from selfcal.model import Model
+from selfcal.model.file import Model
 from selfcal.verbs import command as verb
 from selfcal.verbs.codegen import codegen
-from selfcal.wire import Decoder
+from selfcal.wire.frames import Decoder
 
 KEY = bytes(range(16))
 GATE_OFF = "-DBOARD_REPORT_MS=500 -DBOARD_GATE=0"

@@ -20,14 +20,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal import recording as recording_module
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.recording import Recording, load
+from selfcal.base.errors import UserError
+from selfcal.logs import recording as recording_module
+from selfcal.logs.recording import Recording, load
+from selfcal.model.file import Model
 from selfcal.verbs.identify import identify_axis
 from selfcal.verbs.replay import ROOT, TARGETS, build, emulator, replay, run, write_rows
 from selfcal.verbs.simulate import simulate
-from selfcal.wire import AxisReport, axis_unit, load_dbc, names_of
+from selfcal.wire.frames import AxisReport, axis_unit, load_dbc, names_of
 
 from conftest import shared_recording
 

@@ -16,7 +16,7 @@ import pytest
 import yaml
 from firmware import some
 
-from selfcal.model import DEFAULT
+from selfcal.model.file import DEFAULT
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay

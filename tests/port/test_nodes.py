@@ -17,19 +17,19 @@ import cantools
 import pytest
 from test_replay import NAT_TOLERANCE, P_TOLERANCE, SD_TOLERANCE, part_of_shipped
 
-from selfcal import wire
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.known_models import KnownModels
-from selfcal.model import Model
-from selfcal.one_over_f import with_white
-from selfcal.recording import Recording, load
-from selfcal.tables import make_tables
+from selfcal.adequacy.one_over_f import with_white
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import Recording, load
+from selfcal.model.file import Model
+from selfcal.model.tables import make_tables
 from selfcal.verbs import monitor as monitor_module
 from selfcal.verbs.dbc import dbc
 from selfcal.verbs.monitor import monitor
 from selfcal.verbs.replay import build, can_bus, replay, write_rows
-from selfcal.wire import ROOT, Decoder
+from selfcal.wire import frames as wire
+from selfcal.wire.frames import ROOT, Decoder
+from selfcal.wire.known_models import KnownModels
 
 from conftest import needs_multicast, run
 from wire_stream import lines, message, serial_line, stream

@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 from gated import Gated, learning_gate
 
-from selfcal import recording as recording_module
-from selfcal.engines.library import Bank
-from selfcal.model import Model
-from selfcal.recording import Recording, load
-from selfcal.tables import make_tables
-from selfcal.units import factor
+from selfcal.bank.library import Bank
+from selfcal.base.units import factor
+from selfcal.logs import recording as recording_module
+from selfcal.logs.recording import Recording, load
+from selfcal.model.file import Model
+from selfcal.model.tables import make_tables
 from selfcal.verbs import replay as replay_module
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import build, replay, run, write_rows

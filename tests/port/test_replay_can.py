@@ -21,11 +21,11 @@ import pytest
 from rich.console import Console
 from test_replay import SHIPPED, part_of_shipped
 
-from selfcal import table
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.recording import load
-from selfcal.table import show
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import load
+from selfcal.model.file import Model
+from selfcal.show import table
+from selfcal.show.table import show
 from selfcal.verbs.demo import demo
 from selfcal.verbs.monitor import monitor
 from selfcal.verbs.replay import build, can_bus, replay, write_rows

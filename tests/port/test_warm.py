@@ -1,4 +1,4 @@
-"""The warm start (tools/selfcal/warm.py): the prior that a diagnosis gives, in the library and in the firmware.
+"""The warm start (tools/selfcal/diagnosis/warm.py): the prior that a diagnosis gives, in the library and in the firmware.
 
 Truth: the dense Gaussian density of a record under the stated prior; records whose truth is drawn from that prior; and
 a simulated part. The figures of tests/ACCURACY.md come from tests/warm_start.py, whose campaign is run here with few
@@ -19,18 +19,18 @@ import pytest
 from scipy import stats
 from warm_start import LAW, PART, both, campaign, diagnosed, law_known
 
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.known_models import KnownModels
-from selfcal.model import Model
-from selfcal.recording import load as load_recording
-from selfcal.regressors import columns_of
-from selfcal.result import HALF_90
-from selfcal.tables import make_tables
+from selfcal.bank.library import Bank
+from selfcal.bank.result import HALF_90
+from selfcal.base.errors import UserError
+from selfcal.diagnosis.warm import REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load, warmed
+from selfcal.logs.recording import load as load_recording
+from selfcal.model.file import Model
+from selfcal.model.regressors import columns_of
+from selfcal.model.tables import make_tables
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
-from selfcal.warm import REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load, warmed
+from selfcal.wire.known_models import KnownModels
 
 Files = tuple[Path, Path]
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal.ahead import AHEAD_S, Known, error_ahead, of_report
-from selfcal.model import Model, Regressor
-from selfcal.recording import Column, Recording
-from selfcal.wire import AxisReport
+from selfcal.logs.recording import Column, Recording
+from selfcal.model.file import Model, Regressor
+from selfcal.wire.ahead import AHEAD_S, Known, error_ahead, of_report
+from selfcal.wire.frames import AxisReport
 
 RATE_HZ, SLOPE = 2.0, 1.0e-3
 MODEL = Model.load()

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, norm
 
-from selfcal.allan import (
+from selfcal.adequacy.allan import (
     deviations,
     freedom_of,
     lengths,
@@ -29,16 +29,16 @@ from selfcal.allan import (
     sampled,
     terms_of,
 )
-from selfcal.blocks import block_means
-from selfcal.checks import CHECK_LIMIT, judge
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.laws import PLAIN, named
-from selfcal.model import Model
-from selfcal.recording import as_float, save
+from selfcal.adequacy.checks import CHECK_LIMIT, judge
+from selfcal.bank.blocks import block_means
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import as_float, save
+from selfcal.model.file import Model
+from selfcal.model.laws import PLAIN, named
+from selfcal.model.tables import make_tables
+from selfcal.show.table import show
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
-from selfcal.table import show
-from selfcal.tables import make_tables
 from selfcal.verbs.identify import identify
 
 from conftest import shared_recording
@@ -236,7 +236,7 @@ def test_recordings_leave_the_model_where_it_does_not_fit(
 def test_the_legend_is_within_the_picture(count: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of one axis the picture is as narrow as it gets."""
     kept: list[Any] = []
-    monkeypatch.setattr("selfcal.allan_plot.save_picture", lambda figure, path, dpi: kept.append(figure))
+    monkeypatch.setattr("selfcal.show.allan_plot.save_picture", lambda figure, path, dpi: kept.append(figure))
     rng = np.random.default_rng(6)
     columns = {name: ("deg/s", 0.04 * rng.standard_normal(2000)) for name in ("gx", "gy", "gz")[:count]}
     save(tmp_path / "log.npz", columns, 10.0)

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 import yaml
 
-from selfcal.errors import UserError
-from selfcal.model import DEFAULT
+from selfcal.base.errors import UserError
+from selfcal.model.file import DEFAULT
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.simulate import simulate
 

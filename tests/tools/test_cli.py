@@ -17,7 +17,7 @@ import typer
 
 import selfcal
 from selfcal import cli
-from selfcal.loaders import READ, Reading
+from selfcal.logs.loaders import READ, Reading
 
 from conftest import CALLED, COMMAND, ROOT, run
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from test_page import HOSTILE, Page
 
-from selfcal.diagnosis.compare_page import page
-from selfcal.errors import UserError
-from selfcal.recording import save
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
+from selfcal.show.compare_page import page
 from selfcal.verbs.compare import compare
 
 

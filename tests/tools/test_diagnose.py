@@ -19,14 +19,14 @@ import yaml
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
+from selfcal.base.errors import UserError
+from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis.causes.periodic import BANDS_MOST
-from selfcal.diagnosis.fit import COLUMNS_MOST, Series, finish, fit, ln_likelihood, shifts, slopes
-from selfcal.diagnosis.fit import run as run_filter
-from selfcal.diagnosis.statemodel import Terms, matrices
-from selfcal.errors import UserError
-from selfcal.fail_on import outcome
-from selfcal.model import DEFAULT, Model
-from selfcal.recording import save
+from selfcal.likelihood.fit import COLUMNS_MOST, Series, finish, fit, ln_likelihood, shifts, slopes
+from selfcal.likelihood.fit import run as run_filter
+from selfcal.likelihood.statemodel import Terms, matrices
+from selfcal.logs.recording import save
+from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

@@ -14,8 +14,8 @@ from scipy.signal import lfilter
 from selfcal.diagnosis.estimators import METHODS, arx, beside, correlation, subspace
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.transfer import late
-from selfcal.model import Model
-from selfcal.recording import load
+from selfcal.logs.recording import load
+from selfcal.model.file import Model
 
 from conftest import case_records
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal.errors import UserError
-from selfcal.export import FORMS
-from selfcal.overbound import overbound, upper_limit
-from selfcal.recording import save
+from selfcal.adequacy.overbound import overbound, upper_limit
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
+from selfcal.show.export import FORMS
 from selfcal.verbs.identify import identify
 
 RATE = 4.0

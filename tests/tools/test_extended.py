@@ -18,15 +18,15 @@ import numpy as np
 import pytest
 import yaml
 
+from selfcal.adequacy.one_over_f import beside_its_law
 from selfcal.diagnosis.extend import _regressors, extended
 from selfcal.diagnosis.finding import Diagnosed
-from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
-from selfcal.diagnosis.state import Regressor, State
-from selfcal.model import DEFAULT, Model
-from selfcal.one_over_f import beside_its_law
-from selfcal.recording import load
+from selfcal.likelihood.fit import Fit, run
+from selfcal.likelihood.state import Regressor, State
+from selfcal.logs.recording import load
+from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose

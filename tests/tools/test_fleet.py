@@ -21,17 +21,17 @@ from typing import Any
 import numpy as np
 import pytest
 
+from selfcal.base.errors import UserError
+from selfcal.base.units import factor
 from selfcal.batch.files import Source
 from selfcal.batch.page import page
+from selfcal.batch.spread import DEATHS, Row, spread
 from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.table import COLUMNS, Unit
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.recording import save
-from selfcal.spread import DEATHS, Row, spread
-from selfcal.units import factor
+from selfcal.batch.verdicts import Limits
+from selfcal.logs.recording import save
+from selfcal.model.file import Model
 from selfcal.verbs.fleet import _document, _judged, fleet
-from selfcal.verdicts import Limits
 
 from conftest import COMMAND, case_records, run
 

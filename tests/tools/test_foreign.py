@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from selfcal import units
-from selfcal.errors import UserError
-from selfcal.recording import load
+from selfcal.base import units
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import load
 
 _RATE, _ROWS, _G = 80.0, 700, units.STANDARD_GRAVITY
 _DEG = math.pi / 180.0

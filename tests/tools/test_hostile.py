@@ -26,10 +26,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from selfcal import limits
-from selfcal.errors import UserError
-from selfcal.model import DEFAULT, Model
-from selfcal.recording import Recording, load, save
+from selfcal.base import limits
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import Recording, load, save
+from selfcal.model.file import DEFAULT, Model
 
 from conftest import CAMPAIGN, ROOT
 
@@ -300,7 +300,7 @@ def test_headers_that_take_long(tmp_path: Path, line: str) -> None:
 @pytest.mark.parametrize("name", ["log.rda", "log.mat"])
 def test_a_bomb_of_arrays(tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """More unpacked than is allowed is not unpacked."""
-    monkeypatch.setattr("selfcal.loaders.table.MOST_UNPACKED_BYTES", 10_000)
+    monkeypatch.setattr("selfcal.logs.loaders.table.MOST_UNPACKED_BYTES", 10_000)
     path = tmp_path / name
     if name == "log.mat":
         savemat(path, {"gx": np.zeros(100_000)}, do_compression=True)

@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
-from selfcal.blocks import REPORT_MIN, block_means
-from selfcal.engines import reference
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.laws import PLAIN
-from selfcal.model import NODES, Model, Prior
-from selfcal.recording import save
+from selfcal.bank import reference
+from selfcal.bank.blocks import REPORT_MIN, block_means
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
+from selfcal.model.file import NODES, Model, Prior
+from selfcal.model.laws import PLAIN
+from selfcal.model.tables import make_tables
+from selfcal.show.table import show
 from selfcal.studies.montecarlo import draw, simulate_bank_samples
-from selfcal.table import show
-from selfcal.tables import make_tables
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 

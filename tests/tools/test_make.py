@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal import recording
-from selfcal.model import Model
+from selfcal.logs import recording
+from selfcal.model.file import Model
 from selfcal.verbs import replay as verb
 from selfcal.verbs.command import build_flag
 from selfcal.verbs.replay import build

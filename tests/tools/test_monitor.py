@@ -18,13 +18,13 @@ from rich.console import Console
 from test_wire import spoil
 
 from selfcal import cli
-from selfcal.dbc_file import PLACE_NAMES
-from selfcal.errors import UserError
-from selfcal.live import View
-from selfcal.model import Model
+from selfcal.base.errors import UserError
+from selfcal.model.file import Model
 from selfcal.verbs.identify import identify
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import REASONS, AxisReport, Decoder, Link, names_of, open_bus
+from selfcal.wire.dbc_file import PLACE_NAMES
+from selfcal.wire.frames import REASONS, AxisReport, Decoder, Link, names_of, open_bus
+from selfcal.wire.live import View
 
 from wire_stream import lines, message, serial_line, stream
 

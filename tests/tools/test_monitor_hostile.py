@@ -27,10 +27,10 @@ import pytest
 from rich.console import Console
 from test_wire import with_bits
 
-from selfcal.errors import UserError
-from selfcal.live import Contact, View, most_probable
+from selfcal.base.errors import UserError
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import LINE_MAX, AxisReport, Decoder, Link, load_dbc, open_bus
+from selfcal.wire.frames import LINE_MAX, AxisReport, Decoder, Link, load_dbc, open_bus
+from selfcal.wire.live import Contact, View, most_probable
 
 from conftest import needs_multicast
 from wire_stream import lines, message, serial_line, stream

@@ -14,9 +14,23 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from selfcal.engines.library import Bank
-from selfcal.model import Model
-from selfcal.navigation import (
+from selfcal.bank.library import Bank
+from selfcal.base.units import STANDARD_GRAVITY
+from selfcal.model.file import Model
+from selfcal.model.parts import AXES, LAWS, Floats
+from selfcal.model.tables import make_tables
+from selfcal.studies.navigate import (
+    FIGURES,
+    HORIZONS_S,
+    TIMES,
+    TITLES,
+    identified_noise,
+    matched,
+    navigate,
+    sheet_noise,
+    show,
+)
+from selfcal.studies.navigation import (
     GPS_S,
     JUDGED,
     LATENCY_SD_S,
@@ -30,20 +44,6 @@ from selfcal.navigation import (
     nees,
     true_noise,
 )
-from selfcal.parts import AXES, LAWS, Floats
-from selfcal.studies.navigate import (
-    FIGURES,
-    HORIZONS_S,
-    TIMES,
-    TITLES,
-    identified_noise,
-    matched,
-    navigate,
-    sheet_noise,
-    show,
-)
-from selfcal.tables import make_tables
-from selfcal.units import STANDARD_GRAVITY
 
 from conftest import run
 

@@ -11,10 +11,10 @@ import yaml
 from drifts import assert_held, noise
 from noise_coverage import FLICKER_HZ, numbers_of, one_over_f, with_one_over_f
 
-from selfcal import table
-from selfcal.model import DEFAULT, Model
-from selfcal.one_over_f import beside_its_law, density_above, white_of
-from selfcal.tables import make_tables
+from selfcal.adequacy.one_over_f import beside_its_law, density_above, white_of
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.tables import make_tables
+from selfcal.show import table
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from selfcal.errors import UserError
-from selfcal.output import whole, write_text
+from selfcal.base.errors import UserError
+from selfcal.base.output import whole, write_text
 
 
 def names(folder: Path) -> list[str]:
@@ -35,7 +35,7 @@ def test_a_killed_program_leaves_the_older_file(tmp_path: Path) -> None:
     path = tmp_path / "report.json"
     write_text(path, "old")
     code = (
-        "import os, signal, sys\nfrom selfcal.output import whole\nwith whole(sys.argv[1]) as temporary:\n"
+        "import os, signal, sys\nfrom selfcal.base.output import whole\nwith whole(sys.argv[1]) as temporary:\n"
         "    temporary.write_text('ne')\n    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", code, str(path)], check=False)
@@ -75,7 +75,7 @@ def test_streams_are_written_to(tmp_path: Path) -> None:
     """A device stays one; so does a regular file that stdout leads to, which the caller goes on writing."""
     write_text("/dev/null", "gone")
     assert stat.S_ISCHR(Path("/dev/null").stat().st_mode)
-    code = "from selfcal.output import write_text; write_text('/dev/stdout', 'one\\n'); print('two')"
+    code = "from selfcal.base.output import write_text; write_text('/dev/stdout', 'one\\n'); print('two')"
     with (tmp_path / "out").open("a") as out:
         subprocess.run([sys.executable, "-c", code], stdout=out, check=True)
     assert (tmp_path / "out").read_text() == "one\ntwo\n"

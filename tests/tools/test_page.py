@@ -22,21 +22,22 @@ from typing import Any
 import numpy as np
 import pytest
 
-from selfcal.diagnosis import chart, integrity, pictures
+from selfcal.base.errors import UserError
+from selfcal.diagnosis import integrity
 from selfcal.diagnosis.causes import colored_noise, periodic, ramp, step, variance_change
 from selfcal.diagnosis.causes import outliers as outliers_cause
-from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, outside_of
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.page import page, write_page
 from selfcal.diagnosis.record import Missing, Record, of_recording
-from selfcal.diagnosis.state import Look, State
-from selfcal.diagnosis.statemodel import Array
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.recording import load
+from selfcal.likelihood.state import Look, State
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import load
+from selfcal.model.file import Model
+from selfcal.show import chart, pictures
+from selfcal.show.chart import Band, Curve, Figure, Panel, outside_of
+from selfcal.show.page import page, write_page
 
 from conftest import run
 

@@ -15,14 +15,14 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from selfcal.allan import overlapping
-from selfcal.diagnosis.chart import Figure, Panel
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.paper_figures import section3, section4, survey
-from selfcal.paper_figures.told import Told
+from selfcal.adequacy.allan import overlapping
+from selfcal.base.errors import UserError
+from selfcal.model.file import Model
+from selfcal.show.chart import Figure, Panel
 from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.studies.paper import paper, show
+from selfcal.studies.paper_figures import section3, section4, survey
+from selfcal.studies.paper_figures.told import Told
 from selfcal.verbs.identify import identify
 from selfcal.verbs.part import part
 

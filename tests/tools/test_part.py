@@ -13,8 +13,9 @@ import pytest
 import yaml
 from test_cases_priors import at_rest, deviation, write
 
-from selfcal.errors import UserError
-from selfcal.model import DEFAULT, Model, file_of, parts
+from selfcal.base.errors import UserError
+from selfcal.model import parts
+from selfcal.model.file import DEFAULT, Model, file_of
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 from selfcal.verbs.part import part

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal.errors import UserError
-from selfcal.model import DEFAULT, Model
+from selfcal.base.errors import UserError
+from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.plan import LEAST, Wish, _half_interval, coefficient_rows, plan, rows_of
 
 from conftest import case_records, run
@@ -87,7 +87,7 @@ def test_the_planned_length_suffices(tmp_path: Path, name: str) -> None:
 
 def test_the_information_is_that_of_known_cases() -> None:
     """White noise alone: ln N has the variance 1 / (2 n)."""
-    from selfcal.laws import NAMED
+    from selfcal.model.laws import NAMED
 
     half = _half_interval(NAMED["constant"], {"N": 0.02}, "N", 2.0, 5000.0)
     assert half == pytest.approx(1.6449 / math.sqrt(2 * 10000), rel=0.02)

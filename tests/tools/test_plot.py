@@ -8,10 +8,10 @@ from typing import Any
 import pytest
 from matplotlib import pyplot
 
-from selfcal.dbc_file import BY_PLACE, Names
-from selfcal.model import Model
-from selfcal.plot import plot_run
-from selfcal.wire import AxisReport, names_of
+from selfcal.model.file import Model
+from selfcal.show.plot import plot_run
+from selfcal.wire.dbc_file import BY_PLACE, Names
+from selfcal.wire.frames import AxisReport, names_of
 
 G = 9.80665  # m/s^2
 

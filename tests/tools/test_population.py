@@ -18,16 +18,16 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.bank.library import Bank
+from selfcal.bank.result import HALF_90
+from selfcal.base.units import factor
 from selfcal.batch.drift import Series, drifts_of
 from selfcal.batch.population import FALSE_ALARM, Measured, Population, populations
 from selfcal.batch.summary import apart_words
-from selfcal.engines.library import Bank
-from selfcal.model import DEFAULT, Model, read_yaml
-from selfcal.recording import save
-from selfcal.result import HALF_90
+from selfcal.logs.recording import save
+from selfcal.model.file import DEFAULT, Model, read_yaml
+from selfcal.model.tables import make_tables
 from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.tables import make_tables
-from selfcal.units import factor
 from selfcal.verbs.fleet import fleet
 
 from conftest import CASE_RECORDS, case_records, run

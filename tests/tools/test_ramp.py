@@ -12,11 +12,11 @@ from drifts import assert_held
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from selfcal.engines.library import Bank
-from selfcal.model import DEFAULT, Model
-from selfcal.recording import as_float
-from selfcal.regressors import choices_of, combine, mask_of
-from selfcal.tables import make_tables
+from selfcal.bank.library import Bank
+from selfcal.logs.recording import as_float
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.regressors import choices_of, combine, mask_of
+from selfcal.model.tables import make_tables
 
 from conftest import case_records
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
-from selfcal.loaders import FORMATS, TEXT
-from selfcal.recording import load, parse_scales, save
+from selfcal.base.errors import UserError
+from selfcal.logs.loaders import FORMATS, TEXT
+from selfcal.logs.recording import load, parse_scales, save
 
 from conftest import shared_recording
 

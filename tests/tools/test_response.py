@@ -30,8 +30,8 @@ from influences import (
 )
 from scipy.stats import binom
 
-from selfcal.errors import UserError
-from selfcal.held import updates
+from selfcal.base.errors import UserError
+from selfcal.readings.held import updates
 from selfcal.verbs.response import response
 
 from conftest import case_records, run

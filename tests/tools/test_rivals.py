@@ -13,19 +13,19 @@ import pytest
 from scipy import fft, signal
 from scipy.stats import multivariate_normal
 
-from selfcal import methods as registry
-from selfcal.allan import relative_variance
-from selfcal.errors import UserError
-from selfcal.laws import NAMED
-from selfcal.methods import RIVALS, particles, rao_blackwell
-from selfcal.methods.autocorrelation import covariances
-from selfcal.methods.dual import transition
-from selfcal.methods.ensemble import summary
-from selfcal.methods.problem import Floats, Problem, weights
-from selfcal.methods.recursive import update
-from selfcal.methods.steady_state import ln_likelihood
-from selfcal.methods.wavelets import covariance
-from selfcal.model import Model
+from selfcal.adequacy.allan import relative_variance
+from selfcal.base.errors import UserError
+from selfcal.model.file import Model
+from selfcal.model.laws import NAMED
+from selfcal.studies import methods as registry
+from selfcal.studies.methods import RIVALS, particles, rao_blackwell
+from selfcal.studies.methods.autocorrelation import covariances
+from selfcal.studies.methods.dual import transition
+from selfcal.studies.methods.ensemble import summary
+from selfcal.studies.methods.problem import Floats, Problem, weights
+from selfcal.studies.methods.recursive import update
+from selfcal.studies.methods.steady_state import ln_likelihood
+from selfcal.studies.methods.wavelets import covariance
 from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.studies.rivals import longest_stretch, problem_of, rivals, show
 

@@ -14,11 +14,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from selfcal import _reference, recording
+from selfcal import _reference
+from selfcal.base.errors import UserError
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.errors import UserError
-from selfcal.laws import NAMED
-from selfcal.model import DEFAULT, Model
+from selfcal.logs import recording
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.laws import NAMED
 from selfcal.verbs.simulate import show, simulate
 
 from conftest import run

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import pytest
 
-from selfcal import spread as module
-from selfcal.errors import UserError
-from selfcal.spread import Row, spread
+from selfcal.base.errors import UserError
+from selfcal.batch import spread as module
+from selfcal.batch.spread import Row, spread
 from selfcal.studies.montecarlo import montecarlo
 
 CLUSTER = all(importlib.util.find_spec(name) for name in ("distributed", "pyarrow"))

@@ -22,11 +22,11 @@ from mcap.reader import make_reader
 from test_replay_can import COMMAND, demonstration
 from websockets.sync.client import connect
 
-from selfcal.errors import UserError
-from selfcal.framelog import FrameLog
-from selfcal.streams import LARGEST, McapLog, check
+from selfcal.base.errors import UserError
 from selfcal.verbs.monitor import monitor
-from selfcal.wire import Decoder
+from selfcal.wire.framelog import FrameLog
+from selfcal.wire.frames import Decoder
+from selfcal.wire.streams import LARGEST, McapLog, check
 
 from conftest import CASE_RECORDS
 from wire_stream import AXES, lines, stream

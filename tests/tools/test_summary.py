@@ -15,15 +15,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from selfcal import table
-from selfcal.engines.library import Bank
-from selfcal.laws import PLAIN
-from selfcal.model import Model
-from selfcal.recording import save
-from selfcal.result import AxisResult, Estimate
+from selfcal.adequacy.summary import Number, halved_after, summarize
+from selfcal.bank.library import Bank
+from selfcal.bank.result import AxisResult, Estimate
+from selfcal.logs.recording import save
+from selfcal.model.file import Model
+from selfcal.model.laws import PLAIN
+from selfcal.model.tables import make_tables
+from selfcal.show import table
 from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.summary import Number, halved_after, summarize
-from selfcal.tables import make_tables
 from selfcal.verbs.identify import identify
 
 from conftest import case_records

@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from selfcal import units
-from selfcal.errors import UserError
+from selfcal.base import units
+from selfcal.base.errors import UserError
 
 
 @pytest.mark.parametrize(

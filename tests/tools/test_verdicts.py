@@ -15,16 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from selfcal import units
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.recording import save
-from selfcal.result import AxisResult
+from selfcal.bank.library import Bank
+from selfcal.bank.result import AxisResult
+from selfcal.base import units
+from selfcal.base.errors import UserError
+from selfcal.batch.verdicts import CHANCE, FAIL, OPEN, PASS, UNJUDGED, Limits, duration_words, judge
+from selfcal.logs.recording import save
+from selfcal.model.file import Model
+from selfcal.model.tables import Tables, make_tables
 from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.tables import Tables, make_tables
 from selfcal.verbs.fleet import fleet
-from selfcal.verdicts import CHANCE, FAIL, OPEN, PASS, UNJUDGED, Limits, duration_words, judge
 
 from conftest import case_records, run
 
@@ -155,7 +155,7 @@ def test_files_that_are_no_limits(tmp_path: Path) -> None:
         ("gq.N: {max: 1 deg/s}", "begins with no group or axis of the model"),
         ("gx.Q: {max: 1 deg/s}", "ends with none of bias, N"),
         ("{}", "no limit is in it"),
-        ("schema: selfcal.model/1", "schema: must be selfcal.limits/1"),
+        ("schema: selfcal.model.file/1", "schema: must be selfcal.base.limits/1"),
         ("gx.N: {max: 1 deg/s/sqrt(Hz), max: 2 deg/s/sqrt(Hz)}", "appears twice"),
         ("- 1", "not a limits file"),
     ):

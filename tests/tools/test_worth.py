@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.parts import SHEET_N, TURN_ON, simulate
+from selfcal.base.errors import UserError
+from selfcal.base.units import STANDARD_GRAVITY
+from selfcal.model.file import Model
+from selfcal.model.parts import SHEET_N, TURN_ON, simulate
 from selfcal.studies.worth import (
     CORNER_HZ,
     LAST_S,
@@ -24,7 +25,6 @@ from selfcal.studies.worth import (
     show,
     worth,
 )
-from selfcal.units import STANDARD_GRAVITY
 
 from conftest import ROOT, run
 

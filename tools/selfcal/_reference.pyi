@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.laws import LawTuple
+from selfcal.model.laws import LawTuple
 
 _Floats = NDArray[np.float64]
 

@@ -17,9 +17,9 @@ from typer.core import TyperGroup
 from typer.exceptions import TyperException
 
 import selfcal
-from selfcal.ending import Held, install, last_signal, leave
-from selfcal.errors import UserError, called, note, printable
-from selfcal.loaders import READ, WRITTEN, Reading
+from selfcal.base.ending import Held, install, last_signal, leave
+from selfcal.base.errors import UserError, called, note, printable
+from selfcal.logs.loaders import READ, WRITTEN, Reading
 
 #: Folders of the verbs, and their headings in the help.
 _HEADINGS = {"verbs": "Commands", "studies": "Studies of the method"}
@@ -190,7 +190,7 @@ def _reading_logs(command: Callable[..., None]) -> Callable[..., None]:
     """Give a command the options of `recording.Reading`; they reach it together, as its argument `reading`."""
 
     def run(**given: Any) -> None:
-        from selfcal.recording import parse_pairs, parse_scales
+        from selfcal.logs.recording import parse_pairs, parse_scales
 
         option = {name: given.pop(name) for name in _READING}
         command(
@@ -224,14 +224,14 @@ def _judge(result: Mapping[str, Any], fail_on: str | None) -> None:
     Held().check()
     codes = [0]
     if fail_on is not None:
-        from selfcal.fail_on import outcome
+        from selfcal.batch.fail_on import outcome
 
         found = outcome(result, fail_on)
         for line in found.lines:
             note(line)
         codes.append(found.code)
     if "limits" in result:
-        from selfcal.verdicts import PASS, Verdict, code_of
+        from selfcal.batch.verdicts import PASS, Verdict, code_of
 
         known = ("recording", "device")
         verdicts = [Verdict.of({k: v for k, v in one.items() if k not in known}) for one in result["limits"]]
@@ -288,7 +288,7 @@ def identify(
     gate: Gate = False,
 ) -> None:
     """Probability of each drift law, noise parameters with intervals, and the bias of a recording at rest."""
-    from selfcal.table import show
+    from selfcal.show.table import show
     from selfcal.verbs import identify as verb
 
     result = verb.identify(
@@ -751,7 +751,7 @@ def replay(
     plot: Annotated[Path | None, typer.Option(metavar="FILE", help="Save the plot of the run")] = None,
 ) -> None:
     """Run the firmware itself over a recording and watch its telemetry."""
-    from selfcal.table import show
+    from selfcal.show.table import show
     from selfcal.verbs import replay as verb
 
     result = verb.replay(

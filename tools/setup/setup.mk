@@ -76,8 +76,8 @@ $(OPTIONAL:%=$(VENV)/%.stamp): $(VENV)/%.stamp: tools/requirements-%.txt $(VENV)
 	@touch $@
 
 $(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py) \
-                          $(wildcard tools/selfcal/models/*.yaml)
-	$(BIN)/selfcal codegen tools/selfcal/models/default.yaml -o $(MODEL)
+                          $(wildcard tools/selfcal/model/models/*.yaml)
+	$(BIN)/selfcal codegen tools/selfcal/model/models/default.yaml -o $(MODEL)
 
 # The pages as they lie in the repository, so that each link between them holds. A broken one fails.
 .PHONY: docs

@@ -13,9 +13,9 @@ from glob import glob
 from pathlib import Path
 from typing import Any
 
-from selfcal.errors import UserError, note, short
-from selfcal.limits import read_text
-from selfcal.recording import meta_place
+from selfcal.base.errors import UserError, note, short
+from selfcal.base.limits import read_text
+from selfcal.logs.recording import meta_place
 
 #: A table of units: 10 000 lines of 100 letters are 1 MB.
 MOST_TABLE_BYTES = 1 << 26

@@ -12,13 +12,13 @@ from urllib.parse import quote
 
 import numpy as np
 
-from selfcal import units as unit_module
+from selfcal.base import units as unit_module
+from selfcal.base.errors import printable
+from selfcal.base.output import write_text
 from selfcal.batch.population import Array, Population
 from selfcal.batch.summary import Batch, apart_words, plain, seen_from_words, shared_words, unidentified_lines
-from selfcal.diagnosis.chart import Band, Curve, Figure, Panel, draw, number, scrolled
-from selfcal.diagnosis.page import frame
-from selfcal.errors import printable
-from selfcal.output import write_text
+from selfcal.show.chart import Band, Curve, Figure, Panel, draw, number, scrolled
+from selfcal.show.page import frame
 
 #: At most: lines of a list, and those not folded; units of the matrix; distributions; points of a control chart.
 MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES, MOST_POINTS = 150, 15, 100, 48, 400

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtri
 
-from selfcal.result import HALF_90, of_mixture
+from selfcal.bank.result import HALF_90, of_mixture
 
 Array = NDArray[np.float64]
 #: Units that make a population, and that make a group.

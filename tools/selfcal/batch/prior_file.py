@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from selfcal import units
+from selfcal.base import units
+from selfcal.base.errors import UserError
+from selfcal.base.output import write_text
 from selfcal.batch.population import Population
 from selfcal.batch.summary import Batch, axes_of, group_of, sound_of
-from selfcal.errors import UserError
-from selfcal.model import LOG_NORMAL_SD, Model, Prior, read_yaml
-from selfcal.output import write_text
-from selfcal.priors import prior_tree
+from selfcal.model.file import LOG_NORMAL_SD, Model, Prior, read_yaml
+from selfcal.readings.priors import prior_tree
 
 #: Significant digits of a prior.
 DIGITS = 4

@@ -13,11 +13,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from selfcal.adequacy.checks import CHECK_LIMIT
+from selfcal.base.errors import UserError, first_line, printable
+from selfcal.base.output import whole
+from selfcal.batch.spread import Job, Row, spread
 from selfcal.batch.table import Unit
-from selfcal.checks import CHECK_LIMIT
-from selfcal.errors import UserError, first_line, printable
-from selfcal.output import whole
-from selfcal.spread import Job, Row, spread
 
 #: What is kept of an axis of `identify`, and of one of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")

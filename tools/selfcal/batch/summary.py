@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaln
 
-from selfcal import units as unit_module
+from selfcal.bank.result import HALF_90
+from selfcal.base import units as unit_module
+from selfcal.base.errors import UserError
 from selfcal.batch.drift import Drift, Series, drifts_of
 from selfcal.batch.population import (
     FALSE_ALARM,
@@ -26,11 +28,9 @@ from selfcal.batch.population import (
     sd_of,
 )
 from selfcal.batch.table import Unit, bias_of
-from selfcal.errors import UserError
-from selfcal.laws import RATIOS
-from selfcal.model import Group, Model, Prior, Regressor
-from selfcal.regressors import coefficient_unit, offered
-from selfcal.result import HALF_90
+from selfcal.model.file import Group, Model, Prior, Regressor
+from selfcal.model.laws import RATIOS
+from selfcal.model.regressors import coefficient_unit, offered
 
 #: Nats that one unit may weigh in the choice of the batch's law: an odd one decides nothing.
 MOST_NATS = 10.0

@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from selfcal.bank.result import HALF_90
+from selfcal.base.errors import UserError, install
+from selfcal.base.output import whole
 from selfcal.batch.files import Source, moment, stem
-from selfcal.errors import UserError, install
-from selfcal.output import whole
-from selfcal.result import HALF_90
 
 COLUMNS = (
     *("device", "recording", "recorded_at", "station", "lot", "sha256", "version", "axis", "parameter"),

@@ -17,19 +17,19 @@ import numpy as np
 import yaml
 from scipy.special import logsumexp
 
+from selfcal.bank.library import Bank
+from selfcal.base.errors import UserError
 from selfcal.diagnosis.cause import Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import regressor_key
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.statemodel import Array
-from selfcal.engines.library import Bank
-from selfcal.errors import UserError
-from selfcal.model import Model, Regressor
-from selfcal.readings import Readings, look
-from selfcal.recording import Recording, as_float
-from selfcal.regressors import columns_of, mask_of, offered
-from selfcal.tables import make_tables
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import Recording, as_float
+from selfcal.model.file import Model, Regressor
+from selfcal.model.regressors import columns_of, mask_of, offered
+from selfcal.model.tables import make_tables
+from selfcal.readings.readings import Readings, look
 
 #: Pieces of the second recording whose scatter gives the uncertainty.
 PIECES = 12

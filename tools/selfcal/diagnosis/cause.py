@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from selfcal.diagnosis.model_tree import digits
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.statemodel import Array
 
 if TYPE_CHECKING:
     from selfcal._reference import Random
     from selfcal.diagnosis.finding import Diagnosed, Finding
     from selfcal.diagnosis.record import Record
-    from selfcal.diagnosis.state import Look, Regressor, State
-    from selfcal.model import Model
+    from selfcal.likelihood.state import Look, Regressor, State
+    from selfcal.model.file import Model
 
 #: Looks at one axis: the candidates of one cause or of several.
 Looks = Callable[["State", "Record"], "list[Look]"]

@@ -8,19 +8,19 @@ from copy import deepcopy
 from types import MappingProxyType
 from typing import Any
 
-from selfcal import units as unit_module
+from selfcal.adequacy.document import recording_entry
+from selfcal.base import units as unit_module
+from selfcal.base.ending import Stopped
+from selfcal.base.errors import UserError
 from selfcal.diagnosis import findable, words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
-from selfcal.diagnosis.state import Look
-from selfcal.document import recording_entry
-from selfcal.ending import Stopped
-from selfcal.errors import UserError
-from selfcal.model import MOST_COLUMNS
-from selfcal.recording import SIDE_CHANNELS, Recording
-from selfcal.regressors import coefficient_unit
+from selfcal.likelihood.state import Look
+from selfcal.logs.recording import SIDE_CHANNELS, Recording
+from selfcal.model.file import MOST_COLUMNS
+from selfcal.model.regressors import coefficient_unit
 
 SCHEMA = "selfcal.diagnose/1"
 #: Why a finding is not in the extended model file.

@@ -15,10 +15,10 @@ import numpy as np
 from scipy.linalg import lstsq, qr, svd
 from scipy.signal import fftconvolve
 
-from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.forms import LONGEST_LAG
-from selfcal.diagnosis.state import State
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.fit import Fit, run
+from selfcal.likelihood.state import State
+from selfcal.likelihood.statemodel import Array
 
 #: Orders of ARX and of a state model at most, taps of the weighting function, and block rows of the subspace.
 ORDERS, TAPS, BLOCK_ROWS = 4, (1, 2, 4, 8, 16, 32), (5, 8, 12)

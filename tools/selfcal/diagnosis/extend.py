@@ -12,21 +12,21 @@ from typing import Any
 import numpy as np
 import yaml
 
+from selfcal.base.ending import Stopped
+from selfcal.base.errors import UserError, remark
 from selfcal.diagnosis.cause import Cause, Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.fit import finish
 from selfcal.diagnosis.forms import form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Regressor as Column
-from selfcal.ending import Stopped
-from selfcal.errors import UserError, remark
-from selfcal.forms import NUMBER, formed
-from selfcal.laws import averaged
-from selfcal.model import MOST_COLUMNS, SMALLEST, Model
-from selfcal.priors import state_own
-from selfcal.regressors import trailing_mean
+from selfcal.likelihood.fit import finish
+from selfcal.likelihood.state import Regressor as Column
+from selfcal.model.file import MOST_COLUMNS, SMALLEST, Model
+from selfcal.model.forms import NUMBER, formed
+from selfcal.model.laws import averaged
+from selfcal.model.regressors import trailing_mean
+from selfcal.readings.priors import state_own
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0

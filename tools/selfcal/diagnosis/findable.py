@@ -6,7 +6,7 @@ from typing import Any
 
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import State
+from selfcal.likelihood.state import State
 
 
 def not_found(state: State, record: Record, found: set[str]) -> list[dict[str, Any]]:

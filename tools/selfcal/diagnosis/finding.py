@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, Regressor, State
 from selfcal.diagnosis.statistics import Statistic
+from selfcal.likelihood.state import Look, Regressor, State
 
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12

@@ -17,15 +17,15 @@ import numpy as np
 from scipy.fft import rfft
 from scipy.stats import chi2
 
+from selfcal.base.units import power
 from selfcal.diagnosis.cause import Channels, Key, medians, positive
-from selfcal.diagnosis.fit import Fit, run
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.diagnosis.state import ALIKE, NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
-from selfcal.diagnosis.statemodel import Array
-from selfcal.forms import NUMBER, POWER, formed, slope
-from selfcal.recording import SIDE_CHANNELS
-from selfcal.regressors import coefficient_unit
-from selfcal.units import power
+from selfcal.likelihood.fit import Fit, run
+from selfcal.likelihood.state import ALIKE, NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import SIDE_CHANNELS
+from selfcal.model.forms import NUMBER, POWER, formed, slope
+from selfcal.model.regressors import coefficient_unit
 
 #: Forms, the simplest first. `first_order` is (coefficient + rate s) / (1 + lag_s s): static, a lag, and a filtered
 #: rate are cases of it.

@@ -14,10 +14,10 @@ from scipy.stats import poisson
 
 from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State, interval
-from selfcal.diagnosis.statemodel import Array, Mask
-from selfcal.motion import Moved
-from selfcal.readings import Readings
+from selfcal.likelihood.state import NET_LEAST, Look, State, interval
+from selfcal.likelihood.statemodel import Array, Mask
+from selfcal.readings.motion import Moved
+from selfcal.readings.readings import Readings
 
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5

@@ -7,16 +7,17 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
-from selfcal.diagnosis import integrity, score, work
+from selfcal.base.ending import Stopped
+from selfcal.diagnosis import integrity, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.record import Record, carried
-from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
-from selfcal.ending import Stopped
-from selfcal.motion import Moved
+from selfcal.likelihood import work
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State
+from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from selfcal.model import LARGEST, SMALLEST
+from selfcal.model.file import LARGEST, SMALLEST
 
 #: Nodes on the host of a law that is a sum: `sums.yaml` says what they bear.
 NODES = [24, 20]

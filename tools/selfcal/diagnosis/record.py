@@ -10,16 +10,16 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from selfcal import _library32
-from selfcal.diagnosis.state import Regressor, State
-from selfcal.diagnosis.statemodel import Array, Mask
-from selfcal.errors import UserError
-from selfcal.forms import variance_of
-from selfcal.model import Group, Model
-from selfcal.model import Regressor as Stated
-from selfcal.readings import RateChange, Readings, Rows, evened, look, own_rows, readings_of, thinned
-from selfcal.recording import SIDE_CHANNELS, Recording, bridged
-from selfcal.regressors import columns_of, offered
-from selfcal.timebase import Clock
+from selfcal.base.errors import UserError
+from selfcal.likelihood.state import Regressor, State
+from selfcal.likelihood.statemodel import Array, Mask
+from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
+from selfcal.logs.timebase import Clock
+from selfcal.model.file import Group, Model
+from selfcal.model.file import Regressor as Stated
+from selfcal.model.forms import variance_of
+from selfcal.model.regressors import columns_of, offered
+from selfcal.readings.readings import RateChange, Readings, Rows, evened, look, own_rows, readings_of, thinned
 
 #: Samples that a diagnosis needs at least, and takes at most, gaps included.
 LEAST, MOST = 200, 10_000_000

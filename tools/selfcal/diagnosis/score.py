@@ -18,11 +18,11 @@ from scipy.special import gammaln, logsumexp, softmax
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
 from selfcal.diagnosis.finding import HeldOut
-from selfcal.diagnosis.fit import Fit, passed, run
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, State
-from selfcal.diagnosis.statemodel import Array, Mask, matrices
-from selfcal.readings import Rows
+from selfcal.likelihood.fit import Fit, passed, run
+from selfcal.likelihood.state import Look, State
+from selfcal.likelihood.statemodel import Array, Mask, matrices
+from selfcal.readings.readings import Rows
 
 #: How far ahead the bias is predicted, s.
 HORIZONS_S = (1.0, 10.0, 60.0, 300.0)

@@ -16,10 +16,10 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.stats import norm, pearson3
 from scipy.stats import t as student
 
-from selfcal.diagnosis.fit import Fit, Series, run
-from selfcal.diagnosis.state import State
-from selfcal.diagnosis.statemodel import Array, Matrices, matrices
-from selfcal.lattice import WHITE_REMAINDERS
+from selfcal.likelihood.fit import Fit, Series, run
+from selfcal.likelihood.state import State
+from selfcal.likelihood.statemodel import Array, Matrices, matrices
+from selfcal.readings.lattice import WHITE_REMAINDERS
 
 Indices = NDArray[np.int64]
 

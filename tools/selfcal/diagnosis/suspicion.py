@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from selfcal.diagnosis.fit import ROUGH_FTOL
+from selfcal.base.errors import UserError
 from selfcal.diagnosis.integrity import masked
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import of_recording
-from selfcal.diagnosis.state import NET_LEAST, Look
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.recording import Recording
+from selfcal.likelihood.fit import ROUGH_FTOL
+from selfcal.likelihood.state import NET_LEAST, Look
+from selfcal.logs.recording import Recording
+from selfcal.model.file import Model
 
 #: Rate of the means that are looked at, Hz, and how many of them at most: a longer record has longer ones.
 RATE_HZ, MOST = 1.0, 20_000

@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
 from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, inconstancy
 from selfcal.diagnosis.record import smoothed
-from selfcal.diagnosis.state import ALIKE, NET_LEAST, State, net
-from selfcal.diagnosis.statemodel import DRIFT_SIZES, Array
-from selfcal.forms import slope
+from selfcal.likelihood.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
+from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
+from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
+from selfcal.model.forms import slope
 
 Complex = NDArray[np.complex128]
 #: Probability of an interval.

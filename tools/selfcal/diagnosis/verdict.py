@@ -14,13 +14,13 @@ from typing import Any
 
 from scipy.stats import norm
 
-from selfcal.checks import against
+from selfcal.adequacy.checks import against
 from selfcal.diagnosis.causes import shared
 from selfcal.diagnosis.finding import Diagnosed
-from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State
 from selfcal.diagnosis.statistics import Statistic, judged
+from selfcal.likelihood.fit import run
+from selfcal.likelihood.state import NET_LEAST, Look, State
 
 #: Pictures of the checks of `identify`, by the beginning of their names.
 SHOWN = (("innovation_mean", "innovation_means"), ("innovation_ln_variance", "noise_level"))

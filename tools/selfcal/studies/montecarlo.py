@@ -20,14 +20,14 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from selfcal.allan import terms_of
-from selfcal.document import check_writable, write_json
-from selfcal.errors import UserError
-from selfcal.laws import Law, named
-from selfcal.model import Group, Model
-from selfcal.spread import Row, record_seeds, spread
-from selfcal.table import TABLE_WIDTH
-from selfcal.tables import Tables, bank_block, make_tables
+from selfcal.adequacy.allan import terms_of
+from selfcal.adequacy.document import check_writable, write_json
+from selfcal.base.errors import UserError
+from selfcal.batch.spread import Row, record_seeds, spread
+from selfcal.model.file import Group, Model
+from selfcal.model.laws import Law, named
+from selfcal.model.tables import Tables, bank_block, make_tables
+from selfcal.show.table import TABLE_WIDTH
 
 SCHEMA = "selfcal.montecarlo/1"
 #: Bank samples; fewer say nothing.
@@ -134,7 +134,7 @@ def simulate_bank_samples(
 
 def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> list[Row]:
     """One row: the law, the truth, the probabilities, and the estimates of the true law."""
-    from selfcal.engines.library import Bank
+    from selfcal.bank.library import Bank
 
     law, seed = job
     block = min(BLOCK, bank_block(model.sensor_rate_hz, model.bank_rate_hz))

@@ -14,13 +14,13 @@ from rich.console import Console
 from rich.table import Table
 from scipy import optimize, stats
 
-from selfcal.document import check_writable, write_json
-from selfcal.model import Model
-from selfcal.navigation import GPS_S, JUDGED, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
-from selfcal.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
-from selfcal.spread import Row, record_seeds, spread
-from selfcal.table import TABLE_WIDTH
-from selfcal.tables import make_tables
+from selfcal.adequacy.document import check_writable, write_json
+from selfcal.batch.spread import Row, record_seeds, spread
+from selfcal.model.file import Model
+from selfcal.model.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
+from selfcal.model.tables import make_tables
+from selfcal.show.table import TABLE_WIDTH
+from selfcal.studies.navigation import GPS_S, JUDGED, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 
 SCHEMA = "selfcal.navigate/1"
 #: What filter designers multiply a data sheet's noise by.
@@ -104,7 +104,7 @@ def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
     has the variance that the bank predicts HORIZONS_S ahead, of all laws and nodes (`matched`): the variance of one law
     at its median is too small where another law or a larger drift is possible.
     """
-    from selfcal.engines.library import Bank
+    from selfcal.bank.library import Bank
 
     model = Model.load()
     bank = Bank(make_tables(model, 1.0, tuple(AXES), bank_rate_hz=1.0))

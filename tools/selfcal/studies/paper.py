@@ -13,15 +13,15 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from selfcal.diagnosis.chart import Figure, draw
-from selfcal.diagnosis.page import STYLE
-from selfcal.document import check_writable
-from selfcal.errors import UserError, note, printable
-from selfcal.model import Model
-from selfcal.output import write_text
-from selfcal.paper_figures import section3, section4, survey
-from selfcal.paper_figures.told import Told
-from selfcal.spread import record_seeds
+from selfcal.adequacy.document import check_writable
+from selfcal.base.errors import UserError, note, printable
+from selfcal.base.output import write_text
+from selfcal.batch.spread import record_seeds
+from selfcal.model.file import Model
+from selfcal.show.chart import Figure, draw
+from selfcal.show.page import STYLE
+from selfcal.studies.paper_figures import section3, section4, survey
+from selfcal.studies.paper_figures.told import Told
 
 #: Where the real recordings are looked for, beside the repository.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))

@@ -23,20 +23,20 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from selfcal import units
-from selfcal.document import check_writable, recording_entry, write_json
-from selfcal.errors import UserError, first_line, note, printable
-from selfcal.laws import NAMED, PLAIN
-from selfcal.loaders import Reading
-from selfcal.methods import RIVALS, Rival
-from selfcal.methods.ensemble import Cell, over_laws, rows_of, summary
-from selfcal.methods.problem import Answer, Problem
-from selfcal.model import DEFAULT, Model
-from selfcal.priors import for_record
-from selfcal.recording import Recording, as_float, load
-from selfcal.spread import record_seeds, spread, workers
+from selfcal.adequacy.document import check_writable, recording_entry, write_json
+from selfcal.base import units
+from selfcal.base.errors import UserError, first_line, note, printable
+from selfcal.batch.spread import record_seeds, spread, workers
+from selfcal.logs.loaders import Reading
+from selfcal.logs.recording import Recording, as_float, load
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.laws import NAMED, PLAIN
+from selfcal.model.tables import make_tables
+from selfcal.readings.priors import for_record
+from selfcal.studies.methods import RIVALS, Rival
+from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
+from selfcal.studies.methods.problem import Answer, Problem
 from selfcal.studies.montecarlo import settings_of
-from selfcal.tables import make_tables
 from selfcal.verbs.identify import chosen_axes
 
 SCHEMA = "selfcal.rivals/1"
@@ -64,7 +64,7 @@ def rivals(
     json: Path | str | None = None,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
-    """Run the library and every other method of `selfcal.methods` on the same block means of each axis.
+    """Run the library and every other method of `selfcal.studies.methods` on the same block means of each axis.
 
     `only`: names of the methods to run, else all. Each runs in a process of its own, one after the other, so that its
     time and its memory are its own. Returns the document `selfcal.rivals/1`; numbers are in the recording's units.
@@ -180,7 +180,7 @@ def chosen_rivals(only: Sequence[str]) -> list[Rival]:
 def problem_of(recording: Recording, name: str, model: Model, decimate: float | None) -> tuple[Problem, int]:
     """The longest stretch of the axis' block means without a gap, and how many means lie outside it. Most methods take
     no gaps, and all must see the same samples."""
-    from selfcal.blocks import usable_blocks
+    from selfcal.bank.blocks import usable_blocks
 
     laws = tuple(law for law in model.hypotheses if law in PLAIN)
     if not laws:

@@ -15,14 +15,14 @@ from rich.console import Console
 from rich.table import Table
 from scipy import signal
 
-from selfcal.document import check_writable, write_json
-from selfcal.errors import UserError, printable
-from selfcal.model import Group, Model
-from selfcal.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
-from selfcal.recording import Recording, as_float, load
-from selfcal.spread import Row, record_seeds, spread
-from selfcal.tables import make_tables
-from selfcal.units import STANDARD_GRAVITY, convert, same_kind
+from selfcal.adequacy.document import check_writable, write_json
+from selfcal.base.errors import UserError, printable
+from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
+from selfcal.batch.spread import Row, record_seeds, spread
+from selfcal.logs.recording import Recording, as_float, load
+from selfcal.model.file import Group, Model
+from selfcal.model.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
+from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"
 #: s of rest, and s after its end at which the bias is wanted.
@@ -104,7 +104,7 @@ def worth(
 
 def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], Floats]:
     """The bias at each of SECONDS by each method, and the bank's own sd."""
-    from selfcal.engines.library import Bank
+    from selfcal.bank.library import Bank
 
     bank = Bank(make_tables(model, 1.0, (axis,), bank_rate_hz=1.0))
     bank.push(y[:, None])
@@ -212,7 +212,7 @@ def _simulated(model: Model, job: Job) -> list[Row]:
 
 def _means(recording: Recording, model: Model, name: str) -> Floats:
     """Means of 1 s of a recorded axis, NaN where there is none."""
-    from selfcal.blocks import usable_blocks
+    from selfcal.bank.blocks import usable_blocks
 
     recording = recording.along(name)
     group = model.group_of(name)

@@ -9,16 +9,25 @@ from pathlib import Path
 import numpy as np
 from rich.console import Console
 
-from selfcal.errors import UserError, remark
-from selfcal.forms import COLUMN_KINDS
-from selfcal.laws import KINDS
-from selfcal.model import NOT_HANDLED, Model
-from selfcal.output import whole
-from selfcal.recording import SIDE_CHANNELS
-from selfcal.tables import AxisTable, Grid, HypothesisTable, PriorRow, RegressorTable, Tables, gate_table, make_tables
-from selfcal.warm import load as load_start
-from selfcal.warm import warmed
-from selfcal.wire import carries
+from selfcal.base.errors import UserError, remark
+from selfcal.base.output import whole
+from selfcal.diagnosis.warm import load as load_start
+from selfcal.diagnosis.warm import warmed
+from selfcal.logs.recording import SIDE_CHANNELS
+from selfcal.model.file import NOT_HANDLED, Model
+from selfcal.model.forms import COLUMN_KINDS
+from selfcal.model.laws import KINDS
+from selfcal.model.tables import (
+    AxisTable,
+    Grid,
+    HypothesisTable,
+    PriorRow,
+    RegressorTable,
+    Tables,
+    gate_table,
+    make_tables,
+)
+from selfcal.wire.frames import carries
 
 #: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal_parts.h, SIGMA_BITS in bank_kernel_fixed.c.
 SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20

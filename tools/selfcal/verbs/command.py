@@ -9,9 +9,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from selfcal.dbc_file import NODE_IDS, NODES
-from selfcal.errors import UserError, called
-from selfcal.wire import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of, open_bus, serial_ports
+from selfcal.base.errors import UserError, called
+from selfcal.wire.dbc_file import NODE_IDS, NODES
+from selfcal.wire.frames import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of, open_bus, serial_ports
 
 if TYPE_CHECKING:
     import can

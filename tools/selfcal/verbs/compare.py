@@ -13,17 +13,17 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from selfcal.document import check_writable, write_json
-from selfcal.ending import Held
-from selfcal.errors import UserError, called, printable
-from selfcal.fail_on import CHANGED, check
-from selfcal.loaders import Reading
-from selfcal.model import Model
-from selfcal.result import HALF_90
-from selfcal.results import Comparison
+from selfcal.adequacy.document import check_writable, write_json
+from selfcal.bank.result import HALF_90
+from selfcal.base.ending import Held
+from selfcal.base.errors import UserError, called, printable
+from selfcal.base.results import Comparison
+from selfcal.batch.fail_on import CHANGED, check
+from selfcal.batch.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
+from selfcal.logs.loaders import Reading
+from selfcal.model.file import Model
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
-from selfcal.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
 
 SCHEMA = "selfcal.compare/1"
 #: A difference counts from so many standard deviations on: once in 1600 quantities by chance.
@@ -112,7 +112,7 @@ def compare(
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
     if report is not None and not none:
-        from selfcal.diagnosis.compare_page import write_page
+        from selfcal.show.compare_page import write_page
 
         write_page(report, document, curves)
     if none:

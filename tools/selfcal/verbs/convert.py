@@ -9,10 +9,10 @@ from typing import Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
-from selfcal.loaders import Reading
-from selfcal.output import check_place
-from selfcal.recording import Recording, list_of, load, save
+from selfcal.base.errors import UserError
+from selfcal.base.output import check_place
+from selfcal.logs.loaders import Reading
+from selfcal.logs.recording import Recording, list_of, load, save
 
 #: Stamps closer than this, as a share of the fastest axes' interval, are one row.
 _ONE_ROW = 0.01

@@ -5,13 +5,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from selfcal.dbc_file import COLUMNS, HYPOTHESES, NODES
-from selfcal.dbc_file import dbc as text_of
-from selfcal.document import check_writable
-from selfcal.errors import UserError
-from selfcal.model import Model
-from selfcal.output import write_text
-from selfcal.wire import AXES, axis_unit, carries, names_of
+from selfcal.adequacy.document import check_writable
+from selfcal.base.errors import UserError
+from selfcal.base.output import write_text
+from selfcal.model.file import Model
+from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, NODES
+from selfcal.wire.dbc_file import dbc as text_of
+from selfcal.wire.frames import AXES, axis_unit, carries, names_of
 
 
 def dbc(model: Path | str, *, node: int = 0, output: Path | str | None = None) -> str:

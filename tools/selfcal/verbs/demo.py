@@ -9,13 +9,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from selfcal.dbc_file import NODES
-from selfcal.errors import UserError, called
-from selfcal.model import Model
-from selfcal.recording import load
+from selfcal.base.errors import UserError, called
+from selfcal.logs.recording import load
+from selfcal.model.file import Model
 from selfcal.verbs.identify import chosen_axes
 from selfcal.verbs.replay import build, running, write_rows
-from selfcal.wire import ROOT
+from selfcal.wire.dbc_file import NODES
+from selfcal.wire.frames import ROOT
 
 SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
 #: s of module time between reports, at least. A host takes one a second.

@@ -12,28 +12,36 @@ from typing import Any, Unpack
 
 from rich.console import Console
 
-from selfcal.diagnosis import words, work
+from selfcal.adequacy.document import (
+    check_writable,
+    of_errors,
+    parameters_entry,
+    recording_entry,
+    regressors_entry,
+    write_json,
+)
+from selfcal.base.ending import Held, Stopped, abandon, held
+from selfcal.base.errors import UserError, note, printable
+from selfcal.base.output import write_text
+from selfcal.base.progress import Doing
+from selfcal.base.results import Diagnosis
+from selfcal.batch.fail_on import check
+from selfcal.batch.verdicts import Limits, add_verdicts, check_options, on_a_line
+from selfcal.diagnosis import words
 from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, carried, of_recording, why_left_out
 from selfcal.diagnosis.verdict import joined, of_checks
-from selfcal.document import check_writable, of_errors, parameters_entry, recording_entry, regressors_entry, write_json
-from selfcal.ending import Held, Stopped, abandon, held
-from selfcal.errors import UserError, note, printable
-from selfcal.fail_on import check
-from selfcal.loaders import Reading
-from selfcal.model import Model
-from selfcal.output import write_text
-from selfcal.priors import add_sources, for_record
-from selfcal.progress import Doing
-from selfcal.readings import look
-from selfcal.recording import Recording, list_of, load
-from selfcal.results import Diagnosis
-from selfcal.table import since
+from selfcal.likelihood import work
+from selfcal.logs.loaders import Reading
+from selfcal.logs.recording import Recording, list_of, load
+from selfcal.model.file import Model
+from selfcal.readings.priors import add_sources, for_record
+from selfcal.readings.readings import look
+from selfcal.show.table import since
 from selfcal.verbs.identify import chosen_axes, identify_axis, moved_beside, stretch_of
-from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
@@ -128,7 +136,7 @@ def diagnose(
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
-                        from selfcal.diagnosis.page import write_page
+                        from selfcal.show.page import write_page
 
                         write_page(report, document, record, {})
                     if json is not None:
@@ -151,7 +159,7 @@ def diagnose(
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
                     note(f"{write_model} leaves out {told}: {NO_ROOM}")
             if report is not None:
-                from selfcal.diagnosis.page import write_page
+                from selfcal.show.page import write_page
 
                 doing.now("pictures")
                 given = _given(axes, model, decimate, recording)

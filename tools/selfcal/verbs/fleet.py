@@ -9,20 +9,20 @@ from typing import Any, Unpack
 
 from rich.console import Console
 
+from selfcal.adequacy.document import check_writable, write_json
+from selfcal.base.errors import UserError, note, printable, short
+from selfcal.batch.fail_on import check, outcome
 from selfcal.batch.files import DATE_FORM, sources_of
 from selfcal.batch.prior_file import lines_of as lines_of_priors
 from selfcal.batch.prior_file import write_model as write_priors
 from selfcal.batch.record import ByContent, Options, examined, killed, own_pages, settings_of
+from selfcal.batch.spread import spread
 from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.table import Unit, check_table, rows_of, write_table
-from selfcal.document import check_writable, write_json
-from selfcal.errors import UserError, note, printable, short
-from selfcal.fail_on import check, outcome
-from selfcal.loaders import Reading
-from selfcal.model import Model
-from selfcal.spread import spread
+from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, check_options, judge, unjudged, write
+from selfcal.logs.loaders import Reading
+from selfcal.model.file import Model
 from selfcal.studies import montecarlo
-from selfcal.verdicts import FAIL, PASS, Judged, Limits, check_options, judge, unjudged, write
 
 SCHEMA = "selfcal.fleet/1"
 #: Names that are printed of a kind at most.

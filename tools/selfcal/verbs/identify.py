@@ -16,31 +16,31 @@ from rich.console import Console
 from rich.progress import Progress
 
 from selfcal import _library32
-from selfcal.allan import Sampled, sample_lengths, sampled
-from selfcal.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
-from selfcal.checks import FEWEST, coefficients_of, judge, with_drift, with_readings
-from selfcal.document import Identified, check_writable, to_document, write_json
-from selfcal.errors import OutsidePriors, UserError
-from selfcal.export import FORMS, write_export
-from selfcal.fail_on import check
-from selfcal.gate import gated
-from selfcal.loaders import Reading
-from selfcal.model import DEFAULT, Model
-from selfcal.one_over_f import weigh, with_white
-from selfcal.plot import check_picture
-from selfcal.priors import add_sources, for_record
-from selfcal.readings import Readings, look
-from selfcal.recording import SIDE_CHANNELS, Recording, as_float, list_of, load
-from selfcal.regressors import choices_of, columns_of, combine, mask_of, offered
-from selfcal.rest import outside_priors
-from selfcal.result import AxisResult, in_unit
-from selfcal.results import Identification
-from selfcal.summary import halved_after, summarize
-from selfcal.tables import bank_block, make_tables
-from selfcal.verdicts import Limits, add_verdicts, check_options, on_a_line
+from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
+from selfcal.adequacy.checks import FEWEST, coefficients_of, judge, with_drift, with_readings
+from selfcal.adequacy.document import Identified, check_writable, to_document, write_json
+from selfcal.adequacy.one_over_f import weigh, with_white
+from selfcal.adequacy.summary import halved_after, summarize
+from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
+from selfcal.bank.result import AxisResult, in_unit
+from selfcal.base.errors import OutsidePriors, UserError
+from selfcal.base.results import Identification
+from selfcal.batch.fail_on import check
+from selfcal.batch.verdicts import Limits, add_verdicts, check_options, on_a_line
+from selfcal.logs.loaders import Reading
+from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, list_of, load
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.regressors import choices_of, columns_of, combine, mask_of, offered
+from selfcal.model.tables import bank_block, make_tables
+from selfcal.readings.gate import gated
+from selfcal.readings.priors import add_sources, for_record
+from selfcal.readings.readings import Readings, look
+from selfcal.readings.rest import outside_priors
+from selfcal.show.export import FORMS, write_export
+from selfcal.show.plot import check_picture
 
 if TYPE_CHECKING:
-    from selfcal.diagnosis.state import Look
+    from selfcal.likelihood.state import Look
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
@@ -81,7 +81,7 @@ def identify(
     or 'reference' (the textbook bank in double, its grid refined until the probabilities settle).
     `decimate`: rate of the block means in Hz, else the model's.
     `plot`: file for the picture of the Allan deviations; `datasheet`: in the units of data sheets.
-    `export`: a format of `selfcal.export` and the file to write. `suspicion`: look at the axes that are not adequate
+    `export`: a format of `selfcal.show.export` and the file to write. `suspicion`: look at the axes that are not adequate
     once more, for the cause that explains most. `fail_on`: see fail_on.py; it is only checked here.
     `limits`: a file of limits (verdicts.py), `junit` and `verdicts`: the files of their verdicts.
     `start_s`, `end_s`: the stretch of the recording to look at, s. `since_power_on_s`: from power-on to the recording's
@@ -159,7 +159,7 @@ def identify(
     if export is not None:
         write_export(document, *export, overbound)
     if plot is not None:
-        from selfcal.allan_plot import plot_allan
+        from selfcal.show.allan_plot import plot_allan
 
         plot_allan(document, plot, datasheet=datasheet)
         console.print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
@@ -253,8 +253,8 @@ def _weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequ
     """What the laws of `models/sums.yaml` say of the axes whose drift the default ones do not describe, beside them.
 
     At the model's own bank rate; of a longer record than MORE_LAWS_MOST such intervals at a lower one."""
+    from selfcal.bank.library import Bank
     from selfcal.diagnosis.causes import CAUSES
-    from selfcal.engines.library import Bank
 
     more = Model.load(DEFAULT.parent / "sums.yaml")
     rate_hz = min(more.bank_rate_hz, MORE_LAWS_MOST / recording.duration_s)
@@ -342,7 +342,7 @@ def identify_axis(
     z = blocks.z - np.array([column.reference for column in tables.regressors])
     sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
     if engine in ("library", "fixed"):
-        from selfcal.engines.library import Bank
+        from selfcal.bank.library import Bank
 
         bank = Bank(tables, fixed=engine == "fixed", offset=offset)
         bank.push(samples[:, None], recording.missing_before, columns if regressors else None)
@@ -350,7 +350,7 @@ def identify_axis(
             results.append(bank.report(0, mask_of(regressors, choice), ahead_s))
             advance()
     else:
-        from selfcal.engines import reference
+        from selfcal.bank import reference
 
         if blocks.mean.size > MOST_DENSE:
             raise UserError(f"{blocks.mean.size} bank intervals, gaps included, are too many for the reference")

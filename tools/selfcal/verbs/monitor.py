@@ -12,18 +12,14 @@ from typing import TYPE_CHECKING, Any, cast
 
 from rich.console import Console
 
-from selfcal.checks import Judged
-from selfcal.dbc_file import NODES, Names
-from selfcal.document import Identified, Telemetry, check_writable, to_document, write_json
-from selfcal.ending import held
-from selfcal.errors import UserError
-from selfcal.framelog import FrameLog, FrameWriter, check_suffix
-from selfcal.known_models import KnownModels
-from selfcal.live import SILENT_S, Contact, View
-from selfcal.plot import check_picture, plot_run
-from selfcal.streams import check as check_stream
-from selfcal.streams import content, open_streams
-from selfcal.wire import (
+from selfcal.adequacy.checks import Judged
+from selfcal.adequacy.document import Identified, Telemetry, check_writable, to_document, write_json
+from selfcal.base.ending import held
+from selfcal.base.errors import UserError
+from selfcal.show.plot import check_picture, plot_run
+from selfcal.wire.dbc_file import NODES, Names
+from selfcal.wire.framelog import FrameLog, FrameWriter, check_suffix
+from selfcal.wire.frames import (
     AXES,
     REASONS,
     AxisReport,
@@ -37,6 +33,10 @@ from selfcal.wire import (
     reasons,
     serial_ports,
 )
+from selfcal.wire.known_models import KnownModels
+from selfcal.wire.live import SILENT_S, Contact, View
+from selfcal.wire.streams import check as check_stream
+from selfcal.wire.streams import content, open_streams
 
 if TYPE_CHECKING:
     import can

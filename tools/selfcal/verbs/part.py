@@ -13,17 +13,17 @@ from typing import Any, Unpack
 import numpy as np
 import yaml
 
-from selfcal import units as unit_module
-from selfcal.document import check_writable
-from selfcal.errors import UserError, note, remark, short
-from selfcal.loaders import Reading
-from selfcal.model import DEFAULT, LONGEST_TEXT, SENSORS, Group, Model, Prior
-from selfcal.output import write_text
-from selfcal.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
-from selfcal.readings import Readings, look
-from selfcal.recording import Recording, list_of, load
-from selfcal.rest import rest_of
-from selfcal.units import factor, parameter_unit
+from selfcal.adequacy.document import check_writable
+from selfcal.base import units as unit_module
+from selfcal.base.errors import UserError, note, remark, short
+from selfcal.base.output import write_text
+from selfcal.base.units import factor, parameter_unit
+from selfcal.logs.loaders import Reading
+from selfcal.logs.recording import Recording, list_of, load
+from selfcal.model.file import DEFAULT, LONGEST_TEXT, SENSORS, Group, Model, Prior
+from selfcal.readings.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
+from selfcal.readings.readings import Readings, look
+from selfcal.readings.rest import rest_of
 
 #: What a data sheet may state of a group or an axis, and what it states of the part. `density` is one-sided, as data
 #: sheets have it; an angle or velocity random walk is N.

@@ -25,20 +25,20 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from selfcal import units
-from selfcal.allan import information_of, terms_of
-from selfcal.document import check_writable, write_json
-from selfcal.errors import UserError, printable, short
-from selfcal.laws import PLACES, Law
-from selfcal.model import Model, Regressor
-from selfcal.plot import COLORS, check_picture, save_picture
-from selfcal.regressors import coefficient_unit, offered
-from selfcal.result import HALF_90
-from selfcal.spread import Row, record_seeds, spread
+from selfcal.adequacy.allan import information_of, terms_of
+from selfcal.adequacy.document import check_writable, write_json
+from selfcal.bank.result import HALF_90
+from selfcal.base import units
+from selfcal.base.errors import UserError, printable, short
+from selfcal.batch.spread import Row, record_seeds, spread
+from selfcal.batch.verdicts import duration_words
+from selfcal.model.file import Model, Regressor
+from selfcal.model.laws import PLACES, Law
+from selfcal.model.regressors import coefficient_unit, offered
+from selfcal.model.tables import make_tables
+from selfcal.show.plot import COLORS, check_picture, save_picture
 from selfcal.studies.montecarlo import has_nodes, simulate_bank_samples
-from selfcal.tables import make_tables
 from selfcal.verbs.simulate import truth_of
-from selfcal.verdicts import duration_words
 
 SCHEMA = "selfcal.plan/1"
 Floats = NDArray[np.float64]
@@ -282,7 +282,7 @@ def _cycling(
 
 def coefficient_rows(model: Model, axis: str, samples: int, cycles: float, swing: float, seed: int) -> list[Row]:
     """Half the 90 % interval of the coefficient of the model's only regressor, whose channel follows a cosine."""
-    from selfcal.engines.library import Bank
+    from selfcal.bank.library import Bank
 
     (regressor,), group = model.regressors, model.group_of(axis)
     law, truth = part_of(replace(model, regressors=()), axis, seed)
@@ -309,7 +309,7 @@ def part_of(model: Model, axis: str, seed: int) -> tuple[str, dict[str, float]]:
 
 def rows_of(model: Model, axis: str, wishes: Sequence[Wish], samples: int, seed: int) -> list[Row]:
     """One record of the part: its law, truth, and the metric of each wish."""
-    from selfcal.engines.library import Bank
+    from selfcal.bank.library import Bank
 
     law, truth = part_of(model, axis, seed)
     y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)

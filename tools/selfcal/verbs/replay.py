@@ -22,25 +22,24 @@ from typing import Any, Unpack
 import numpy as np
 from rich.console import Console
 
-from selfcal.ahead import error_ahead, of_report
-from selfcal.blocks import usable_blocks
-from selfcal.checks import Judged, judge, with_drift, with_readings
-from selfcal.dbc_file import HYPOTHESES
-from selfcal.document import Identified, as_typed, check_writable, to_document, write_json
-from selfcal.ending import held
-from selfcal.errors import OutsidePriors, UserError, called, note
-from selfcal.firmware import Played
-from selfcal.gate import table_of as gate_of
-from selfcal.live import View, frame_counts
-from selfcal.loaders import Reading
-from selfcal.model import Model
-from selfcal.on_wire import places, sent
-from selfcal.one_over_f import weigh, with_white
-from selfcal.plot import check_picture, plot_run
-from selfcal.priors import add_sources, for_record
-from selfcal.readings import look
-from selfcal.recording import SIDE_CHANNELS, Recording, as_float, list_of, load
-from selfcal.regressors import (
+from selfcal.adequacy.checks import Judged, judge, with_drift, with_readings
+from selfcal.adequacy.document import Identified, as_typed, check_writable, to_document, write_json
+from selfcal.adequacy.one_over_f import weigh, with_white
+from selfcal.adequacy.summary import summarize
+from selfcal.bank.blocks import usable_blocks
+from selfcal.bank.firmware import Played
+from selfcal.bank.result import AxisResult, in_unit
+from selfcal.base.ending import held
+from selfcal.base.errors import OutsidePriors, UserError, called, note
+from selfcal.base.results import Identification
+from selfcal.base.units import factor as factor_of
+from selfcal.base.units import same_kind
+from selfcal.diagnosis.warm import Start, warmed
+from selfcal.diagnosis.warm import load as load_start
+from selfcal.logs.loaders import Reading
+from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, list_of, load
+from selfcal.model.file import Model
+from selfcal.model.regressors import (
     Choice,
     Inclusion,
     Scored,
@@ -52,17 +51,18 @@ from selfcal.regressors import (
     normal_coefficient,
     offered,
 )
-from selfcal.result import AxisResult, in_unit
-from selfcal.results import Identification
-from selfcal.summary import summarize
-from selfcal.tables import Tables, bank_block, make_tables
-from selfcal.units import factor as factor_of
-from selfcal.units import same_kind
+from selfcal.model.tables import Tables, bank_block, make_tables
+from selfcal.readings.gate import table_of as gate_of
+from selfcal.readings.priors import add_sources, for_record
+from selfcal.readings.readings import look
+from selfcal.show.plot import check_picture, plot_run
 from selfcal.verbs.codegen import check_forms, write_tables
 from selfcal.verbs.identify import chosen_axes, may_act, with_reasons
-from selfcal.warm import Start, warmed
-from selfcal.warm import load as load_start
-from selfcal.wire import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
+from selfcal.wire.ahead import error_ahead, of_report
+from selfcal.wire.dbc_file import HYPOTHESES
+from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
+from selfcal.wire.live import View, frame_counts
+from selfcal.wire.on_wire import places, sent
 
 MAGIC = b"SELFCAL2"
 #: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.

@@ -13,23 +13,23 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from selfcal import units
+from selfcal.adequacy.document import check_writable, recording_entry, write_json
+from selfcal.base import units
+from selfcal.base.errors import UserError, printable
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
 from selfcal.diagnosis.record import Record, of_recording, why_left_out
-from selfcal.diagnosis.state import ALIKE, NET_LEAST, State
-from selfcal.diagnosis.statemodel import Array
 from selfcal.diagnosis.transfer import PROBABILITY, Empirical, Input, Posterior, Tried
-from selfcal.document import check_writable, recording_entry, write_json
-from selfcal.errors import UserError, printable
-from selfcal.forms import POWER
-from selfcal.held import updates
-from selfcal.loaders import Reading
-from selfcal.model import Model
-from selfcal.plot import check_picture, save_picture
-from selfcal.recording import SIDE_CHANNELS, Recording, bridged, list_of, load
-from selfcal.regressors import coefficient_unit
+from selfcal.likelihood.state import ALIKE, NET_LEAST, State
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.loaders import Reading
+from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged, list_of, load
+from selfcal.model.file import Model
+from selfcal.model.forms import POWER
+from selfcal.model.regressors import coefficient_unit
+from selfcal.readings.held import updates
+from selfcal.show.plot import check_picture, save_picture
 from selfcal.verbs.diagnose import BELOW_LATTICE
 from selfcal.verbs.identify import stretch_of
 

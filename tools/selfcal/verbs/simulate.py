@@ -12,15 +12,17 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.console import Console
 
-from selfcal import _reference, recording, units
+from selfcal import _reference
+from selfcal.adequacy.one_over_f import FLICKER, beside_its_law
+from selfcal.base import units
+from selfcal.base.errors import UserError, printable
+from selfcal.base.output import check_place
 from selfcal.diagnosis.cause import Cause, Channels, Key, Setting, is_count
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.errors import UserError, printable
-from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
-from selfcal.model import Group, Model
-from selfcal.one_over_f import FLICKER, beside_its_law
-from selfcal.output import check_place
-from selfcal.tables import bank_block
+from selfcal.logs import recording
+from selfcal.model.file import Group, Model
+from selfcal.model.laws import NAMED, PARAMETERS, PLACES, Law
+from selfcal.model.tables import bank_block
 
 #: Readings, samples times axes, of a recording, which is made in memory: 4 GB.
 MOST_READINGS = 100_000_000

@@ -12,12 +12,12 @@ import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
 from selfcal.diagnosis.causes import quantization_noise
-from selfcal.diagnosis.fit import Fit, best, fit, moved
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State, interval, net
-from selfcal.diagnosis.statemodel import Array
-from selfcal.laws import RATIO_LIMITS
+from selfcal.likelihood.fit import Fit, best, fit, moved
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, interval, net
+from selfcal.likelihood.statemodel import Array
+from selfcal.model.laws import RATIO_LIMITS
 
 
 def looks(state: State, record: Record) -> list[Look]:

@@ -15,10 +15,10 @@ from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import ALIKE, Look, State
-from selfcal.diagnosis.statemodel import Array
-from selfcal.forms import formed
-from selfcal.regressors import coefficient_unit
+from selfcal.likelihood.state import ALIKE, Look, State
+from selfcal.likelihood.statemodel import Array
+from selfcal.model.forms import formed
+from selfcal.model.regressors import coefficient_unit
 
 #: Windows of a rate, s: another axis moves faster than a temperature.
 RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)

@@ -7,10 +7,10 @@ from dataclasses import replace
 from typing import Any
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
-from selfcal.diagnosis.fit import Fit, best, fit, ln_likelihood, moved, run
 from selfcal.diagnosis.model_tree import add_law
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, State, net
+from selfcal.likelihood.fit import Fit, best, fit, ln_likelihood, moved, run
+from selfcal.likelihood.state import Look, State, net
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The size of 1/f noise is at its limit of nothing in
 #: most of them: 11 instead of 68 showed 3 nats at the price of one look.

@@ -12,8 +12,8 @@ import numpy as np
 
 from selfcal._reference import Random
 from selfcal.diagnosis.cause import Cause, counted, medians, positive
-from selfcal.diagnosis.state import Look
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.state import Look
+from selfcal.likelihood.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:

@@ -1,4 +1,4 @@
-"""The sensor was moved or shaken. `selfcal.motion` finds the stretches of one axis in the raw readings, before any fit;
+"""The sensor was moved or shaken. `selfcal.readings.motion` finds the stretches of one axis in the raw readings, before any fit;
 `integrity.motion` the quieter ones afterwards, by energy that several axes share."""
 
 from __future__ import annotations
@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from selfcal.diagnosis.cause import Cause, Key, counted, shown
-from selfcal.diagnosis.state import Look
-from selfcal.motion import Moved, joined
+from selfcal.likelihood.state import Look
+from selfcal.readings.motion import Moved, joined
 
 
 def look_of(parts: Sequence[Moved]) -> Look:

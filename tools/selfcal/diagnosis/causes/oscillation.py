@@ -15,16 +15,16 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.bank.result import HALF_90
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Key, medians, positive, shown
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
-from selfcal.diagnosis.fit import Fit, Series, best, fit, ln_likelihood, run
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, State, net
-from selfcal.diagnosis.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms
 from selfcal.diagnosis.statistics import swinging
-from selfcal.laws import RATIO_LIMITS, swing
-from selfcal.result import HALF_90
+from selfcal.likelihood.fit import Fit, Series, best, fit, ln_likelihood, run
+from selfcal.likelihood.state import Look, State, net
+from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms
+from selfcal.model.laws import RATIO_LIMITS, swing
 
 #: Periods in a record at least.
 TURNS_LEAST = 3.0

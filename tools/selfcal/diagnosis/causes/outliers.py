@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
-from selfcal.diagnosis.fit import run
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.fit import run
+from selfcal.likelihood.state import NET_LEAST, Look, State, interval, net
+from selfcal.likelihood.statemodel import Array
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The two numbers of a mixture are at their limits in
 #: most of them: 5 instead of 1350 / e gained 2.5 nats.

@@ -14,10 +14,10 @@ from scipy.optimize import minimize_scalar
 
 from selfcal.diagnosis.cause import Cause, Key, medians
 from selfcal.diagnosis.finding import Diagnosed
-from selfcal.diagnosis.fit import Fit, finish, fit, moved
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
-from selfcal.diagnosis.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array
+from selfcal.likelihood.fit import Fit, finish, fit, moved
+from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
+from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array
 
 #: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
 TURNS_LEAST, BAND_TURNS = 1.5, 3.0

@@ -16,12 +16,12 @@ import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, raised, scan
-from selfcal.diagnosis.fit import Fit, Series, ln_det, shifts
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import Look, Regressor, State, gain_for, ln_looks, mixture, net
-from selfcal.diagnosis.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Terms
+from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
+from selfcal.likelihood.state import Look, Regressor, State, gain_for, ln_looks, mixture, net
+from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Terms
 
 #: Blocks that the pairs are looked for in, and places of a step among them.
 BLOCKS, PLACES = 3000, 96

@@ -14,7 +14,7 @@ import numpy as np
 from selfcal._reference import Random
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, positive, shown
 from selfcal.diagnosis.model_tree import digits
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:

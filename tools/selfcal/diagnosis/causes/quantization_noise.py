@@ -15,14 +15,14 @@ from typing import Any
 
 import numpy as np
 
-from selfcal import units
+from selfcal.base import units
 from selfcal.diagnosis.cause import Cause, Channels, Extension, medians, positive, shown
-from selfcal.diagnosis.fit import Fit
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, Look, State, interval, net
-from selfcal.diagnosis.statemodel import Array, Terms
-from selfcal.laws import RATIO_LIMITS
+from selfcal.likelihood.fit import Fit
+from selfcal.likelihood.state import NET_LEAST, Look, State, interval, net
+from selfcal.likelihood.statemodel import Array, Terms
+from selfcal.model.laws import RATIO_LIMITS
 
 #: The prior of the spectral ratio reaches so many times either way about the recording's, and never above 1.
 WITHIN = 5.0

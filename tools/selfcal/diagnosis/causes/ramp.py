@@ -7,8 +7,8 @@ from typing import Any
 from selfcal.diagnosis.cause import Cause, Key, medians, shown
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, interval, mixture, net
-from selfcal.regressors import coefficient_unit
+from selfcal.likelihood.state import SCREEN, Look, Regressor, State, interval, mixture, net
+from selfcal.model.regressors import coefficient_unit
 
 
 def looks(state: State, record: Record) -> list[Look]:

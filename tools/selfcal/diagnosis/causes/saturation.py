@@ -7,7 +7,7 @@ import numpy as np
 from selfcal.diagnosis.cause import Cause, Extension, positive, shown
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.readings import ROUNDED
+from selfcal.readings.readings import ROUNDED
 
 
 def _within(record: Record, axis: str, limit: float) -> bool:

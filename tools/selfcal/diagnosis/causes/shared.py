@@ -21,8 +21,8 @@ from selfcal.diagnosis.cause import Cause, shown
 from selfcal.diagnosis.causes.cross_axis import without
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import ALIKE, NET_LEAST, Look, State, gain_for, interval, net
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, interval, net
+from selfcal.likelihood.statemodel import Array
 
 #: Bands are thirds of an octave, of so many bins of the spectrum at least.
 PARTS, BINS_LEAST = 3, 16

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Key, medians, shown, sized
-from selfcal.diagnosis.fit import Fit, Series, ln_det, shifts
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
-from selfcal.diagnosis.statemodel import Array, Mask
+from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
+from selfcal.likelihood.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
+from selfcal.likelihood.statemodel import Array, Mask
 
 #: A place is looked at where the level before it leaves this share of a step's information, at least; and until what is
 #: left of the record knows a step by this share of the information of one in its middle.

@@ -7,7 +7,7 @@ from typing import Any
 
 from selfcal._reference import Random
 from selfcal.diagnosis.cause import Cause, counted
-from selfcal.diagnosis.statemodel import Array
+from selfcal.likelihood.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:

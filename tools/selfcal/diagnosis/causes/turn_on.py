@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
-from selfcal.diagnosis.fit import Fit, Series, run
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, mixture, net
-from selfcal.diagnosis.statemodel import Array, Terms
+from selfcal.likelihood.fit import Fit, Series, run
+from selfcal.likelihood.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, mixture, net
+from selfcal.likelihood.statemodel import Array, Terms
 
 #: The fastest time constant looked for, samples.
 FASTEST = 5.0

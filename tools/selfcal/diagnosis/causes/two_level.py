@@ -21,8 +21,8 @@ from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
-from selfcal.diagnosis.statemodel import Array, Mask
+from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
+from selfcal.likelihood.statemodel import Array, Mask
 
 #: Tried first: amplitudes over the white noise of a block, dwell times in blocks, ln of the drift over the fitted one.
 AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)

@@ -17,9 +17,9 @@ from selfcal.diagnosis.causes import vibration
 from selfcal.diagnosis.forms import LN_SMOOTHINGS, SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.diagnosis.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
-from selfcal.diagnosis.statemodel import Array
-from selfcal.recording import SIDE_CHANNELS
+from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import SIDE_CHANNELS
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0

@@ -12,10 +12,10 @@ from selfcal.diagnosis import forms
 from selfcal.diagnosis.cause import Cause, Channels, Key, shown
 from selfcal.diagnosis.forms import LN_SLOW, Channel
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.diagnosis.state import Look, State
-from selfcal.diagnosis.statemodel import Array
-from selfcal.forms import variance_of
-from selfcal.recording import bridged
+from selfcal.likelihood.state import Look, State
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import bridged
+from selfcal.model.forms import variance_of
 
 #: Widths of the means of a variance, s.
 WIDTHS_S = (1.0, 3.0, 10.0, 30.0, 90.0)

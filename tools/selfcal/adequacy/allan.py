@@ -1,0 +1,414 @@
+"""The Allan deviation of a record and of the laws: closed forms, and how far apart the two may be.
+
+Every law is a sum of terms: white noise, a random walk, Gauss-Markov drifts. With X the sum of the readings of a term,
+one even function G tells all that is needed here: for weights that remove a line, the covariance of two weighted sums
+of X is the sum of the weights times G at the distance between them. At m readings apart
+
+    u_k = (X_(k+2m) - 2 X_(k+m) + X_k) / m,     Allan variance = E[u^2] / 2,     and Cov(u_k, u_(k+j)) follow from G.
+
+Readings are the bank's: means over blocks of samples, at whose instants the drift is a point. Of readings that are no
+means a random walk's Allan variance is K^2 tau / 3 (1 + 1 / (2 m^2)), of means over many samples the continuous one,
+K^2 tau / 3.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft
+from scipy.special import gammaincinv, ndtri
+
+from selfcal.bank.result import HALF_90, Estimate
+from selfcal.model.file import Group
+from selfcal.model.laws import Law, averaged, named
+
+_Floats = NDArray[np.float64]
+
+#: A record is this many times as long as the longest averaging time: fewer windows say little.
+LONGEST = 5
+#: Step in the ln of a parameter for derivatives.
+_STEP = 1e-3
+#: Correlation times after which a Gauss-Markov drift is forgotten.
+_FORGOTTEN = 14.0
+#: Where the record's Allan variance and the model's are nearly one number, S - V is the small difference of two: at
+#: least this part of S is left.
+_LEAST_LEFT = 0.2
+#: Posterior draws of the band.
+_DRAWS = 200
+#: Averaging times of a curve.
+_PER_OCTAVE = 4
+#: Stretches without a gap, the longest ones, that the deviation of a recording's samples is made from.
+_MOST_STRETCHES = 200
+
+
+@dataclass(frozen=True)
+class Terms:
+    """A law at one value of its parameters, per reading: the white noise's `variance` and its correlation `lag1` with
+    the reading before, the variance of the walk's `step`, and each Gauss-Markov drift's variance and its bandwidth
+    times the interval between readings. An oscillation is the real part of one whose numbers are complex. `lacking`:
+    variance of white noise that the drift's averages lack (laws.averaged)."""
+
+    variance: float
+    lag1: float = 0.0
+    step: float = 0.0
+    markov: tuple[tuple[complex, complex], ...] = ()
+    lacking: float = 0.0
+
+    def sums(self, j: _Floats) -> _Floats:
+        """G at the distances `j`, whole or not."""
+        j = np.abs(j)
+        found = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
+        if self.lag1:
+            found = found - self.variance * self.lag1 * np.maximum(j, 1.0)
+        for variance, alpha in self.markov:
+            phi, left = np.exp(-alpha), -np.expm1(-alpha)
+            found = found - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
+        return np.asarray(found)
+
+    def allan_variance(self, m: _Floats) -> _Floats:
+        """At `m` readings."""
+        return np.asarray((3.0 * self.sums(0.0 * m) - 4.0 * self.sums(m) + self.sums(2.0 * m)) / m**2)
+
+    def covariance(self, m: int, lags: int) -> _Floats:
+        """Cov(u_k, u_(k+j)) for j = 0 to `lags` - 1."""
+        near = np.arange(min(lags, 2 * m + 2), dtype=float)
+        weights = {0: 6.0, m: -4.0, -m: -4.0, 2 * m: 1.0, -2 * m: 1.0}
+        found = sum(weight * self.sums(near + shift) for shift, weight in weights.items()) / m**2
+        far = np.zeros(lags - near.size)
+        for variance, alpha in self.markov:  # farther than 2 m the others have none
+            j = np.arange(near.size, lags, dtype=float)
+            scale = variance * np.exp(-alpha) / np.expm1(-alpha) ** 2 * np.expm1(-alpha * m) ** 4 / m**2
+            far -= (scale * np.exp(-alpha * (j - 2 * m))).real
+        return np.concatenate([found, far])
+
+    def spectrum(self, omega: _Floats) -> _Floats:
+        """Power of the readings at `omega` rad a reading; white noise of variance 1 has 1."""
+        step = 4.0 * np.sin(0.5 * omega) ** 2  # |1 - e^(i omega)|^2
+        found = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
+        for variance, alpha in self.markov:
+            found = found - (variance * np.expm1(-2.0 * alpha) / (np.expm1(-alpha) ** 2 + np.exp(-alpha) * step)).real
+        return np.asarray(found)
+
+
+def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
+    """A law at `parameters` (continuous time, units.py), for readings every `dt_s`, means of `block` samples."""
+    drift, second = law.node(parameters)
+    variance, lag1 = parameters["N"] ** 2 / dt_s, 0.0
+    if law.coloured_noise:
+        theta = (second - 1.0) / (second + 1.0)
+        variance, lag1 = variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
+    step = sum((term.deviation * drift) ** 2 * dt_s for term in law.terms if term.kind == "walk")
+    lacking = (1.0 - 1.0 / block**2) * step / 6.0
+    markov: list[tuple[complex, complex]] = []
+    for term in law.terms:
+        if term.kind != "walk":
+            alpha = term.bandwidth * (1.0 if term.stated else second)
+            sigma = term.deviation * drift * (second if term.by_ratio else 1.0)
+            own = sigma**2 / (alpha if law.has_walk else 1.0)
+            if term.kind == "oscillation":  # alpha is 2 pi over its period
+                share = math.sqrt(1.0 - term.damping**2)
+                mean = 1.0 - (alpha * dt_s) ** 2 * (1.0 - 1.0 / block**2) / 12.0
+                pole = complex(term.damping, -share)
+                markov.append((own * mean * complex(1.0, -term.damping / share), alpha * dt_s * pole))
+                continue
+            gain, without = averaged(alpha * dt_s, block)
+            markov.append((own * gain, alpha * dt_s))
+            lacking += own * without
+    return Terms(variance, lag1, step, tuple(markov), lacking)
+
+
+def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
+    """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading, and which ones
+    those are [n - 2 m + 1]. NaN without any."""
+    missing = np.isnan(y)
+    total = np.concatenate([[0.0], np.cumsum(np.where(missing, 0.0, y))])
+    absent = np.concatenate([[0], np.cumsum(missing)])
+    whole = absent[2 * m :] == absent[: -2 * m]
+    u = (total[2 * m :] - 2.0 * total[m:-m] + total[: -2 * m])[whole] / m
+    return (0.5 * float((u**2).mean()) if u.size else math.nan), whole
+
+
+def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
+    """Variance of the overlapping Allan variance over windows `whole`, over its mean squared, under `terms`: normal
+    readings have Var = 2 / M^2 sum of Cov(u_k, u_l)^2 / 4."""
+    count = int(whole.sum())
+    memory = max((_FORGOTTEN / alpha.real for _, alpha in terms.markov), default=0.0)
+    lags = min(whole.size, 2 * m + 2 + math.ceil(memory))
+    if whole.all():
+        pairs = count - np.arange(lags, dtype=float)
+    else:
+        size = fft.next_fast_len(whole.size + lags, real=True)
+        power = np.abs(fft.rfft(whole.astype(np.float32), size)) ** 2
+        pairs = fft.irfft(power, size)[:lags].astype(float)
+    square = terms.covariance(m, lags) ** 2
+    return float((2.0 * (pairs @ square) - pairs[0] * square[0]) * 2.0 / (count**2 * square[0]))
+
+
+@dataclass(frozen=True)
+class Fit:
+    """The curve of a law whose parameters were estimated from a record, at `m` [t] readings: `allan_variance` [t] at
+    the `terms` of the estimate, `jacobian` [d, t] of its logarithm in the ln of each parameter, `ln_estimate` [d], and
+    `covariance` [d, d] of those logarithms."""
+
+    terms: Terms
+    allan_variance: _Floats
+    jacobian: _Floats
+    ln_estimate: _Floats
+    covariance: _Floats
+
+    @property
+    def variance(self) -> _Floats:
+        """Of the curve's logarithm [t], as the estimate has it."""
+        return np.asarray(np.einsum("dt,de,et->t", self.jacobian, self.covariance, self.jacobian))
+
+
+def _around(
+    of: Law, ln_estimate: _Floats, dt_s: float, white: float, block: int
+) -> tuple[Callable[[_Floats], Terms], list[tuple[Terms, Terms]]]:
+    """The terms at given ln parameters, and those a step to either side of `ln_estimate` in each."""
+
+    def at(ln_theta: _Floats) -> Terms:
+        theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
+        terms = terms_of(of, theta, dt_s, block)
+        return replace(terms, variance=terms.variance * white)
+
+    return at, [(at(ln_estimate + step), at(ln_estimate - step)) for step in np.eye(ln_estimate.size) * _STEP]
+
+
+def information_of(
+    of: Law, parameters: Mapping[str, float], dt_s: float, n: float, white: float = 1.0, block: int = 1
+) -> _Floats:
+    """What `n` readings every `dt_s` say of ln of each parameter, [d, d].
+
+    Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum."""
+    ln_estimate = np.log([parameters[name] for name in of.parameters])
+    _, sides = _around(of, ln_estimate, dt_s, white, block)
+    k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
+    omega = 2.0 * math.pi * k / n
+    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * _STEP)
+    return np.asarray((slopes * np.gradient(k)) @ slopes.T, np.float64)
+
+
+def fit_of(
+    law: str,
+    parameters: Mapping[str, float],
+    group: Group,
+    dt_s: float,
+    n: float,
+    m: _Floats,
+    white: float = 1.0,
+    block: int = 1,
+) -> Fit:
+    """The curve at `parameters` that `n` readings have determined, beside the group's priors. `white` multiplies the
+    white noise's variance. A reading is the mean of `block` samples."""
+    of = group.laws[law]
+    ln_estimate = np.log([parameters[name] for name in of.parameters])
+    information = information_of(of, parameters, dt_s, n, white, block)
+    prior = [group.priors[name].ln_sd ** -2 for name in of.parameters]
+    at, sides = _around(of, ln_estimate, dt_s, white, block)
+    jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * _STEP)
+    covariance = np.linalg.inv(information + np.diag(prior))
+    terms = at(ln_estimate)
+    return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.asarray(covariance, np.float64))
+
+
+def lengths(n: int, per_octave: int = 1) -> NDArray[np.int64]:
+    """2 readings, twice as many and so on to a fifth of `n`, and with `per_octave` some between."""
+    octaves = math.log2(n / (2 * LONGEST)) if n > 2 * LONGEST else -1.0
+    return np.unique(
+        np.rint(2.0 ** (1.0 + np.arange(math.floor(octaves * per_octave) + 1) / per_octave)).astype(np.int64)
+    )
+
+
+def deviations(ratio: float, variance: float) -> float:
+    """How many standard deviations an Allan variance is above its mean, being `ratio` times it with that relative
+    `variance`: it has the distribution of chi-square over its degrees of freedom, whose cube root is normal (Wilson &
+    Hilferty 1931)."""
+    ninth = variance / 9.0  # 2 / (9 degrees of freedom)
+    return (math.cbrt(ratio) - (1.0 - ninth)) / math.sqrt(ninth)
+
+
+def ratio_at(deviations: float, variance: float) -> float:
+    """The ratio that is so many standard deviations above 1, 0 where there is none."""
+    ninth = variance / 9.0
+    return max(0.0, 1.0 - ninth + deviations * math.sqrt(ninth)) ** 3
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Allan deviation of a record of bank readings beside a law's that was identified from it, at `tau_s` [t], s.
+
+    `recording` [t] with its `freedom`, the equivalent degrees of freedom of its square under the law; `model` [t] at
+    the posterior medians with the limits `model_q05` and `model_q95` [t]; `octave` [t] says which are octaves of two
+    readings. `deviations` [t]: by how many standard deviations the record's variance is above the model's, `left` [t]
+    being the variance of the logarithm of their ratio.
+    """
+
+    tau_s: _Floats
+    recording: _Floats
+    freedom: _Floats
+    model: _Floats
+    model_q05: _Floats
+    model_q95: _Floats
+    octave: NDArray[np.bool_]
+    deviations: _Floats
+    left: _Floats
+
+    def within(self, deviations: float) -> _Floats:
+        """The record's Allan deviation [t] if it were so many standard deviations above the model's."""
+        return self.model * np.sqrt([ratio_at(deviations, variance) for variance in self.left.tolist()])
+
+
+def curve_of(
+    y: _Floats,
+    dt_s: float,
+    law: str,
+    estimates: Mapping[str, Estimate],
+    group: Group,
+    *,
+    white: float = 1.0,
+    half_life_s: float = 0.0,
+    block: int = 1,
+) -> Curve | None:
+    """Readings `y` every `dt_s` (NaN: missing), means of `block` samples, beside `law` at its posterior medians.
+
+    None if there are too few.
+
+    The record has also determined the parameters, so the two are nearer to each other than a record is to a curve known
+    beforehand. With a the logarithm of the record's Allan variance, S its variance about the true curve, and V the
+    posterior variance of the model's curve: how far the true curve is from the posterior's mean is independent of the
+    record, so S = Var(a - mean curve) + V, and the difference has the variance S - V.
+    """
+    # With forgetting the posterior rests on the last readings. Its sums, weighted by e^(-age / w), have the variance of
+    # 2 w readings and 1 - e^-2 of their weight on the last 2 w: Var = S + V - 2 (1 - e^-2) V.
+    memory, known = math.ceil(2.0 * half_life_s / math.log(2.0) / dt_s), 1.0
+    if 0 < memory < y.size:
+        y, known = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
+    n = int(np.isfinite(y).sum())
+    if n < 2 * LONGEST:
+        return None
+    y = y - float(np.nanmean(y))
+    found = [(int(m), *overlapping(y, int(m))) for m in lengths(n, _PER_OCTAVE)]
+    found = [entry for entry in found if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
+    m = np.array([entry[0] for entry in found], float)
+    recorded = np.array([entry[1] for entry in found])
+    medians = {name: estimate.median for name, estimate in estimates.items()}
+    fit = fit_of(law, medians, group, dt_s, n, m, white, block)
+    own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in found])
+    left = np.maximum(own - known * fit.variance, _LEAST_LEFT * own)
+    ratio = recorded / fit.allan_variance
+    low, high = _band(law, estimates, fit, group, dt_s, m, white, block)
+    return Curve(
+        m * dt_s,
+        np.sqrt(recorded),
+        2.0 / own,
+        np.sqrt(fit.allan_variance),
+        low,
+        high,
+        np.isin(m, lengths(n)),
+        np.array([deviations(*pair) for pair in zip(ratio.tolist(), left.tolist(), strict=True)]),
+        left,
+    )
+
+
+def _band(
+    law: str,
+    estimates: Mapping[str, Estimate],
+    fit: Fit,
+    group: Group,
+    dt_s: float,
+    m: _Floats,
+    white: float,
+    block: int,
+) -> tuple[_Floats, _Floats]:
+    """5 % and 95 % limits of the model's deviation over posterior draws."""
+    draws = posterior_draws(estimates, fit.covariance, _DRAWS)
+    curves = []
+    for row in zip(*draws.values(), strict=True):
+        terms = terms_of(group.laws[law], dict(zip(draws, map(float, row), strict=True)), dt_s, block)
+        curves.append(replace(terms, variance=terms.variance * white).allan_variance(m))
+    low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
+    return low, high
+
+
+def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats, count: int) -> dict[str, _Floats]:
+    """Values [count] of each parameter of a law: its own median and quantiles, and between parameters the correlation
+    of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive recurrence:
+    Roberts 2018), so that quantiles of functions of them are smooth."""
+    chosen = list(estimates.values())
+    sd = np.sqrt(np.diag(covariance))
+    d = len(chosen)
+    root = 2.0  # of x^(d+1) = x + 1
+    for _ in range(50):
+        root = (1.0 + root) ** (1.0 / (d + 1))
+    even = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, d + 1))) % 1.0
+    z = ndtri(even) @ np.linalg.cholesky(covariance / np.outer(sd, sd)).T
+    middle = np.log([e.median for e in chosen])
+    up = (np.log([e.q95 for e in chosen]) - middle) / HALF_90
+    down = (middle - np.log([e.q05 for e in chosen])) / HALF_90
+    draws = np.exp(middle + z * np.where(z > 0.0, up, down))
+    return dict(zip(estimates, draws.T, strict=True))
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """Overlapping Allan deviation of a recording's own samples at `tau_s` [t], s, with its 90 % interval."""
+
+    tau_s: _Floats
+    deviation: _Floats
+    q05: _Floats
+    q95: _Floats
+
+
+def sample_lengths(n: int, block: int) -> NDArray[np.int64]:
+    """1 of `n` samples, 2, 4 ... to two bank intervals of `block` samples, and from there in octaves of these."""
+    short = 2 ** np.arange(math.ceil(math.log2(2 * block)), dtype=np.int64)
+    return np.concatenate([short, block * lengths(n // block)])
+
+
+def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, m: NDArray[np.int64]) -> Sampled:
+    """At `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing
+    ones each.
+
+    A gap parts the record: each stretch without one has its deviation, and theirs are pooled by their number of terms.
+    The interval is that of chi-square with the degrees of freedom of the power law that has the curve's slope.
+    """
+    values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
+    broken = np.isnan(values)
+    ends = np.flatnonzero(np.diff(np.concatenate([[True], broken, [True]]).astype(np.int8)))
+    starts, stops = ends[::2], ends[1::2]
+    inner = np.flatnonzero((missing_before > 0) & ~broken)
+    cuts = np.setdiff1d(inner, starts)
+    starts, stops = np.sort(np.concatenate([starts, cuts])), np.sort(np.concatenate([stops, cuts]))
+    longest = np.argsort(starts - stops, kind="stable")[:_MOST_STRETCHES]
+    n = int((stops - starts)[longest].sum())
+    total, terms = np.zeros(m.size), np.zeros(m.size)
+    for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):
+        stretch = values[start:stop] - values[start:stop].mean()
+        for at in np.flatnonzero(2 * m < stretch.size).tolist():
+            variance, windows = overlapping(stretch, int(m[at]))
+            total[at] += windows.size * variance
+            terms[at] += windows.size
+    known = np.flatnonzero((terms >= m) & (total > 0.0))
+    m, deviation = m[known], np.sqrt(total[known] / terms[known])
+    slope = np.gradient(np.log(deviation), np.log(m)) if m.size > 1 else np.full(m.size, -0.5)
+    powers = np.clip(np.rint(2.0 * slope), -1.0, 1.0)
+    half = np.array([0.5 * freedom_of(power, length, n) for power, length in zip(powers, m.tolist(), strict=True)])
+    q05, q95 = (deviation * np.sqrt(half / gammaincinv(half, p)) for p in (0.95, 0.05))
+    return Sampled(m / rate_hz, deviation, q05, q95)
+
+
+def freedom_of(power: float, m: int, n: int) -> float:
+    """Equivalent degrees of freedom of the overlapping Allan variance at `m` of `n` readings, as Greenhall & Riley
+    (2003) define them, of noise whose variance goes as tau^`power`: -1 white, 0 flicker, 1 a walk."""
+    flicker = named("flicker")
+    terms = {
+        -1.0: Terms(1.0),
+        0.0: terms_of(flicker, {"N": 0.0, "B": 1.0, "alpha": 1.0 / m}, 1.0),
+        1.0: Terms(0.0, step=1.0),
+    }
+    return 2.0 / relative_variance(terms[power], m, np.ones(n - 2 * m + 1, np.bool_))

@@ -1,0 +1,270 @@
+"""Checks of adequacy: what in a record speaks against its most probable law."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import ndtr, ndtri
+
+from selfcal.adequacy.allan import Curve, curve_of, ratio_at, terms_of
+from selfcal.bank.blocks import MOST_DENSE, Blocks
+from selfcal.bank.result import AxisResult, Estimate
+from selfcal.base import units
+from selfcal.logs.recording import Recording
+from selfcal.model.file import Group, Prior
+from selfcal.model.tables import Tables
+from selfcal.readings.lattice import BELOW_LATTICE
+from selfcal.readings.readings import CLOCK_LEAST, Readings
+
+#: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
+CHECK_LIMIT = 4.0
+#: A part that is not from the batch, sd of `batch_check`: by chance one law's two parameters in 1000 parts.
+BATCH_LIMIT = 3.5
+#: A law of the batch has this prior probability at least.
+BATCH_LAW = 0.1
+#: Of the prior's variance, what a record that shows nothing leaves to compare by.
+LEFT_LEAST = 0.1
+#: Bank samples without which there are no checks.
+FEWEST = 20
+#: Share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at 0.9,
+#: where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
+HIDDEN_MOST = 0.84
+#: Spacing of float32 in the noise of a reading from which on it makes N too large: by 0.4 %.
+SPACING_MOST = 0.3
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A record against its most probable law, at its posterior medians: the `checks` of adequacy, and the `curve` of
+    its Allan deviation, None where the record is too short, or too long, to tell."""
+
+    checks: Mapping[str, Mapping[str, Any]]
+    curve: Curve | None
+
+
+def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: Sequence[int] = ()) -> Judged:
+    """What in the record speaks against the most probable law, with the columns `used`."""
+    law = result.best
+    medians = {name: estimate.median for name, estimate in result.parameters[law].items()}
+    if blocks.mean.size > MOST_DENSE or not all(math.isfinite(value) for value in medians.values()):
+        return Judged({}, None)
+    if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
+        return Judged({}, None)
+    curve = curve_of(
+        _unexplained(blocks, tables, result, used),
+        tables.dt_s,
+        law,
+        result.parameters[law],
+        group,
+        white=float(blocks.r[np.isfinite(blocks.mean)].mean()),
+        half_life_s=tables.half_life_s,
+        block=tables.block,
+    )
+    hidden = drift_check(tables, group, result)
+    if not all(one["passed"] for one in hidden.values()):
+        return Judged(hidden, curve)  # the other checks would show the same
+    checks = innovation_checks(blocks, tables, group, result, list(used))
+    unlike = batch_check(tables, group, result)
+    return Judged({**hidden, **unlike, **checks, **(allan_checks(curve) if curve else {})}, curve)
+
+
+def _unexplained(blocks: Blocks, tables: Tables, result: AxisResult, used: Sequence[int]) -> NDArray[np.float64]:
+    """The blocks' means [m] less what the columns `used` explain."""
+    if not used:
+        return blocks.mean
+    z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
+    return np.asarray(blocks.mean - z @ coefficients_of(result))
+
+
+def with_drift(
+    judged: Judged,
+    blocks: Blocks,
+    tables: Tables,
+    result: AxisResult,
+    recording: Recording,
+    others: Sequence[str],
+    used: Sequence[int] = (),
+) -> Judged:
+    """The same with the checks of the drift, where the others are made: `channel`, `turn_on`, `jump` (drift_checks.py).
+    `others`: the recording's columns that may act on the axis; `used`: the model's columns in use."""
+    if not judged.checks or blocks.mean.size > MOST_DENSE:
+        return judged
+    from selfcal.adequacy.drift_checks import drift_checks
+
+    blocks = replace(blocks, mean=_unexplained(blocks, tables, result, used))
+    return replace(judged, checks={**judged.checks, **drift_checks(blocks, tables, result, recording, others)})
+
+
+def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
+    """Does the drift of the most probable law, at its posterior medians, move little enough within an average? The
+    `value` is the share of the white noise at high frequency that it hides. Nothing where no readings are averaged."""
+    if tables.block == 1:
+        return {}
+    at = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
+    terms = terms_of(group.laws[result.best], at, tables.dt_s, tables.block)
+    share = terms.lacking / (terms.variance * (1.0 - 2.0 * terms.lag1))
+    return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
+
+
+def batch_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
+    """Is the part like the batch that log-normal priors describe? Else another law with wide priors takes its drift.
+
+    The `value` is the distance of a parameter from its prior's median: (m1 - m0)/sqrt(s0^2 - s1^2) of the posterior's
+    m1, s1 in the logarithm is normal (0, 1) if the part is from the batch. Of a law its largest distance counts, of the
+    laws of the batch the least. Nothing where no law that is likely a priori has a log-normal prior of its drift.
+    """
+    distances = []
+    for one in tables.hypotheses:
+        priors = {name: group.priors[name] for name in one.law.parameters if group.priors[name].law == "log_normal"}
+        if priors.keys() - {"N"} and one.ln_probability >= math.log(BATCH_LAW):
+            distances.append(max(_distance(result.parameters[one.name][name], prior) for name, prior in priors.items()))
+    if not distances:
+        return {}
+    value = min(distances)
+    return {"batch": {"value": value, "limit": BATCH_LIMIT, "passed": value <= BATCH_LIMIT}}
+
+
+def _distance(estimate: Estimate, prior: Prior) -> float:
+    """Standard deviations between the record and the prior. A posterior of nearly the prior's width states none."""
+    if not (estimate.q05 > 0.0 and math.isfinite(estimate.q95)):
+        return math.inf
+    left = max(prior.ln_sd**2 - estimate.ln_sd**2, LEFT_LEAST * prior.ln_sd**2)
+    return abs(math.log(estimate.median / prior.median)) / math.sqrt(left)
+
+
+def with_readings(
+    judged: Judged, readings: Readings, group: Group, unit: str, dt_s: float, *, as_fed: bool = False
+) -> Judged:
+    """The same with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
+
+    `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
+    noise of a reading; `step` in the recording's unit; `distinct` readings.
+    `saturation`, if some are clipped: their share, and the `at` of the limit.
+    `outliers`, if one value recurs too often: the share of these readings, and the value `at` which.
+    `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
+    `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
+    `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the largest
+    change of the sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
+    """
+    factor = units.factor(group.unit, unit)
+    checks: dict[str, dict[str, Any]] = {}
+    found = readings.lattice
+    if found is not None:
+        told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse_over(dt_s)}
+        checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct}
+    if readings.clipped is not None:
+        share = float(readings.clipped.mask.mean())
+        checks["saturation"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.clipped.limit * factor}
+    if readings.recurring is not None:
+        often = readings.recurring
+        checks["outliers"] = {"value": often.share, "limit": 0.0, "passed": False, "at": often.value * factor}
+    if readings.held is not None and not readings.held.even:
+        checks["held_samples"] = {"value": 1.0 - 1.0 / readings.held.ratio, "limit": 0.0, "passed": False}
+    if readings.moved is not None:
+        share, start_s = float(readings.moving.mean()), readings.recording.start_s
+        times = [[a + start_s, b + start_s] for a, b in readings.moved.intervals]
+        checks["motion"] = {"value": share, "limit": 0.0, "passed": False, "intervals": times}
+    if as_fed:
+        if readings.stuck.any():
+            checks["stuck"] = {"value": float(readings.stuck.mean()), "limit": 0.0, "passed": False}
+        if readings.changes:
+            ratio = max((one.after_hz / one.before_hz - 1.0 for one in readings.changes), key=abs)
+            checks["rate_change"] = {"value": ratio, "limit": CLOCK_LEAST, "passed": False}
+        if readings.coarse > SPACING_MOST:
+            checks["float_spacing"] = {"value": readings.coarse, "limit": SPACING_MOST, "passed": False}
+    return replace(judged, checks={**judged.checks, **checks})
+
+
+def against(checks: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
+    """The checks that speak against the model, the surest first: each with its distance in standard deviations.
+    Infinite where a check has none."""
+    failed = {name: one for name, one in checks.items() if not one["passed"]}
+    sure = {
+        name: abs(one.get("deviations", CHECK_LIMIT * one["value"] / one["limit"] if one["limit"] > 0.0 else math.inf))
+        for name, one in failed.items()
+    }
+    return dict(sorted(sure.items(), key=lambda item: -item[1]))
+
+
+def coefficients_of(result: AxisResult) -> NDArray[np.float64]:
+    """Posterior means [p] of the coefficients of the columns in use, under the most probable law."""
+    return np.array([mean for mean, _ in result.coefficients[result.best]])
+
+
+def allan_checks(curve: Curve) -> dict[str, dict[str, Any]]:
+    """Is the record's Allan deviation the model's, at averaging times of 2, 4, 8 ... bank intervals to a fifth of the
+    record? `value` is the model's deviation over the record's less 1, `limit` how far on this side it may be, and
+    `deviations` by how many standard deviations the record's variance is above the model's.
+    """
+    limit = allan_limit(curve)
+    checks = {}
+    for k in np.flatnonzero(curve.octave):
+        deviations = float(curve.deviations[k])
+        edge = ratio_at(math.copysign(limit, deviations), float(curve.left[k]))
+        checks[f"allan_{curve.tau_s[k]:g}s"] = {
+            "value": float(curve.model[k]) / float(curve.recording[k]) - 1.0 if curve.recording[k] > 0.0 else math.inf,
+            "limit": abs(edge**-0.5 - 1.0) if edge > 0.0 else math.inf,
+            "passed": abs(deviations) <= limit,
+            "deviations": deviations,
+        }
+    return checks
+
+
+def allan_limit(curve: Curve) -> float:
+    """How many standard deviations an averaging time may be off. All together fail as often as one other check
+    (CHECK_LIMIT): a single one counts as outside beyond the limit that makes this so (Bonferroni's). Once one is, every
+    one beyond CHECK_LIMIT is named."""
+    off = np.abs(curve.deviations[curve.octave])
+    alone = float(-ndtri(ndtr(-CHECK_LIMIT) / max(off.size, 1)))
+    return CHECK_LIMIT if bool((off > alone).any()) else alone
+
+
+def innovation_checks(
+    blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: list[int]
+) -> dict[str, dict[str, Any]]:
+    """Are the innovations of the most probable law, at its posterior medians and with the columns `used`, of mean 0 (a
+    ramp that a random walk follows leaves one), white, normal and of one variance?"""
+    from selfcal import _reference
+
+    law = group.laws[result.best]
+    at = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
+    offset = float(np.nanmean(blocks.mean))
+    z = blocks.z - np.array([column.reference for column in tables.regressors])
+    sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
+    nu = _reference.innovations(
+        np.ascontiguousarray(blocks.mean - offset),
+        tables.dt_s,
+        -offset,
+        group.priors["bias"].sd,
+        law.as_tuple,
+        *law.node(at),
+        at["N"] / math.sqrt(tables.dt_s),
+        blocks.r,
+        np.ascontiguousarray(z[:, used]) if used else None,
+        sd[used] if used else None,
+        tables.block,
+    )[1 + len(used) :]  # the first ones are the bias and the coefficients
+    pairs = np.isfinite(nu[1:]) & np.isfinite(nu[:-1])
+    whole = nu[np.isfinite(nu)]
+    n = whole.size
+    half = n // 2
+    lag1 = float((nu[1:] * nu[:-1])[pairs].sum() / (whole**2).sum())
+    kurtosis = float(((whole - whole.mean()) ** 4).mean() / whole.var() ** 2 - 3.0)
+    nothing = 1e-30 * float(whole.var())  # of a dead band, a half may have no variance
+    ratio = math.log(max(float(whole[half:].var()), nothing) / max(float(whole[:half].var()), nothing))
+    # Standard deviations under white normal innovations.
+    checks = {
+        "innovation_mean": (float(whole.mean() / whole.std()), 1.0 / math.sqrt(n)),
+        "innovation_lag1": (lag1, 1.0 / math.sqrt(n)),
+        "innovation_excess_kurtosis": (kurtosis, math.sqrt(24.0 / n)),
+        "innovation_ln_variance_ratio_of_halves": (ratio, math.sqrt(8.0 / n)),
+    }
+    return {
+        name: {"value": value, "limit": CHECK_LIMIT * sd, "passed": abs(value) <= CHECK_LIMIT * sd}
+        for name, (value, sd) in checks.items()
+    }

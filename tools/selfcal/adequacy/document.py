@@ -1,0 +1,278 @@
+"""The JSON of `identify` and `replay`: `selfcal.identify/1`, and how every verb writes its JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from selfcal.adequacy.allan import Sampled
+from selfcal.adequacy.checks import Judged, against, allan_limit
+from selfcal.adequacy.summary import Number
+from selfcal.bank.result import AxisResult, Estimate
+from selfcal.base import units
+from selfcal.base.errors import UserError, printable, short
+from selfcal.base.output import check_place, write_text
+from selfcal.logs.recording import Recording
+from selfcal.model.regressors import Scored
+
+SCHEMA = "selfcal.identify/1"
+#: Where metadata have the device's serial number and the date.
+SERIALS, DATES = ("serial", "serial_number"), ("recorded_at", "date")
+#: Stamps between 2001 and 2100 count from 1970, s; no device is powered for so long.
+EPOCH_S = (1e9, 4.1e9)
+
+
+@dataclass(frozen=True)
+class Identified:
+    """One axis: the engine's `result` in `unit`, what was `judged` of its adequacy, the samples `kept_out`, and what is
+    known of the regressors, if the model has any for it (coefficients in `unit` too). `sampled`: the Allan deviation of
+    its samples, if it was asked for; as the curve of `judged` it is in the `group_unit`, and so are the numbers of the
+    `summary`. `halved_after`: see summary.py. `more_laws`: probabilities of the laws where the drift is 1/f noise."""
+
+    unit: str
+    group_unit: str
+    result: AxisResult
+    judged: Judged
+    kept_out: Mapping[str, int]
+    scored: Scored | None = None
+    sampled: Sampled | None = None
+    summary: Mapping[str, Number] = field(default_factory=dict)
+    halved_after: Mapping[str, float | None] = field(default_factory=dict)
+    more_laws: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def adequate(self) -> bool:
+        """All checks passed: nothing in the record speaks against the best model."""
+        return not against(self.judged.checks)
+
+
+@dataclass(frozen=True)
+class Telemetry:
+    """What a document says of samples that only a module has seen, as of a `Recording`. None: the module does not state
+    it. `duration_s` is the time of the last report."""
+
+    path: str
+    rate_hz: float
+    samples: int | None
+    duration_s: float
+    start_s: float = 0.0
+    since_power_on_s: float | None = None
+    paths: tuple[Path, ...] = ()
+    options: tuple[tuple[str, str], ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
+    """What a document says of its recording."""
+    return {
+        "path": str(recording.path),
+        "rate_hz": recording.rate_hz,
+        "samples": recording.samples,
+        "duration_s": recording.duration_s,
+        "start_s": recording.start_s,
+        "since_power_on_s": recording.since_power_on_s,
+        **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
+        **({"options": [list(one) for one in recording.options]} if recording.options else {}),
+        **({"notes": list(recording.notes)} if recording.notes else {}),
+        **(_origin(recording) if isinstance(recording, Recording) else {}),
+    }
+
+
+def _origin(recording: Recording) -> dict[str, str]:
+    """The device's serial number and the date, where the metadata have them; the date also by stamps since 1970."""
+    found = {}
+    for key, names in (("serial", SERIALS), ("recorded_at", DATES)):
+        stated = [recording.meta[name] for name in names if isinstance(recording.meta.get(name), str | int)]
+        if stated and str(stated[0]).strip():
+            found[key] = short(str(stated[0]).strip())
+    began = recording.started_s
+    if "recorded_at" not in found and began is not None and EPOCH_S[0] < began < EPOCH_S[1]:
+        found["recorded_at"] = datetime.fromtimestamp(math.floor(began), UTC).isoformat().replace("+00:00", "Z")
+    return found
+
+
+def as_typed(recording: Mapping[str, Any]) -> str:
+    """The files of a document's `recording`, and the options that read them, as a shell takes them."""
+    options = [word for name, value in recording.get("options", ()) for word in (name, value) if word]
+    return printable(shlex.join([*recording.get("paths", [recording["path"]]), *options]))
+
+
+def to_document(
+    recording: Recording | Telemetry,
+    found: Mapping[str, Identified | UserError],
+    *,
+    all_failed: Path | str | None = None,
+) -> dict[str, Any]:
+    """The JSON of the contract. An axis without a result has its reason in its place: {"error": ...}. Raises UserError
+    if no axis has a result; the reasons are then written to `all_failed`."""
+    reasons = {
+        name: str(axis).removeprefix(f"{recording.path}: ")
+        for name, axis in found.items()
+        if isinstance(axis, UserError)
+    }
+    if len(reasons) == len(found):
+        columns: dict[str, list[str]] = {}
+        for name, reason in reasons.items():
+            columns.setdefault(reason, []).append(name)
+        said = "; ".join(
+            f"column{'s' if len(names) > 1 else ''} {', '.join(names)}: {reason}" for reason, names in columns.items()
+        )
+        if all_failed is not None:
+            write_json(of_errors(SCHEMA, recording, reasons), all_failed)
+        raise UserError(f"{recording.path}: {said or 'no axis has a result'}")
+    return {
+        "schema": SCHEMA,
+        "recording": recording_entry(recording),
+        "axes": {
+            name: {"error": reasons[name]}
+            if isinstance(axis, UserError)
+            else {
+                "summary": _summary(axis),
+                "priors": None,  # a verb that knows the model states where they are from
+                "hypotheses": dict(axis.result.probability),
+                "log_evidence": dict(axis.result.log_evidence),
+                "parameters": parameters_entry(axis),
+                "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
+                "samples_kept_out": dict(axis.kept_out),
+                "adequate": axis.adequate,
+                **_own_rate(recording, name),
+                "checks": {key: dict(check) for key, check in axis.judged.checks.items()},
+                "allan": _allan(axis),
+                **regressors_entry(axis.scored),
+                **({"halved_after_s": dict(axis.halved_after)} if axis.halved_after else {}),
+                **({"more_laws": dict(axis.more_laws)} if axis.more_laws else {}),
+            }
+            for name, axis in found.items()
+        },
+    }
+
+
+def of_errors(schema: str, recording: Recording | Telemetry, reasons: Mapping[str, str]) -> dict[str, Any]:
+    """The document of a recording no axis of which has a result."""
+    axes = {name: {"error": reason} for name, reason in reasons.items()}
+    return {"schema": schema, "recording": recording_entry(recording), "axes": axes}
+
+
+def _own_rate(recording: Recording | Telemetry, name: str) -> dict[str, float]:
+    """The sampling rate of an axis that has its own."""
+    own = recording.columns[name].clock if isinstance(recording, Recording) else None
+    return {} if own is None else {"rate_hz": own.rate_hz}
+
+
+def parameters_entry(axis: Identified) -> dict[str, Any]:
+    """Posterior of every parameter, by law."""
+    return {
+        law: {
+            parameter: {
+                **_spread(e),
+                "unit": units.parameter_unit(parameter, axis.unit),
+                "identified": e.identified,
+                "off_grid": e.off_grid,
+            }
+            for parameter, e in estimates.items()
+        }
+        for law, estimates in axis.result.parameters.items()
+    }
+
+
+def _summary(axis: Identified) -> dict[str, Any] | None:
+    """The numbers of a data sheet, in the recording's units and in data sheets' own; None where they are not known."""
+    found: dict[str, Any] = {}
+    for key, number in axis.summary.items():
+        unit, sheet = units.parameter_unit(key, axis.unit), units.datasheet_unit(key, axis.unit)
+        own = number.estimate.scaled(units.factor(axis.group_unit, axis.unit))
+        found[key] = {**_spread(own), "unit": unit, "identified": own.identified, "reason": number.reason or None}
+        found[key]["datasheet"] = {**_spread(own.scaled(units.factor(unit, sheet))), "unit": sheet}
+    return found or None
+
+
+def _spread(e: Estimate) -> dict[str, float]:
+    return {"mean": e.mean, "median": e.median, "sd": e.sd, "q05": e.q05, "q95": e.q95}
+
+
+def _allan(axis: Identified) -> dict[str, Any] | None:
+    """The Allan deviation of the record's bank samples and of the most probable law, and of its own samples if that was
+    asked for; None where it is not known."""
+    curve, sampled = axis.judged.curve, axis.sampled
+    if curve is None:
+        return None
+    factor, limit = units.factor(axis.group_unit, axis.unit), allan_limit(curve)
+    found: dict[str, Any] = {
+        "unit": axis.unit,
+        "tau_s": curve.tau_s.tolist(),
+        "recording": (curve.recording * factor).tolist(),
+        "degrees_of_freedom": curve.freedom.tolist(),
+        "model": (curve.model * factor).tolist(),
+        "model_q05": (curve.model_q05 * factor).tolist(),
+        "model_q95": (curve.model_q95 * factor).tolist(),
+        "adequate_from": (curve.within(-limit) * factor).tolist(),
+        "adequate_to": (curve.within(limit) * factor).tolist(),
+    }
+    if sampled is not None:
+        found["samples"] = {
+            "tau_s": sampled.tau_s.tolist(),
+            "deviation": (sampled.deviation * factor).tolist(),
+            "q05": (sampled.q05 * factor).tolist(),
+            "q95": (sampled.q95 * factor).tolist(),
+        }
+    return found
+
+
+def regressors_entry(scored: Scored | None) -> dict[str, Any]:
+    """The keys an axis has beyond the contract's if its model has regressors."""
+    if scored is None:
+        return {}
+    return {
+        "regressors": {
+            name: {
+                "probability": inclusion.probability,
+                "coefficients": {
+                    c.column: {key: getattr(c, key) for key in ("mean", "median", "sd", "q05", "q95", "unit")}
+                    for c in inclusion.coefficients
+                },
+            }
+            for name, inclusion in scored.inclusion.items()
+        },
+        "regressors_in_use": [one.name for one in scored.choices[scored.best]],
+        "subsets": [
+            {"regressors": [one.name for one in choice], "probability": probability}
+            for choice, probability in zip(scored.choices, scored.probability, strict=True)
+        ],
+    }
+
+
+def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
+    """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
+    or that is there twice. None and '-' are none."""
+    taken = {Path(one).resolve() for one in inputs if one is not None}
+    for file in files:
+        if file is not None and str(file) != "-":
+            check_place(file)
+            if Path(file).resolve() in taken:
+                raise UserError(f"{file}: is read, or written as another output: give it a name of its own")
+            taken.add(Path(file).resolve())
+
+
+def write_json(document: Mapping[str, Any], path: Path | str) -> None:
+    """Write a document to a file, or to stdout for '-'. What JSON cannot say (infinity, not a number) becomes null."""
+    text = json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
+    if str(path) == "-":
+        sys.stdout.write(text)
+        return
+    write_text(path, text)
+
+
+def finite(value: Any) -> Any:
+    """`value` with None in place of every number that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

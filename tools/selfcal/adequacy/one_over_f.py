@@ -1,0 +1,155 @@
+"""1/f noise beside the laws of a model: how likely it is, its B, and the white noise beside it.
+
+The law `flicker` has three terms, so 1/f noise above the fastest one looks white to it: its N is too large. White noise
+beside 1/f noise is what the law's spectrum has more than B^2 / (2 pi f) at a third of the bank's rate. There the two
+agree best on records of 10 minutes to 4 hours (tests/noise_coverage.py).
+
+The paper's laws put the Allan deviation's minimum of true 1/f noise 10 to 40 % too high. So the data sheet's numbers
+weigh the law `flicker` beside the model's laws.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.adequacy.allan import LONGEST, fit_of, posterior_draws, terms_of
+from selfcal.bank.result import AxisResult, Estimate
+from selfcal.base.errors import UserError
+from selfcal.model.file import MOST_HYPOTHESES, Group, Prior
+from selfcal.model.laws import NAMED
+from selfcal.model.tables import HypothesisTable, Tables, make_grid, priors_of
+
+_Floats = NDArray[np.float64]
+
+FLICKER = "flicker"
+#: From this probability on the drift is 1/f noise. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
+#: root of a second, 5 reach 0.9 and none 0.97.
+SURE = 0.98
+#: Radians a bank interval at which the white noise is what the spectrum has beside 1/f noise.
+_OMEGA = 2.0 * math.pi / 3.0
+#: Images of the bank's rate that count: more change the density by 1e-4.
+_IMAGES = 100
+#: Of the law's own white noise, the least part that is left.
+_LEAST = 1e-3
+#: Nodes of rho and alpha, and bank intervals at most: longer records are averaged further.
+_NODES, _MOST = (24, 20), 20_000
+#: Limits of alpha times the bank's interval, as models/sums.yaml has them.
+_ALPHA = (2e-4, 0.2)
+#: A prior of sigma_m about a known batch is this much wider of B, either way.
+_WIDER = 10.0
+#: Draws of a posterior.
+_DRAWS = 1024
+
+
+def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
+    """[k], s: what 1/f noise of B = 1 has more than the law `flicker` of B = 1 and `alpha` [k] at a third of the bank's
+    rate, in means of `block` readings every `dt_s`. The readings have nothing above half their own rate."""
+    points = min(block, _IMAGES)
+    image = np.abs(_OMEGA + 2.0 * math.pi * np.arange(-points, points + 1))
+    image = image[image < math.pi * points]
+    passed = (np.sin(0.5 * image) / (points * np.sin(0.5 * image / points))) ** 2
+    whole = float((passed / image).sum())  # 1 / (2 pi f), f per interval
+    law = NAMED[FLICKER]
+    own = [
+        float(terms_of(law, {"N": 0.0, "B": 1.0, "alpha": one}, dt_s, block).spectrum(np.array(_OMEGA)))
+        for one in alpha.tolist()
+    ]
+    return np.asarray(dt_s * (whole - np.array(own)))
+
+
+def white_of(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floats:
+    """N [k] beside 1/f noise of draws [k] of the parameters of the law `flicker`."""
+    square = draws["N"] ** 2
+    left = square - density_above(draws["alpha"], dt_s, block) * draws["B"] ** 2
+    return np.asarray(np.sqrt(np.maximum(left, _LEAST**2 * square)))
+
+
+def beside_its_law(parameters: Mapping[str, float], dt_s: float, block: int) -> float:
+    """The law's N whose white noise is `parameters["N"]` beside 1/f noise: the inverse of white_of()."""
+    above = float(density_above(np.array([parameters["alpha"]]), dt_s, block)[0])
+    return math.sqrt(max(parameters["N"] ** 2 + above * parameters["B"] ** 2, 0.0))
+
+
+def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> AxisResult:
+    """The same with N of the law `flicker` beside 1/f noise. The result as it is without that law, or where the record
+    is too short for it."""
+    estimates = result.parameters.get(FLICKER, {})
+    medians = {name: estimate.median for name, estimate in estimates.items()}
+    if not estimates or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
+        return result
+    fit = fit_of(FLICKER, medians, group, dt_s, n, np.ones(1), block=block)
+    draws = posterior_draws(estimates, fit.covariance, _DRAWS)
+    white = white_of(draws, dt_s, block)
+    low, middle, high = np.quantile(white, (0.05, 0.5, 0.95)).tolist()
+    known = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
+    own = Estimate(float(white.mean()), middle, float(white.std()), low, high, known, estimates["N"].off_grid)
+    return replace(result, parameters={**result.parameters, FLICKER: {**estimates, "N": own}})
+
+
+@dataclass(frozen=True)
+class Beside:
+    """The law `flicker` beside a model's laws: its probability among them, and its posterior of `n` means over `block`
+    samples, one every `dt_s`, under the priors of `group`."""
+
+    probability: float
+    estimates: Mapping[str, Estimate]
+    group: Group
+    dt_s: float
+    n: int
+    block: int
+
+    def laws(self, probability: Mapping[str, float]) -> dict[str, float]:
+        """The probabilities of all laws where this one is sure; else none."""
+        if self.probability < SURE:
+            return {}
+        return {**{law: (1.0 - self.probability) * p for law, p in probability.items()}, FLICKER: self.probability}
+
+
+def weigh(
+    tables: Tables,
+    group: Group,
+    samples: NDArray[np.floating[Any]],
+    missing_before: NDArray[np.integer[Any]],
+    columns: NDArray[np.floating[Any]] | None = None,
+    mask: int = 0,
+    offset: float = 0.0,
+) -> Beside | None:
+    """The law `flicker` on the readings of the one axis of `tables`, with the prior odds of an average law of these.
+
+    `mask`: the columns in use. `offset`: see Bank. None where the tables have the law, no room for it, or no result.
+    """
+    from selfcal.bank.library import Bank
+
+    count = len(tables.hypotheses)
+    if count >= MOST_HYPOTHESES or any(one.name == FLICKER for one in tables.hypotheses):
+        return None
+    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * _MOST)))
+    dt_s, block = times * tables.dt_s, times * tables.block
+    drift = group.priors["sigma_m"]
+    wider = _WIDER if drift.law == "log_normal" else 1.0
+    priors = {
+        **group.priors,
+        "B": Prior("log_uniform", drift.min / wider, drift.max * wider),
+        "alpha": Prior("log_uniform", *(limit / dt_s for limit in _ALPHA)),
+    }
+    own = replace(group, priors=priors, laws={**group.laws, FLICKER: NAMED[FLICKER]})
+    rho, alpha = map(make_grid, _NODES)
+    law = NAMED[FLICKER]
+    one_more = HypothesisTable(FLICKER, law, -math.log(count + 1), rho, alpha, (priors_of(own, FLICKER),))
+    share = math.log(count / (count + 1))
+    others = (replace(one, ln_probability=one.ln_probability + share) for one in tables.hypotheses)
+    bank = Bank(replace(tables, dt_s=dt_s, block=block, hypotheses=(*others, one_more)), offset=offset)
+    bank.push(samples[:, None], missing_before, columns)
+    try:
+        found = bank.report(0, mask)
+    except UserError:
+        return None
+    if not math.isfinite(found.probability[FLICKER]):
+        return None
+    return Beside(found.probability[FLICKER], found.parameters[FLICKER], own, dt_s, found.n, block)

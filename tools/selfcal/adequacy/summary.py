@@ -1,0 +1,203 @@
+"""The numbers of a data sheet, of the posterior of all laws: white noise, random walk, bias instability, quantization.
+
+The white noise (angle random walk, of an accelerometer velocity random walk) is N. The rate random walk is K; a
+Gauss-Markov drift counts as the walk that it is over times short against 1 / alpha, K = sigma_m sqrt(2 alpha); no drift
+has K = 0. The bias instability is the first minimum of the law's Allan deviation over 0.664 (IEEE Std 952, annex C).
+Of 1/f noise it is B, and the white noise is that beside 1/f noise (one_over_f.py). Its law is weighed beside the
+model's own; the walk is theirs alone.
+Coloured noise of a spectral ratio below 1 is white noise beside quantization noise; at the bank's interval dt
+Q = N sqrt(dt) sqrt(1 / ratio^2 - 1) / 2. The number is there where such noise is sure. Each law counts by its
+probability.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.adequacy.allan import LONGEST, Terms, fit_of, posterior_draws, terms_of
+from selfcal.adequacy.one_over_f import FLICKER, SURE, Beside, white_of
+from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.base import units
+from selfcal.model.file import Group
+
+_Floats = NDArray[np.float64]
+
+#: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
+_DRAWS, _PER_OCTAVE = 256, 16
+#: Times the record that a longer rest is looked at, and halvings of its logarithm: to 2 %.
+MOST_REST, _HALVINGS = 100.0, 8
+#: Laws of smaller probability do not count.
+_LEAST = 1e-3
+#: Share of the posterior that must have a walk, or a minimum, for the number to be identified.
+_SURE = 0.95
+#: Why a number is not identified: words of the table and the JSON.
+NO_WALK = "no walk is sure"
+WIDE = "the record leaves it open"
+NO_MINIMUM = "the Allan deviation has no minimum up to half the record"
+BELOW = "the Allan deviation rises from the shortest averaging time on"
+ONE_OVER_F = "the drift is 1/f noise"
+
+
+@dataclass(frozen=True)
+class Number:
+    """One of the numbers. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
+
+    estimate: Estimate
+    reason: str = ""
+
+
+def summarize(
+    result: AxisResult, group: Group, dt_s: float, n: int, block: int, beside: Beside | None = None
+) -> dict[str, Number]:
+    """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
+    the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
+    record is too short for an Allan deviation. `beside`: 1/f noise beside the laws of the result."""
+    if n < 2 * LONGEST:
+        return {}
+    more = 0.0 if beside is None else beside.probability
+    laws: list[tuple[str, float, Mapping[str, Estimate], Group, float, int, int]] = [
+        (law, probability * (1.0 - more), result.parameters[law], group, dt_s, n, block)
+        for law, probability in result.probability.items()
+        if probability >= _LEAST
+    ]
+    of_model = len(laws)
+    if beside is not None and more >= _LEAST:
+        laws.append((FLICKER, more, beside.estimates, beside.group, beside.dt_s, beside.n, beside.block))
+    white, walk, counted, floor, reached, weight, own = [], [], [], [], [], [], []
+    drifts, open_drifts = 0.0, 0.0  # probability of the laws with a drift, and of those that leave its size open
+    for number, (law, probability, estimates, of, every_s, length, samples) in enumerate(laws):
+        medians = {name: estimate.median for name, estimate in estimates.items()}
+        if not all(math.isfinite(value) for value in medians.values()):
+            continue
+        m = np.geomspace(1.0, length / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(length / 2.0)))
+        fit = fit_of(law, medians, of, every_s, length, m, block=samples)
+        draws = posterior_draws(estimates, fit.covariance, _DRAWS)
+        sizes = [estimates[name].identified for name in ("K", "sigma_m", "B") if name in estimates]
+        drifts += probability * bool(sizes)
+        open_drifts += probability * (bool(sizes) and not any(sizes))
+        walk.append(_walk(draws))
+        counted.append(_quantization(draws, every_s))
+        weight.append(np.full(_DRAWS, probability / _DRAWS))
+        own.append(np.full(_DRAWS, number < of_model))
+        if law == FLICKER:
+            white.append(white_of(draws, every_s, samples))
+            floor.append(draws["B"] * units.FLICKER_FLOOR)
+            hidden = white[-1] ** 2 / (0.5 * length * every_s) > floor[-1] ** 2  # below the white noise everywhere
+            reached.append(hidden.astype(float))
+            continue
+        white.append(draws["N"])
+        rows = (dict(zip(draws, map(float, row), strict=True)) for row in zip(*draws.values(), strict=True))
+        lowest = [_minimum(terms_of(of.laws[law], row, every_s, samples), m) for row in rows]
+        floor.append(np.array([value for value, _ in lowest]))
+        reached.append(np.array([place for _, place in lowest]))
+    if not weight:
+        return {}
+    w = np.concatenate(weight) / np.concatenate(weight).sum()
+    k, q, place = np.concatenate(walk), np.concatenate(counted), np.concatenate(reached)
+    w_walk = w * np.concatenate(own)
+    w_walk = w_walk / w_walk.sum() if w_walk.any() else w
+    has_walk, has_floor = float(w_walk[k > 0.0].sum()), float(w[place == 0].sum())
+    found = {
+        "arw": _number(np.concatenate(white), w),
+        "rrw": _number(np.where(np.isnan(k), 0.0, k), w_walk),
+        "bias_instability": _number(np.concatenate(floor) / units.FLICKER_FLOOR, w),
+    }
+    if float(w[q > 0.0].sum()) >= _SURE:
+        found["quantization_noise"] = _number(q, w)
+    prior = group.priors["K"]
+    widest = HALF_90 * prior.ln_sd  # of ln(q95 / q05): half the prior's sd
+    left_open = open_drifts > 0.5 * drifts
+    if more >= SURE:
+        found["rrw"] = _without(found["rrw"], ONE_OVER_F)
+    elif has_walk < _SURE:
+        none = found["rrw"].estimate
+        found["rrw"] = _without(Number(replace(none, q95=max(none.q95, prior.min))), NO_WALK)  # a limit is above 0
+    elif left_open or math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
+        found["rrw"] = _without(found["rrw"], WIDE)
+    if has_floor < _SURE:
+        found["bias_instability"] = _without(
+            found["bias_instability"], BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
+        )
+    elif left_open:  # then the prior of the drift makes the minimum
+        found["bias_instability"] = _without(found["bias_instability"], WIDE)
+    return found
+
+
+def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, float | None]:
+    """Of each parameter of the likeliest law that the record leaves open: the further rest that halves its interval, s.
+
+    By the Fisher information at the medians, beside the priors. An open interval is wider than this information says,
+    and falls faster with the rest: the geometric mean of both variances is taken for that of now. The median over
+    records of a kind is then 0.2 to 0.76 times as wide (tests/tools/test_summary.py). None: not even MOST_REST times
+    the record does.
+    """
+    law = result.best
+    estimates = result.parameters[law]
+    open_ = [name for name, estimate in estimates.items() if not estimate.identified]
+    medians = {name: estimate.median for name, estimate in estimates.items()}
+    if not open_ or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
+        return {}
+
+    def variance(times: float) -> dict[str, float]:
+        fit = fit_of(law, medians, group, dt_s, times * n, np.ones(1), block=block)
+        return dict(zip(estimates, np.diag(fit.covariance).tolist(), strict=True))
+
+    now = variance(1.0)
+    found: dict[str, float | None] = {}
+    for name in open_:
+        wanted = 0.25 * math.sqrt(now[name]) * estimates[name].ln_sd
+        low, high = 0.0, math.log(MOST_REST)
+        if not variance(MOST_REST)[name] <= wanted:
+            found[name] = None
+            continue
+        for _ in range(_HALVINGS):
+            at = 0.5 * (low + high)
+            low, high = (low, at) if variance(math.exp(at))[name] <= wanted else (at, high)
+        found[name] = n * dt_s * math.expm1(high)
+    return found
+
+
+def _walk(draws: Mapping[str, _Floats]) -> _Floats:
+    """K of each draw; 0 of a law that has no walk and is like none."""
+    if "K" in draws:
+        return draws["K"]
+    if "sigma_m" in draws and "alpha" in draws:
+        return np.asarray(draws["sigma_m"] * np.sqrt(2.0 * draws["alpha"]))
+    return np.zeros(draws["N"].size)
+
+
+def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
+    """Q of each draw; 0 of a law whose noise has no memory, or one of the other sign."""
+    if "spectral_ratio" not in draws:
+        return np.zeros(draws["N"].size)
+    over = np.maximum(draws["spectral_ratio"] ** -2.0 - 1.0, 0.0)
+    return np.asarray(0.5 * draws["N"] * np.sqrt(dt_s * over))
+
+
+def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
+    """The first minimum of the Allan deviation at `m` readings, and 0; where there is none inside, the lowest value
+    with -1 (it rises from the first on) or 1 (it falls to the last)."""
+    variance = terms.allan_variance(m)
+    inside = np.flatnonzero((variance[1:-1] < variance[:-2]) & (variance[1:-1] <= variance[2:]))
+    at = int(inside[0]) + 1 if inside.size else int(np.argmin(variance))
+    return math.sqrt(max(0.0, float(variance[at]))), 0 if inside.size else (-1 if at == 0 else 1)
+
+
+def _number(values: _Floats, weight: _Floats) -> Number:
+    """Mean, sd and quantiles of weighted draws."""
+    order = np.argsort(values, kind="stable")
+    values, weight = values[order], weight[order]
+    share = np.cumsum(weight) - 0.5 * weight
+    mean = float(weight @ values)
+    sd = math.sqrt(max(0.0, float(weight @ (values - mean) ** 2)))
+    low, middle, high = np.interp((0.05, 0.5, 0.95), share, values).tolist()
+    return Number(Estimate(mean, middle, sd, low, high, identified=True))
+
+
+def _without(number: Number, reason: str) -> Number:
+    return Number(replace(number.estimate, identified=False), reason)

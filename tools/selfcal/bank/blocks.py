@@ -1,0 +1,135 @@
+"""What the library's averager makes of a record, worked out on its own in double: the block means."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError
+from selfcal.model.file import Group
+from selfcal.model.tables import Tables
+
+#: Bank samples a report needs (SELFCAL_REPORT_MIN).
+REPORT_MIN = 3
+#: Averages that are too few where the rest of the readings, all but this share, are in averages of which most is lost.
+FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
+#: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
+MOST_DENSE = 10_000_000
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """What the library's averager makes of a record, worked out on its own in double for the reference and the checks.
+
+    `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
+    those used; `within_sd` of the samples about their block's mean, NaN with one sample a block; `kept_out` counts the
+    samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. `after`: samples from
+    the last whole block to the last usable sample, missing ones included. `begin`: sample instants from the record's
+    first one to the first block. Blocks beyond MOST_DENSE intervals are not
+    worked out.
+    """
+
+    mean: NDArray[np.float64]
+    r: NDArray[np.float64]
+    within_sd: float
+    kept_out: Mapping[str, int]
+    z: NDArray[np.float64]
+    after: int = 0
+    begin: int = 0
+
+
+def usable_blocks(
+    samples: NDArray[np.float32],
+    missing_before: NDArray[np.int64],
+    tables: Tables,
+    group: Group,
+    columns: NDArray[np.float32] | None = None,
+    counted: Callable[[Mapping[str, int]], Mapping[str, int]] = dict,
+) -> Blocks:
+    """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them.
+    `counted`: the samples kept out by reason, from those that the averaging knows."""
+    z = None if columns is None else columns.astype(np.float64)
+    blocks = block_means(samples, missing_before, tables.block, group, z)
+    blocks = replace(blocks, kept_out=counted(blocks.kept_out))
+    present = blocks.mean[np.isfinite(blocks.mean)]
+    needed = REPORT_MIN + len(tables.regressors)
+    kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
+    found = f"{present.size} averages of {tables.dt_s:g} s"
+    whole = float((tables.block / blocks.r[np.isfinite(blocks.mean)]).sum())
+    each = int(np.isfinite(samples).sum())
+    alone = f": --decimate {tables.block / tables.dt_s:.6g} takes each reading alone"
+    if present.size < needed:
+        more = alone if tables.block > 1 and each >= needed else ""
+        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept}){more}")
+    if present.size < FEWEST_WHOLE and whole < WHOLE_SHARE * each:
+        raise UserError(f"too few whole averages: {found} hold {whole:.0f} of the {each} readings{alone}")
+    if not present.std() > 0.0:
+        equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
+        raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")
+    return blocks
+
+
+def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDArray[np.bool_]]:
+    """Which of `samples` [n] are not used, by reason."""
+    finite = np.isfinite(samples)
+    limit = np.float32(group.range) if group.range > 0.0 else np.inf
+    saturated = finite & (np.abs(samples) >= limit)
+    stuck = np.zeros(samples.size, bool)
+    if group.stuck_limit > 0:
+        change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
+        length = np.diff(np.append(change, samples.size))
+        for first, count in zip(change[length >= group.stuck_limit], length[length >= group.stuck_limit], strict=True):
+            stuck[first + group.stuck_limit - 1 : first + count] = True
+        stuck &= finite
+    return {"not_finite": ~finite, "saturated": saturated, "stuck": stuck}
+
+
+def block_means(
+    samples: NDArray[np.floating[Any]],
+    missing_before: NDArray[np.int64],
+    block: int,
+    group: Group,
+    columns: NDArray[np.float64] | None = None,
+) -> Blocks:
+    """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out.
+    `columns` [n, p] of the regressors are averaged over the same samples."""
+    reasons = kept_out(samples, group)
+    usable = ~np.logical_or.reduce(list(reasons.values()))
+    counts = {"missing": int(missing_before.sum()), **{what: int(mask.sum()) for what, mask in reasons.items()}}
+    at = np.cumsum(missing_before)
+    at += np.arange(samples.size)
+    if not usable.any():
+        raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
+    begin = int(at[np.argmax(usable)] - at[0])
+    at -= at[np.argmax(usable)]
+    columns = np.empty((samples.size, 0)) if columns is None else columns
+    count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
+    if not usable.all():
+        samples, at, columns = samples[usable], at[usable], columns[usable]
+    after = int(at[-1] + 1) % block
+    index = np.floor_divide(at, block, out=at)
+    end = int(np.searchsorted(index, count))
+    values, index, rows = samples[:end], index[:end], columns[:end]
+    used = np.bincount(index, minlength=count)
+    total = np.bincount(index, values, minlength=count)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        raw = total / used
+        sums = [np.bincount(index, column, minlength=count) for column in rows.T]
+        z = np.column_stack([np.empty((count, 0)), *sums]) / used[:, None]
+        mean = np.where(used * 2 >= block, raw, np.nan)
+        r = np.where(used * 2 >= block, block / used, 1.0)
+    good = np.isfinite(mean)[index]
+    freedom = int(good.sum()) - int(np.isfinite(mean).sum())
+    scatter = raw[index]
+    np.subtract(values, scatter, out=scatter)
+    if not good.all():
+        scatter = scatter[good]
+    squares = float(np.square(scatter, out=scatter).sum())
+    within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
+    first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
+    return Blocks(mean[first:], r[first:], within, counts, z[first:], after, begin + first * block)

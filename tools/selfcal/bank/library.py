@@ -1,0 +1,155 @@
+"""The C library from Python: the very code of the firmware, in its float, in fixed point, or in double."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal import _coarse, _dense, _fixed, _library32, _library64
+from selfcal.bank.result import AxisResult, Estimate
+from selfcal.base.errors import OutsidePriors, UserError
+from selfcal.model.laws import PLACES
+from selfcal.model.tables import AxisTable, Grid, PriorRow, Tables
+
+
+def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
+    if grid is None:
+        return None
+    return (grid.nodes, grid.fit.ravel().tolist())
+
+
+def _regressors(tables: Tables) -> tuple[list[float], list[float], list[float]] | None:
+    """Reference [p], prior sd and prior mean [axes * p] of the columns."""
+    columns = tables.regressors
+    if not columns:
+        return None
+    places = [(axis, column) for axis in range(len(tables.axes)) for column in columns]
+    sd = [column.coefficient_sd[axis] for axis, column in places]
+    mean = [column.coefficient_mean[axis] if column.coefficient_mean else 0.0 for axis, column in places]
+    return [column.reference for column in columns], sd, mean
+
+
+def _axis(a: AxisTable) -> tuple[list[float], list[float], list[int], float, float, int]:
+    return list(a.ln_min), list(a.ln_max), [int(law) for law in a.law], a.bias_sd, a.range, a.stuck_limit
+
+
+def _rows(rows: Sequence[Sequence[PriorRow]]) -> list[list[tuple[float, float, int, bool]]]:
+    return [[(low, high, int(law), measured) for low, high, law, measured in row] for row in rows]
+
+
+def arguments(tables: Tables) -> tuple[Any, ...]:
+    """The model as the bindings take it (bindings/tables.hpp)."""
+    return (
+        tables.dt_s,
+        tables.block,
+        [_axis(axis) for axis in tables.axes],
+        [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), _rows(h.priors)) for h in tables.hypotheses],
+        tables.id,
+        _regressors(tables),
+        tables.half_life_s,
+        tables.handling.as_tuple,
+    )
+
+
+class Bank:
+    """A bank over the axes of `tables`.
+
+    `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `coarse` one with the cells of a
+    module's reports, `fixed` the integer kernels (SELFCAL_FIXED). `offset`: what the samples of the first axis are less
+    than the readings; its reports have it again.
+    """
+
+    def __init__(
+        self,
+        tables: Tables,
+        *,
+        double: bool = False,
+        dense: bool = False,
+        coarse: bool = False,
+        fixed: bool = False,
+        offset: float = 0.0,
+    ) -> None:
+        self.tables = tables
+        self.offset = offset
+        build = _dense if dense else _library64 if double else _coarse if coarse else _library32
+        if fixed:
+            build = _fixed
+        self.raw: Any = build.Bank(*arguments(tables))
+        if offset:
+            self.raw.shift(0, -offset)
+
+    def push(
+        self,
+        samples: NDArray[np.floating[Any]],
+        missing_before: NDArray[np.integer[Any]] | None = None,
+        regressors: NDArray[np.floating[Any]] | None = None,
+    ) -> None:
+        """Feed `samples` [n, axes] in the model's units, after `missing_before` [n] missing ones each, with the values
+        of the `regressors` [n, p] if the tables have any."""
+        rows = np.ascontiguousarray(samples, dtype=np.float32)
+        missing = np.zeros(len(rows)) if missing_before is None else missing_before
+        values = None if regressors is None else np.ascontiguousarray(regressors, dtype=np.float32)
+        self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64), values)
+
+    def save(self) -> bytes:
+        """Everything the bank knows, in the format of lib/snapshot.c."""
+        return bytes(self.raw.save())
+
+    def restore(self, snapshot: bytes) -> None:
+        """Go on from `snapshot`. Unless it is a whole one of this model and build: UserError, and nothing changes."""
+        try:
+            self.raw.restore(snapshot)
+        except ValueError as error:  # std::invalid_argument
+            raise UserError(str(error)) from error
+
+    def report(self, axis: int, mask: int = 0, ahead_s: float = 0.0) -> AxisResult:
+        """Posterior of one axis, with the columns of `mask` in use, a bit each. The bias is the one `ahead_s` after the
+        last bank interval, with the columns' values of that interval. Raises UserError of an axis that failed, with too
+        few bank samples, and where the priors leave nothing (with regressors an evidence of -inf)."""
+        if self.raw.retired(axis):
+            raise UserError(
+                f"{self.tables.axes[axis].name} was out of range or stuck for too long and is left out: choose the "
+                "others with --axis"
+            )
+        try:
+            report = self.raw.report(axis, mask, ahead_s)
+        except ValueError as error:  # std::length_error
+            raise UserError(_too_short(self.tables, self.raw.count, self.raw.weight)) from error
+        log_evidence, probability, parameters, coefficients = {}, {}, {}, {}
+        used = [k for k in range(len(self.tables.regressors)) if mask >> k & 1]
+        for table, entry in zip(self.tables.hypotheses, report["hypotheses"], strict=True):
+            log_evidence[table.name] = entry["ln_evidence"]
+            probability[table.name] = entry["probability"]
+            coefficients[table.name] = tuple(entry["coefficients"][k] for k in used)
+            parameters[table.name] = {
+                name: _estimate(entry["parameters"][PLACES[name]]) for name in table.law.parameters
+            }
+        if not self.tables.regressors and not any(math.isfinite(p) for p in probability.values()):
+            raise OutsidePriors
+        return AxisResult(
+            report["n"],
+            log_evidence,
+            probability,
+            parameters,
+            report["bias_mean"] + (self.offset if axis == 0 else 0.0),
+            report["bias_sd"],
+            coefficients,
+        )
+
+
+def _too_short(tables: Tables, count: int, weight: float) -> str:
+    if count > _library32.REPORT_MIN and weight < _library32.REPORT_MIN:
+        return f"all is forgotten: after {tables.half_life_s:g} s a bank sample counts half, and the last are too old"
+    return (
+        f"too short: {count} bank samples of {tables.dt_s:g} s, a report needs {_library32.REPORT_MIN} "
+        "(record longer, or give --decimate HZ)"
+    )
+
+
+def _estimate(entry: tuple[float, float, float, float, float, int]) -> Estimate:
+    mean, median, sd, q05, q95, flags = entry
+    return Estimate(mean, median, sd, q05, q95, bool(flags & _library32.IDENTIFIED), bool(flags & _library32.OFF_GRID))

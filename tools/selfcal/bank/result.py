@@ -1,0 +1,107 @@
+"""What an engine says of one axis; every number in the units of the axis, continuous time (units.py)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base import units
+from selfcal.model.laws import RATIOS
+
+#: Standard deviations from the middle of a normal to either end of its 90 % interval.
+HALF_90 = 1.6448536269514722
+
+
+def of_mixture(
+    weight: NDArray[np.float64], mean: NDArray[np.float64], sd: NDArray[np.float64]
+) -> tuple[float, float, float, float, float]:
+    """Mean, sd, and quantiles 0.05, 0.5 and 0.95 of a sum of normals [m], `weight` of each not normalized."""
+    from scipy.special import ndtr  # a tenth of a second to import: for who has such a posterior alone
+
+    held = weight > 1e-6 * weight.max()
+    weight, mean, sd = weight[held] / weight[held].sum(), mean[held], sd[held]
+    middle = float(weight @ mean)
+    spread = math.sqrt(float(weight @ (sd**2 + (mean - middle) ** 2)))
+
+    def quantile(p: float) -> float:
+        low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
+        for _ in range(40):
+            at = 0.5 * (low + high)
+            low, high = (at, high) if float(weight @ ndtr((at - mean) / sd)) < p else (low, at)
+        return 0.5 * (low + high)
+
+    return middle, spread, quantile(0.05), quantile(0.5), quantile(0.95)
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Posterior of one parameter under one hypothesis. `off_grid`: the grid of nodes does not bear it (selfcal.h)."""
+
+    mean: float
+    median: float
+    sd: float
+    q05: float
+    q95: float
+    identified: bool
+    off_grid: bool = False
+
+    @property
+    def ln_sd(self) -> float:
+        """sd of the logarithm, by the 90 % interval; of a positive parameter."""
+        return math.log(self.q95 / self.q05) / (2.0 * HALF_90)
+
+    def scaled(self, factor: float) -> Estimate:
+        """The same estimate with its unit changed by `factor`."""
+        return Estimate(
+            self.mean * factor,
+            self.median * factor,
+            self.sd * factor,
+            self.q05 * factor,
+            self.q95 * factor,
+            self.identified,
+            self.off_grid,
+        )
+
+
+@dataclass(frozen=True)
+class AxisResult:
+    """Posterior of one axis. Keys are hypothesis names, then parameter names (N, K, sigma_m, alpha).
+
+    `n` bank samples; `log_evidence` in nats; `bias` is x0 + drift at the last bank sample, with regressors in use x0 +
+    drift + c z there. `coefficients`: mean and sd by hypothesis, in the order of the columns in use.
+    """
+
+    n: int
+    log_evidence: dict[str, float]
+    probability: dict[str, float]
+    parameters: dict[str, dict[str, Estimate]]
+    bias_mean: float
+    bias_sd: float
+    coefficients: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
+
+    @property
+    def best(self) -> str:
+        """The most probable law."""
+        return max(self.probability, key=lambda name: self.probability[name])
+
+
+def in_unit(result: AxisResult, unit: str, to: str) -> AxisResult:
+    """The result in `to` instead of `unit`: every number but alpha and the ratios, and the evidence, as a density per
+    unit."""
+    factor = units.factor(unit, to)
+    return AxisResult(
+        result.n,
+        {name: value - result.n * math.log(factor) for name, value in result.log_evidence.items()},
+        result.probability,
+        {
+            law: {name: e if name in ("alpha", *RATIOS) else e.scaled(factor) for name, e in estimates.items()}
+            for law, estimates in result.parameters.items()
+        },
+        result.bias_mean * factor,
+        result.bias_sd * factor,
+        {law: tuple((mean * factor, sd * factor) for mean, sd in pairs) for law, pairs in result.coefficients.items()},
+    )

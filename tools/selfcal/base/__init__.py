@@ -1,0 +1,1 @@
+"""What every folder knows, and what knows no other folder."""

@@ -1,0 +1,72 @@
+"""Files from strangers: the largest sizes that are read, and one line for whatever a library raises over one."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from selfcal.base.errors import UserError, first_line
+
+#: Numbers of a recording, rows times columns read: 3.2 GB.
+MOST_NUMBERS = 400_000_000
+#: Columns of a recording, and characters of a heading.
+MOST_COLUMNS, LONGEST_HEADING = 1000, 256
+#: A text recording is read by as many bytes; no line is longer.
+BLOCK_BYTES = 1 << 22
+#: What a packed text recording may unpack to, times its size: readings of a sensor pack to a twentieth at best.
+MOST_GROWTH = 200
+#: Lines before the header of a text recording.
+MOST_LEADING_LINES = 1000
+#: Cells of these lines that are looked at for a known heading.
+MOST_HEADINGS = 30_000
+#: What a MATLAB or R file may unpack to, and what any of them may however small it is. Each number is held three times.
+MOST_UNPACKED_BYTES, MOST_UNPACKED_SMALL = 1 << 30, 1 << 26
+#: Objects in an R file: each value of a text column is one.
+MOST_R_OBJECTS = 200_000
+#: Metadata of a recording, and a model file.
+MOST_META_BYTES, MOST_MODEL_BYTES = 1 << 20, 1 << 18
+#: Values in a model file, each alias counted as if it were written out.
+MOST_MODEL_VALUES = 10_000
+#: Sampling rates, Hz.
+LEAST_RATE_HZ, MOST_RATE_HZ = 1e-6, 1e6
+#: Sampling rates in one recording.
+MOST_CLOCKS = 8
+#: Samples that a recording spans, those missing included: each number up to here is a float64.
+LONGEST = 2**53
+
+
+@contextmanager
+def reading(path: Path | str, otherwise: str) -> Iterator[None]:
+    """Around a library that reads `path`: all that it raises becomes a UserError, its warnings are left out.
+
+    `otherwise` says what the file is not, where the library's error is of no known kind.
+    """
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            yield
+    except UserError:
+        raise
+    except OSError as error:
+        # A library's own OSError has no number.
+        what = f"cannot be read: {error.strerror}" if error.strerror else f"{otherwise}: {first_line(error)}"
+        raise UserError(f"{path}: {what}") from error
+    except MemoryError as error:
+        raise UserError(f"{path}: too large for this machine's memory") from error
+    except RecursionError as error:
+        raise UserError(f"{path}: {otherwise}: nested too deep") from error
+    except Exception as error:
+        raise UserError(f"{path}: {otherwise}: {first_line(error)}") from error
+
+
+def read_text(path: Path, most: int, otherwise: str) -> str:
+    """The text of a file of at most `most` bytes, UTF-8. Raises UserError; FileNotFoundError where there is none."""
+    with path.open("rb") as stream, reading(path, otherwise):
+        data = stream.read(most + 1)
+        if len(data) > most:
+            raise UserError(f"{path}: larger than {most} bytes")
+        return data.decode("utf-8")

@@ -1,0 +1,105 @@
+"""Output files are whole or absent: each is written under another name beside its place, then renamed."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from selfcal.base.errors import UserError
+
+#: Names of streams that are open already, be it on a regular file.
+_STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
+
+
+def check_place(path: Path | str) -> None:
+    """Raise UserError if no file can be made at `path`. For use before long work, whose answer would be lost."""
+    path = Path(path)
+    if path.is_dir():
+        raise UserError(f"{path}: cannot be written: it is a folder; give a file name")
+    if not path.parent.is_dir():
+        raise UserError(f"{path}: cannot be written: there is no folder '{path.parent}'; make it first")
+
+
+@contextmanager
+def whole(path: Path | str) -> Iterator[Path]:
+    """`with whole(path) as temporary:` the block writes the file `temporary`, which becomes `path` when the block ends.
+
+    If the block fails, or the program is killed, an older `path` stays as it was. A symbolic link stays a link, and
+    an older file's permissions stay. Pipes, devices and open streams cannot be renamed over: `temporary` is then `path`
+    itself.
+    Raises UserError for every OSError, those of the block included.
+    """
+    with together(path) as (temporary,):
+        yield temporary
+
+
+@contextmanager
+def together(path: Path | str, *others: Path | str) -> Iterator[tuple[Path, ...]]:
+    """The same for files that belong together: all are on the disk before the first takes its place.
+
+    An older one of the `others` goes just before: none stands beside a `path` that it is not of. One whose temporary
+    file the block removes goes without a new one.
+    """
+    at = Path(path)
+    pending: list[_Pending] = []
+    try:
+        try:
+            for at in map(Path, (path, *others)):
+                pending.append(_Pending.of(at))
+            at = Path(path)
+            yield tuple(one.temporary for one in pending)
+            written = [one for one in pending if one.temporary != one.place]
+            written = [one for one in written if one is pending[0] or one.temporary.exists()]
+            for one in written:
+                one.settle()
+            for one in pending[1:]:
+                if one.temporary != one.place:
+                    one.place.unlink(missing_ok=True)
+            for one in written:
+                one.temporary.replace(one.place)
+        finally:
+            for one in pending:
+                if one.temporary != one.place:
+                    one.temporary.unlink(missing_ok=True)
+    except OSError as error:
+        raise UserError(f"{at}: cannot be written: {error.strerror or error}") from error
+
+
+@dataclass(frozen=True)
+class _Pending:
+    """A file on its way: written as `temporary`, to become `place`, with the permissions of an older one."""
+
+    temporary: Path
+    place: Path
+    mode: int | None
+
+    @staticmethod
+    def of(path: Path) -> _Pending:
+        """Make the temporary file. Raises UserError and OSError."""
+        check_place(path)
+        place = path.resolve()  # a link's target is replaced, not the link
+        mode = place.stat().st_mode if place.exists() else None
+        if str(path).startswith(_STREAMS) or (mode is not None and not stat.S_ISREG(mode)):
+            return _Pending(path, path, None)
+        # The suffix stays: writers choose the form by it.
+        temporary = place.with_name(f".selfcal-{secrets.token_hex(4)}{place.suffix}")
+        os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666))
+        return _Pending(temporary, place, mode)
+
+    def settle(self) -> None:
+        """Bring what is written to the disk."""
+        if self.mode is not None:
+            self.temporary.chmod(stat.S_IMODE(self.mode))
+        with self.temporary.open("rb") as written:
+            os.fsync(written.fileno())
+
+
+def write_text(path: Path | str, text: str) -> None:
+    """Write `text` in UTF-8, as `whole` does. A file's name may have bytes that are no text: they become `\\udc80`."""
+    with whole(path) as temporary:
+        temporary.write_text(text, encoding="utf-8", errors="backslashreplace")

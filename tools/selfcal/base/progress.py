@@ -1,0 +1,47 @@
+"""What a long verb does just now: a bar in a terminal, a plain line on stderr now and then where there is none."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import Progress
+
+from selfcal.base.errors import note
+
+#: Between two lines without a terminal, s; and before the first one.
+EVERY_S = 10.0
+
+
+class Doing:
+    """`with Doing("diagnose") as doing:`, then `doing.now("gx: round 2")` whenever the work changes, from any thread,
+    and `doing.tick()` from the main one."""
+
+    def __init__(self, verb: str) -> None:
+        console = Console(stderr=True)
+        self.verb, self.text, self.terminal = verb, "", console.is_terminal
+        self.progress = Progress(console=console, transient=True, disable=not self.terminal)
+        self.task = self.progress.add_task(verb, total=None)
+        self.began = self.told = time.monotonic()
+
+    def now(self, text: str) -> None:
+        """The work is this from now on."""
+        self.text = text
+        self.progress.update(self.task, description=text)
+
+    def tick(self) -> None:
+        """Write a line if one is due."""
+        now = time.monotonic()
+        if not self.terminal and now - self.told >= EVERY_S:
+            self.told = now
+            note(f"{self.verb}: {self.text} ({now - self.began:.0f} s)")
+
+    def __enter__(self) -> Doing:
+        self.progress.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.progress.stop()

@@ -1,0 +1,307 @@
+"""Units: the one place where they are known, and the only conversions in the package.
+
+A unit is written as a product of powers: `deg/s`, `m/s^2`, `deg/s/sqrt(Hz)`, `m/s/h^1.5`. Conventions of the noise
+parameters, continuous time and two-sided: N is the white noise density (the Allan deviation at 1 s), K the random-walk
+density, sigma_m and alpha the Gauss-Markov deviation and bandwidth. At interval dt the white noise has the deviation
+N / sqrt(dt) and a random walk takes steps of K sqrt(dt).
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cache
+from typing import overload
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError, short
+
+#: m/s^2 per g (3rd CGPM, 1901: exact by definition).
+STANDARD_GRAVITY = 9.80665
+#: A two-sided density is this many times the one-sided one.
+ONE_SIDED_TO_TWO_SIDED = 1.0 / math.sqrt(2.0)
+#: Allan deviation of flicker noise over its coefficient, the bias instability: sqrt(2 ln 2 / pi).
+FLICKER_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
+#: Counts of the sensor's least significant bit; a scale turns them into a unit.
+LSB = "LSB"
+
+# Dimensions: exponents of (angle, length, time, temperature, voltage, current, magnetic flux density, pressure).
+_Dimension = tuple[Fraction, ...]
+
+
+def _dimension(**exponent: int) -> _Dimension:
+    kinds = ("angle", "length", "time", "temperature", "voltage", "current", "field", "pressure")
+    return tuple(Fraction(exponent.get(kind, 0)) for kind in kinds)
+
+
+_NONE = _dimension()
+_TIME = _dimension(time=1)
+_ACCELERATION = _dimension(length=1, time=-2)
+
+#: name: (dimension, size in rad, m, s, K, V, A, T, Pa)
+_ATOMS: dict[str, tuple[_Dimension, float]] = {
+    "1": (_NONE, 1.0),
+    "rad": (_dimension(angle=1), 1.0),
+    "mrad": (_dimension(angle=1), 1e-3),
+    "deg": (_dimension(angle=1), math.pi / 180.0),
+    "arcsec": (_dimension(angle=1), math.pi / 648_000.0),
+    "dps": (_dimension(angle=1, time=-1), math.pi / 180.0),
+    "mdps": (_dimension(angle=1, time=-1), math.pi / 180.0 * 1e-3),
+    "mdeg": (_dimension(angle=1), math.pi / 180.0 * 1e-3),
+    "dph": (_dimension(angle=1, time=-1), math.pi / 648_000.0),
+    "m": (_dimension(length=1), 1.0),
+    "mm": (_dimension(length=1), 1e-3),
+    "s": (_TIME, 1.0),
+    "ms": (_TIME, 1e-3),
+    "us": (_TIME, 1e-6),
+    "ns": (_TIME, 1e-9),
+    "h": (_TIME, 3600.0),
+    "Hz": (_dimension(time=-1), 1.0),
+    "g": (_ACCELERATION, STANDARD_GRAVITY),
+    "mg": (_ACCELERATION, STANDARD_GRAVITY * 1e-3),
+    "ug": (_ACCELERATION, STANDARD_GRAVITY * 1e-6),
+    "K": (_dimension(temperature=1), 1.0),
+    "degC": (_dimension(temperature=1), 1.0),
+    "V": (_dimension(voltage=1), 1.0),
+    "mV": (_dimension(voltage=1), 1e-3),
+    "A": (_dimension(current=1), 1.0),
+    "mA": (_dimension(current=1), 1e-3),
+    "T": (_dimension(field=1), 1.0),
+    "mT": (_dimension(field=1), 1e-3),
+    "uT": (_dimension(field=1), 1e-6),
+    "nT": (_dimension(field=1), 1e-9),
+    "gauss": (_dimension(field=1), 1e-4),
+    "mgauss": (_dimension(field=1), 1e-7),
+    "Gal": (_ACCELERATION, 1e-2),
+    "mGal": (_ACCELERATION, 1e-5),
+    "uGal": (_ACCELERATION, 1e-8),
+    "Pa": (_dimension(pressure=1), 1.0),
+    "hPa": (_dimension(pressure=1), 100.0),
+}
+#: Zero of a temperature scale in K; counts only where the temperature itself is meant, not in `deg/s/degC`.
+_ZERO = {"degC": 273.15}
+
+#: What a recording's header may say, for error messages.
+RECORDING_UNITS = (
+    "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "m/s^2", "mm/s^2", "g", "mg", "ug", LSB, "degC", "K",
+    "V", "mV", "s", "ms", "us", "ns",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Unit:
+    """A parsed unit: `size` in the SI unit of its dimension, `zero` the offset of its scale in that unit."""
+
+    name: str
+    dimension: _Dimension
+    size: float
+    zero: float
+
+
+_FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d(?:\.\d{1,2})?))?)\Z", re.ASCII)
+#: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
+_LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
+#: Signs that a data sheet has, as this module writes them.
+_SIGNS = str.maketrans(
+    {"°": "deg", "º": "deg", "℃": "degC", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1", "·": " "}
+)
+#: A power without its sign, `s-1`, `s2`, and factors with blanks or stars between them.
+_POWER, _FACTORS = re.compile(r"(?<=[a-zA-Z])(-?\d)(?![\w.])", re.ASCII), re.compile(r"\s*[\s*]\s*")
+
+#: Other spellings of an atom, in small letters: whole words of a unit. And brackets around a power, `m/(s^2)`.
+_WORDS = {
+    **dict.fromkeys(("degs", "degree", "degrees", "deg"), "deg"),
+    **dict.fromkeys(("rads", "radian", "radians", "rad"), "rad"),
+    **dict.fromkeys(("sec", "secs", "second", "seconds", "s"), "s"),
+    **dict.fromkeys(("msec", "msecs", "millisecond", "milliseconds", "millis", "ms"), "ms"),
+    **dict.fromkeys(("usec", "usecs", "microsecond", "microseconds", "micros", "us"), "us"),
+    **dict.fromkeys(("nsec", "nsecs", "nanosecond", "nanoseconds", "ns"), "ns"),
+    **dict.fromkeys(("hr", "hrs", "hour", "hours", "h"), "h"),
+    **dict.fromkeys(("g", "gs", "gee", "gees"), "g"),
+    **dict.fromkeys(("c", "celsius", "degc"), "degC"),
+    **dict.fromkeys(("k", "kelvin"), "K"),
+    **dict.fromkeys(("counts", "count", "lsb", "lsbs", "raw", "digit", "digits"), LSB),
+    **{name: name for name in ("dps", "mdps", "mdeg", "dph", "mrad", "m", "mm", "mg", "ug")},
+}
+_WORD, _BRACKETS = re.compile(r"(?<!\w)(?:sqrt(?=\()|[a-zA-Z]+(?=-?\d*(?!\w)))"), re.compile(r"/\s*\(([\w^]+)\)")
+
+#: A root as print has it, and a number with its unit, with or without a blank between them.
+_ROOT = re.compile(r"√\(?([a-zA-Z]+)\)?")
+_QUANTITY = re.compile(r"\s*([-+]?[0-9.]+(?:[eE][-+]?\d+)?)\s*(\S.*)?", re.ASCII)
+
+
+def quantity(text: str) -> tuple[float, str]:
+    """Number and unit, "" for none, of a text as `0.014 deg/s/sqrt(Hz)` or `1.2°/√h`. Raises ValueError."""
+    match = _QUANTITY.fullmatch(text)
+    if match is None:
+        raise ValueError("neither a number nor one with its unit")
+    return float(match[1]), plain(match[2] or "")
+
+
+def plain(name: str) -> str:
+    """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²`, `m s^-2`, `m/s2` -> `m/s^2`;
+    `√Hz` -> `sqrt(Hz)`; other texts stay."""
+    spelled = _ROOT.sub(r"sqrt(\1)", name.strip().translate(_SIGNS))
+    if spelled == LSB or len(spelled) > _LONGEST or known(spelled):
+        return spelled
+    usual = _WORD.sub(lambda word: _WORDS.get(word[0].lower(), word[0]), _BRACKETS.sub(r"/\1", spelled))
+    if usual == LSB:
+        return usual
+    product = _FACTORS.sub("*", _POWER.sub(r"^\1", usual.replace("^", "").replace(".", " ")))
+    try:
+        meant = parse(product)
+    except UserError:
+        return spelled
+    return next(
+        (
+            one
+            for one in RECORDING_UNITS
+            if one != LSB and (same := parse(one)).dimension == meant.dimension and same.size == meant.size
+        ),
+        product,
+    )
+
+
+@cache
+def parse(name: str) -> Unit:
+    """The unit called `name`. Raises UserError if it is not one."""
+    dimension, size = _NONE, 1.0
+    unknown = UserError(f"unknown unit '{short(name)}' (known: {', '.join(RECORDING_UNITS)})")
+    if len(name) > _LONGEST:
+        raise unknown
+    for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
+        match = _FACTOR.match(part)
+        atom = match and (match["root"] or match["atom"])
+        if match is None or atom not in _ATOMS:
+            raise unknown
+        power = Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1)
+        if sign == "/":
+            power = -power
+        kind, scale = _ATOMS[atom]
+        dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
+        size *= scale ** float(power)
+        if not _LEAST < size < _MOST:
+            raise unknown
+    return Unit(name, dimension, size, _ZERO.get(name, 0.0))
+
+
+def known(name: str) -> bool:
+    """Whether `name` is a unit (LSB counts as one)."""
+    try:
+        return name == LSB or parse(name) is not None
+    except UserError:
+        return False
+
+
+def same_kind(one: str, other: str) -> bool:
+    """Whether one unit converts into the other."""
+    return parse(one).dimension == parse(other).dimension
+
+
+def factor(unit: str, to: str) -> float:
+    """What a difference in `unit` is multiplied with to be in `to`. Raises UserError if they are of different kinds."""
+    source, target = parse(unit), parse(to)
+    if source.dimension != target.dimension:
+        raise UserError(f"'{unit}' cannot be converted to '{to}'")
+    return source.size / target.size
+
+
+@overload
+def convert(value: float, unit: str, to: str) -> float: ...
+@overload
+def convert(value: NDArray[np.float64], unit: str, to: str) -> NDArray[np.float64]: ...
+def convert(value: float | NDArray[np.float64], unit: str, to: str) -> float | NDArray[np.float64]:
+    """`value` (any shape) of `unit` in `to`, itself if they are one; temperatures as points on their scales. Raises
+    UserError as `factor`."""
+    scale = factor(unit, to)
+    shift = parse(unit).zero - parse(to).zero
+    if scale == 1.0 and shift == 0.0:
+        return value  # an array itself, not a copy
+    return value * scale if shift == 0.0 else value * scale + shift / parse(to).size
+
+
+def per_second(unit: str) -> str:
+    """`unit` per second: `deg/s` -> `deg/s^2`, `deg/h` -> `deg/h/s`."""
+    match = re.search(r"/s(?:\^(\d+))?\Z", unit)
+    if match is None:
+        return f"{unit}/s"
+    return f"{unit[: match.start()]}/s^{int(match[1] or 1) + 1}"
+
+
+def times_second(unit: str) -> str:
+    """`unit` times a second: `deg/s` -> `deg`, `m/s^2` -> `m/s`, `deg/h` -> `deg/h*s`."""
+    match = re.search(r"/s(?:\^(\d+))?\Z", unit)
+    if match is None:
+        return f"{unit}*s"
+    less = int(match[1] or 1) - 1
+    return unit[: match.start()] + ("" if less == 0 else "/s" if less == 1 else f"/s^{less}")
+
+
+def power(unit: str, exponent: int) -> str:
+    """`unit` to a power: `m/s^2` squared is `m^2/s^4`."""
+    factors = []
+    for sign, part in re.findall(r"(\A|[*/])([^*/]*)", unit):
+        match = _FACTOR.match(part)
+        if match is None or exponent == 1 or part == "1":
+            factors.append(sign + part)
+            continue
+        raised = exponent * (Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1))
+        factors.append(sign + str(match["root"] or match["atom"]) + ("" if raised == 1 else f"^{raised}"))
+    return "".join(factors)
+
+
+def parameter_unit(parameter: str, unit: str) -> str:
+    """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios), of Q, or of a number of summary.py, of
+    an axis that reads in `unit`."""
+    match parameter:
+        case "bias" | "sigma_m" | "B" | "bias_instability":
+            return unit
+        case "N" | "arw":
+            return f"{unit}/sqrt(Hz)"
+        case "K" | "rrw":
+            return f"{per_second(unit)}/sqrt(Hz)"
+        case "Q" | "quantization_noise":
+            return times_second(unit)
+        case "alpha":
+            return "1/s"
+        case "spectral_ratio" | "markov_ratio":
+            return "1"
+        case "p1" | "p2":  # places of the wire that no model names
+            return ""
+    raise ValueError(f"no such parameter: {parameter}")
+
+
+#: Units of data sheets, of a parameter of an angular rate and of an acceleration; below, of the numbers of summary.py.
+_DATASHEET = {
+    "bias": ("deg/h", "ug"),
+    "sigma_m": ("deg/h", "ug"),
+    "B": ("deg/h", "ug"),
+    "N": ("deg/sqrt(h)", "ug/sqrt(Hz)"),
+    "K": ("deg/h/sqrt(h)", "ug/sqrt(h)"),
+    "arw": ("deg/sqrt(h)", "m/s/sqrt(h)"),
+    "rrw": ("deg/h/sqrt(h)", "mg/sqrt(h)"),
+    "bias_instability": ("deg/h", "mg"),
+    "quantization_noise": ("arcsec", "m/s"),
+}
+
+
+def datasheet_unit(parameter: str, unit: str) -> str:
+    """The unit that data sheets state a model parameter in, of an axis that reads in `unit`; that of `parameter_unit`
+    for what they do not state."""
+    if parameter in _DATASHEET:
+        for reading, of_kind in zip(("rad/s", "m/s^2"), _DATASHEET[parameter], strict=True):
+            if same_kind(unit, reading):
+                return of_kind
+    return parameter_unit(parameter, unit)
+
+
+def typeset(unit: str) -> str:
+    """A unit as print has it: `deg/s/sqrt(Hz)` -> `°/s/√Hz`."""
+    text = re.sub(r"sqrt\((\w+)\)", r"√\1", unit)
+    for plain, print_ in (("deg", "°"), ("ug", "µg"), ("^2", "²"), ("^3", "³"), ("°C", "°C")):
+        text = text.replace(plain, print_)
+    return text

@@ -1,0 +1,84 @@
+"""`--fail-on`: an exit code for a production line. An axis that could not be judged has not passed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from selfcal.base.errors import UserError
+
+#: Anything that the model does not explain; and, of two recordings, any change.
+INADEQUATE, CHANGED = "inadequate", "changed"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Exit code: 0 every axis was judged and passed, 1 it applies to one, 2 one could not be judged. `lines`: why, by
+    axis, of those that could not."""
+
+    code: int
+    lines: list[str] = field(default_factory=list)
+
+
+def check(wanted: str | None, more: Collection[str] = ()) -> None:
+    """Raise UserError for what is no cause. `more`: what the verb takes besides."""
+    if wanted is None:
+        return
+    from selfcal.diagnosis.causes import CAUSES  # a second of imports
+
+    known = (INADEQUATE, *more, *CAUSES)
+    if wanted not in known:
+        raise UserError(f"--fail-on: there is no cause '{wanted}' ({', '.join(known)})")
+
+
+def outcome(document: Mapping[str, Any], wanted: str) -> Outcome:
+    """Of the document of `identify`, `diagnose` or `compare`."""
+    told = list(_judged(document, wanted))
+    lines = [line for applies, line in told if not applies and line]
+    return Outcome(1 if any(applies for applies, _ in told) else 2 if lines else 0, lines)
+
+
+def _judged(document: Mapping[str, Any], wanted: str) -> Iterator[tuple[bool, str]]:
+    """Of each axis whether it applies, and if not, why that is not known ("": it is)."""
+    if "verdicts" in document:
+        for name, axis in document["axes"].items():
+            apart = isinstance(axis, Mapping)  # not all recordings could be compared
+            changed = wanted == CHANGED and bool(axis["changes"] if apart else axis)
+            yield changed, f"{name}: {wanted} cannot be judged: {axis['error']}" if apart else ""
+        for path, axes in document["verdicts"].items():
+            for name, axis in axes.items():
+                if "error" not in axis:  # the axis has it in `axes`
+                    applies, line = _axis(axis, wanted)
+                    yield applies, line and f"{path}: {name}: {line}"
+        return
+    for name, axis in document["axes"].items():
+        applies, line = _axis(axis, wanted)
+        yield applies, line and f"{name}: {line}"
+
+
+def _axis(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
+    if "error" in axis:
+        return False, f"{wanted} cannot be judged: {axis['error']}"
+    if "verdict" not in axis:
+        return _of_identify(axis, wanted)
+    if axis["verdict"] != "adequate" if wanted == INADEQUATE else wanted in _causes(axis):
+        return True, ""
+    for one in axis["not_judged"]:
+        if one["cause"] == wanted:
+            return False, f"{wanted} cannot be judged: {one['reason']}"
+    if axis.get("unfinished"):
+        return False, f"{wanted} cannot be judged: {axis['unfinished']}"
+    return False, ""
+
+
+def _causes(axis: Mapping[str, Any]) -> list[str]:
+    return axis["causes"] if "causes" in axis else [finding["cause"] for finding in axis["findings"]]
+
+
+def _of_identify(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
+    if wanted == INADEQUATE:
+        return axis["adequate"] is False, "no check was made" if axis["adequate"] is None else ""
+    if axis.get("suspicion") == wanted:
+        return True, ""
+    return False, f"{wanted} cannot be judged: identify looks for no single cause, diagnose --fail-on {wanted} does"

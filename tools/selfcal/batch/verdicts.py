@@ -1,0 +1,377 @@
+"""Limits of a data sheet: does a unit keep them, by the bounds of its intervals? And the files of a production line.
+
+A limits file has an entry for each quantity, `AXIS.PARAMETER` or `GROUP.PARAMETER`:
+
+    gx.N: {max: 0.014 deg/s/sqrt(Hz)}
+    accel.bias: {min: -50 mg, max: 50 mg}
+
+A unit passes a maximum if the upper 95 % bound of the quantity is within it. It fails if the lower 95 % bound is
+beyond. Between the two the record cannot tell yet. A unit that could not be judged has not passed.
+"""
+
+from __future__ import annotations
+
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from functools import wraps
+from pathlib import Path
+from typing import Any, ParamSpec
+
+from selfcal.adequacy.document import check_writable
+from selfcal.bank.result import HALF_90
+from selfcal.base import units
+from selfcal.base.errors import UserError, printable, shown
+from selfcal.base.output import whole
+from selfcal.logs.recording import list_of
+from selfcal.model.file import Model, read_yaml
+from selfcal.model.laws import PLACES, RATIOS
+
+SCHEMA = "selfcal.base.limits/1"
+PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
+#: A law of less probability is no law of the axis.
+LEAST_PROBABILITY = 0.05
+#: Chance that the verdict is there after the rest that is asked for; times the record that are asked for at most.
+CHANCE, MOST_TIMES = 0.8, 1000.0
+#: How the upper bound of a quantity that the record does not identify falls with the record's length: to this power.
+FALLS = {"K": 1.0, "sigma_m": 0.5, "B": 0.5}
+
+
+@dataclass(frozen=True)
+class Limit:
+    """A bound of one quantity of an axis: `side` is 'max' or 'min', `value` in `unit`."""
+
+    axis: str
+    parameter: str
+    side: str
+    value: float
+    unit: str
+
+    @property
+    def name(self) -> str:
+        """As a report has it."""
+        return f"{self.axis}.{self.parameter} {'<=' if self.side == 'max' else '>='} {self.value:g} {self.unit}"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """How an axis keeps a limit: estimate in the limit's unit, and the rest that an open verdict takes, s."""
+
+    limit: Limit
+    verdict: str
+    reason: str = ""
+    median: float = math.nan
+    q05: float = math.nan
+    q95: float = math.nan
+    more_s: float | None = None
+
+    @property
+    def words(self) -> str:
+        """Verdict with its reason."""
+        return f"{self.limit.name}: {self.verdict}{', ' if self.verdict == OPEN else ': '}{self.reason}".removesuffix(
+            ": "
+        )
+
+    def entry(self) -> dict[str, Any]:
+        """As JSON has it."""
+        told = asdict(self)
+        return {**told.pop("limit"), **told}
+
+    @staticmethod
+    def of(entry: Mapping[str, Any]) -> Verdict:
+        """The verdict of a document's entry; null is not a number."""
+        fields: dict[str, Any] = {
+            key: math.nan if value is None and key != "more_s" else value for key, value in entry.items()
+        }
+        limit = Limit(*[fields.pop(key) for key in ("axis", "parameter", "side", "value", "unit")])
+        return Verdict(limit, **fields)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """The limits of a file. `of_group`: those stated for a group, which only hold for axes that are there."""
+
+    stated: tuple[Limit, ...]
+    of_group: tuple[Limit, ...]
+
+    def of(self, axes: Collection[str]) -> list[Limit]:
+        """The limits of a batch whose recordings have these axes. An axis' own limit replaces its group's."""
+        own = {(one.axis, one.parameter, one.side) for one in self.stated}
+        group = [one for one in self.of_group if one.axis in axes and (one.axis, one.parameter, one.side) not in own]
+        return sorted([*self.stated, *group], key=lambda one: (one.axis, one.parameter, one.side))
+
+    @staticmethod
+    def load(path: Path | str, model: Model) -> Limits:
+        """Read and check a limits file. Raises UserError naming the file and the entry."""
+        place = Path(path)
+        tree = read_yaml(place, "limits file (a YAML mapping of gx.N: {max: 0.01 deg/s/sqrt(Hz)})")
+        if tree.pop("schema", SCHEMA) != SCHEMA:
+            raise UserError(f"{place}: schema: must be {SCHEMA}")
+        stated: list[Limit] = []
+        of_group: list[Limit] = []
+        groups = {group.name: group for group in model.groups}
+        for key, entry in tree.items():
+            name, _, parameter = str(key).partition(".")
+            if name not in groups and name not in model.axes:
+                known = ", ".join((*groups, *model.axes))
+                raise UserError(f"{place}: {shown(key)}: begins with no group or axis of the model ({known})")
+            group = groups[name] if name in groups else model.group_of(name)
+            if parameter not in ("bias", *PLACES):
+                raise UserError(f"{place}: {shown(key)}: ends with none of bias, {', '.join(PLACES)}")
+            if not isinstance(entry, dict) or not entry or not set(entry) <= {"min", "max"}:
+                raise UserError(f"{place}: {shown(key)}: takes {{max: VALUE UNIT}}, {{min: VALUE UNIT}} or both")
+            unit = units.parameter_unit(parameter, group.unit)
+            for side, text in entry.items():
+                value, of = _quantity(f"{place}: {key}.{side}", text, unit)
+                for axis in group.axes if name in groups else (name,):
+                    (of_group if name in groups else stated).append(Limit(axis, parameter, side, value, of))
+        if not stated and not of_group:
+            raise UserError(f"{place}: no limit is in it: write one as gx.N: {{max: 0.01 deg/s/sqrt(Hz)}}")
+        found = Limits(tuple(stated), tuple(of_group))
+        by_side = {(one.axis, one.parameter, one.side): one for one in found.of(model.axes)}
+        for (axis, parameter, side), low in by_side.items():
+            high = by_side.get((axis, parameter, "max"))
+            if side == "min" and high is not None and low.value * units.factor(low.unit, high.unit) > high.value:
+                raise UserError(
+                    f"{place}: {axis}.{parameter}: min {low.value:g} {low.unit} is above max {high.value:g} {high.unit}"
+                )
+        return found
+
+
+def _quantity(where: str, text: Any, like: str) -> tuple[float, str]:
+    """Value and unit of a text such as `0.014 deg/s/sqrt(Hz)`, of the kind of `like`."""
+    wanted = f"takes a number and a unit as {like}, not {shown(text)}"
+    try:
+        value, unit = units.quantity(str(text))
+        unit = unit or ("1" if like == "1" else "")
+        alike = units.known(unit) and unit != units.LSB and units.same_kind(unit, like)
+    except ValueError as error:
+        raise UserError(f"{where}: {wanted}") from error
+    if not math.isfinite(value) or not alike:
+        raise UserError(f"{where}: {wanted}")
+    return value, unit
+
+
+def judge(limits: Iterable[Limit], axes: Mapping[str, Any], duration_s: float) -> list[Verdict]:
+    """The verdicts of one recording of `duration_s`; `axes`: those of the document of `identify`, or with a
+    `posterior` those of `diagnose`."""
+    return [_judged(limit, axes.get(limit.axis), duration_s) for limit in limits]
+
+
+def unjudged(limits: Iterable[Limit], reason: str) -> list[Verdict]:
+    """The verdicts of a recording without a result."""
+    return [Verdict(limit, UNJUDGED, reason) for limit in limits]
+
+
+def _judged(limit: Limit, axis: Mapping[str, Any] | None, duration_s: float) -> Verdict:
+    if axis is None:
+        return Verdict(limit, UNJUDGED, "the recording does not have the axis")
+    if "error" in axis:
+        return Verdict(limit, UNJUDGED, axis["error"])
+    known = axis if "hypotheses" in axis else axis.get("posterior")
+    if known is None:
+        return Verdict(limit, UNJUDGED, "there is no posterior")
+    found = _estimate(limit.parameter, known)
+    if isinstance(found, str):
+        return Verdict(limit, UNJUDGED, found)
+    factor = 1.0 if limit.parameter in RATIOS else units.factor(found["unit"], limit.unit)
+    median, q05, q95 = (found[key] * factor for key in ("median", "q05", "q95"))
+    if found["off_grid"] or not all(map(math.isfinite, (median, q05, q95))):
+        return Verdict(limit, UNJUDGED, "the model's grid does not support the estimate: more nodes", median, q05, q95)
+    above = limit.side == "max"
+    if q95 <= limit.value if above else q05 >= limit.value:
+        return Verdict(limit, PASS, "", median, q05, q95)
+    if found["identified"] and (q05 > limit.value if above else q95 < limit.value):
+        reason = f"the {'lower' if above else 'upper'} 95 % bound is {q05 if above else q95:.3g}"
+        return Verdict(limit, FAIL, reason, median, q05, q95)
+    more_s = _rest_s(limit, found, (median, q05, q95), duration_s)
+    reason = "a longer rest does not tell" if more_s is None else f"rest {duration_words(more_s)} more"
+    return Verdict(limit, OPEN, reason, median, q05, q95, more_s)
+
+
+def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
+    """The posterior of a quantity, or why the axis has none. A constant drift bounds what it lacks from above."""
+    probability = axis["hypotheses"]
+    best = max(probability, key=lambda law: probability[law])
+    constant = set(axis["parameters"][best]) <= {"N"}
+    if parameter == "bias":
+        if "bias_now" not in axis:
+            return "diagnose states no bias: identify --limits does"
+        bias, half = axis["bias_now"], HALF_90 * axis["bias_now"]["sd"]
+        bounds = {"median": bias["mean"], "q05": bias["mean"] - half, "q95": bias["mean"] + half}
+        return {**bounds, "unit": bias["unit"], "identified": True, "off_grid": False, "sharpens": constant}
+    having = [law for law in probability if parameter in axis["parameters"][law]]
+    if not having:
+        return f"no law of the model has {parameter}"
+    law = best if best in having else max(having, key=lambda one: probability[one])
+    if law != best and not constant and probability[law] < LEAST_PROBABILITY:
+        there = ", ".join(name for name in axis["parameters"][best] if name != "N")
+        return f"its drift is {best}, which has no {parameter}: limit {there}"
+    return {**axis["parameters"][law][parameter], "sharpens": True}
+
+
+def _rest_s(
+    limit: Limit, found: Mapping[str, Any], known: tuple[float, float, float], duration_s: float
+) -> float | None:
+    """Rest beyond `duration_s` after which the verdict is there with the probability CHANCE, s; None: none does that.
+
+    The posterior's variance falls as the inverse of the length, in the logarithm of all but a bias. Its median then
+    moves by what the variance loses.
+    """
+    median, q05, q95 = known
+    if not found["sharpens"]:
+        return None
+    if not found["identified"]:
+        power = FALLS.get(limit.parameter)
+        if power is None or limit.side == "min":
+            return None
+        return duration_s * (max(q95 / limit.value, 1.0) ** (1.0 / power) - 1.0) if limit.value > 0.0 else None
+    if limit.parameter != "bias":
+        if not limit.value > 0.0 or not q05 > 0.0:
+            return None
+        middle, sd = math.log(limit.value / median), math.log(q95 / q05) / (2.0 * HALF_90)
+    else:
+        middle, sd = limit.value - median, (q95 - q05) / (2.0 * HALF_90)
+    if not sd > 0.0:
+        return None
+
+    def chance(times: float) -> float:
+        """That the verdict is there at so many times the length."""
+        left, moves = sd / math.sqrt(times), sd * math.sqrt(1.0 - 1.0 / times)
+        return _normal((abs(middle) - HALF_90 * left) / moves) + _normal((-abs(middle) - HALF_90 * left) / moves)
+
+    low, high = 0.0, math.log(MOST_TIMES)
+    if chance(MOST_TIMES) < CHANCE:
+        return None
+    for _ in range(60):
+        at = 0.5 * (low + high)
+        low, high = (low, at) if at > 0.0 and chance(math.exp(at)) >= CHANCE else (at, high)
+    return duration_s * math.expm1(high)
+
+
+def _normal(x: float) -> float:
+    return 0.5 * math.erfc(-x / math.sqrt(2.0))
+
+
+def duration_words(seconds: float) -> str:
+    """About: `40 s`, `12 minutes`, `5 hours`, `3 days`."""
+    for size, name, most in ((1.0, "s", 120.0), (60.0, "minutes", 120.0), (3600.0, "hours", 48.0)):
+        if seconds < most * size:
+            return f"{math.ceil(seconds / size)} {name}"
+    return f"{math.ceil(seconds / 86400.0)} days"
+
+
+def code_of(verdicts: Iterable[Verdict]) -> int:
+    """Exit code: 0 all pass, 1 one fails, 2 one cannot be told or judged."""
+    there = {one.verdict for one in verdicts}
+    return 1 if FAIL in there else 2 if there & {OPEN, UNJUDGED} else 0
+
+
+#: A recording's verdicts: the device, the recording, and they.
+Judged = tuple[str, str, Sequence[Verdict]]
+_COLUMNS = (
+    *("device", "recording", "axis", "parameter", "side", "value", "unit", "verdict", "reason", "median", "q05", "q95"),
+    "more_s",
+)
+
+
+def write_verdicts(path: Path | str, judged: Iterable[Judged]) -> None:
+    """Write a CSV of a row for each limit of each recording."""
+    from selfcal.batch.table import write_csv
+
+    def rows() -> Iterator[dict[str, Any]]:
+        for device, recording, verdicts in judged:
+            for one in verdicts:
+                yield {"device": device, "recording": recording, **one.entry()}
+
+    write_csv(path, _COLUMNS, rows())
+
+
+def write_junit(path: Path | str, judged: Sequence[Judged]) -> None:
+    """Write JUnit's XML: a suite for each recording, a case for each limit.
+
+    A case without a verdict is an error, not a skipped one: a line must not take it for passed.
+    """
+    whole_batch = _counts([one for _, _, verdicts in judged for one in verdicts])
+    del whole_batch["skipped"]  # the schema has it of a suite alone
+    suites = ElementTree.Element("testsuites", {"name": "selfcal limits", **whole_batch})
+    for device, recording, verdicts in judged:
+        suite = ElementTree.SubElement(suites, "testsuite", {"name": _clean(device), **_counts(verdicts), "time": "0"})
+        properties = ElementTree.SubElement(suite, "properties")
+        ElementTree.SubElement(properties, "property", {"name": "recording", "value": _clean(recording)})
+        for one in verdicts:
+            head = {"classname": _clean(device), "name": _clean(one.limit.name), "time": "0"}
+            case = ElementTree.SubElement(suite, "testcase", head)
+            if one.verdict != PASS:
+                kind = {"message": _clean(one.words), "type": one.verdict}
+                ElementTree.SubElement(case, "failure" if one.verdict == FAIL else "error", kind)
+    ElementTree.indent(suites)
+    with whole(path) as temporary:
+        ElementTree.ElementTree(suites).write(temporary, encoding="utf-8", xml_declaration=True)
+
+
+def _counts(verdicts: Sequence[Verdict]) -> dict[str, str]:
+    failures = sum(one.verdict == FAIL for one in verdicts)
+    errors = sum(one.verdict in (OPEN, UNJUDGED) for one in verdicts)
+    return {"tests": str(len(verdicts)), "failures": str(failures), "errors": str(errors), "skipped": "0"}
+
+
+def _clean(text: str) -> str:
+    """A text that XML can have."""
+    return printable(text)
+
+
+P = ParamSpec("P")
+
+
+def on_a_line(verb: Callable[P, dict[str, Any]]) -> Callable[P, dict[str, Any]]:
+    """`identify` or `diagnose`, whose JUnit and CSV are written even where it raises UserError.
+
+    A file of the unit before must not stay in its place."""
+
+    @wraps(verb)
+    def run(*arguments: P.args, **options: P.kwargs) -> dict[str, Any]:
+        try:
+            return verb(*arguments, **options)
+        except UserError as error:
+            with suppress(UserError):  # of the limits file itself
+                given: dict[str, Any] = dict(options)
+                if given.get("limits") is not None:
+                    logs = list_of(arguments[0] if arguments else given["log"])  # type: ignore[arg-type]
+                    files = given.get("junit"), given.get("verdicts")
+                    check_writable(*files, inputs=(*logs, given["limits"], given.get("model")))
+                    model = Model.load(given.get("model"))
+                    limits = Limits.load(given["limits"], model).of(given.get("axes") or model.axes)
+                    write([("", " ".join(map(str, logs)), unjudged(limits, str(error)))], *files)
+            raise
+
+    return run
+
+
+def check_options(limits: Path | str | None, junit: Path | str | None, verdicts: Path | str | None) -> None:
+    """Raise UserError for output files without limits."""
+    if limits is None and not (junit is None and verdicts is None):
+        raise UserError("--junit and --verdicts are of the limits' verdicts: give --limits LIMITS.yaml too")
+
+
+def write(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | str | None) -> None:
+    """Write the files that are asked for. A recording without a device has its file's name."""
+    from selfcal.batch.files import stem
+
+    named = [(device or stem(recording), recording, found) for device, recording, found in judged]
+    if junit is not None:
+        write_junit(junit, named)
+    if verdicts is not None:
+        write_verdicts(verdicts, named)
+
+
+def add_verdicts(
+    document: dict[str, Any], limits: Limits, junit: Path | str | None, verdicts: Path | str | None
+) -> None:
+    """Judge a document of `identify` or `diagnose`: its key `limits`, and the files that are asked for."""
+    axes, recording = document["axes"], document["recording"]
+    found = judge(limits.of(axes), axes, recording["duration_s"])
+    document["limits"] = [one.entry() for one in found]
+    write([(recording.get("serial", ""), recording["path"], found)], junit, verdicts)

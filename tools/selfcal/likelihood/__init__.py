@@ -1,0 +1,1 @@
+"""Filters and fits of one axis."""

@@ -1,0 +1,537 @@
+"""Maximum likelihood of a noise model with regressors, by one Kalman filter over the record and every column."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import combinations, product
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import logsumexp
+
+from selfcal import _likelihood
+from selfcal.likelihood import work
+from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Mask, Terms, matrices
+
+#: Columns that the compiled filter takes in one pass (bindings/likelihood.cpp).
+COLUMNS_MOST = 39
+#: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
+FTOL = 0.01
+#: ... of a quick look, which ranks causes and measures none: their evidence differs by more.
+ROUGH_FTOL = 0.3
+#: Standard deviations of a model's parameters at which posteriors of coefficients are summed.
+NODES = (-2.0, -1.0, 0.0, 1.0, 2.0)
+#: A direction whose standard deviation is above this is walked instead, in such steps, while ln likelihood is within so
+#: much of the best; where it changes by less a step, the term that the parameter sizes has vanished.
+HARDLY, NODE_STEP, POSSIBLE, PLATEAU, NODES_FARTHEST = 0.7, 0.6, 4.0, 0.02, 18.0
+#: Longer records know their parameters well enough: the best ones stand for all.
+NODES_MOST = 100_000
+#: The slopes of a model's matrices are taken over this much of each parameter: exact to 1e-8.
+NEAR = 1e-4
+#: Steps of a fit at most, how far one goes at most in any parameter, and how much shorter one is that went too far.
+STEPS, FARTHEST, SHORTER = 40, 3.0, 0.25
+#: A step that promises less than this share of `ftol` is not taken. Its curvature is taken as other than expected by
+#: this factor at most.
+SETTLED, BENT_MOST = 0.2, 20.0
+#: A size of less information than this may as well be nothing: its standard deviation is a factor of two.
+WEAK = 2.0
+#: Drifts that are nothing below a size, and where they are then looked for.
+LARGER = (
+    (("ln_rho",), -7.0, ((-7.0,), (-5.5,))),
+    (("ln_markov", "ln_alpha"), -5.0, ((-5.0, -7.0), (-5.0, -5.0), (-5.0, -3.0), (-5.0, -1.7))),
+)
+#: Parameters that are logarithms of sizes.
+SIZES = (*DRIFT_SIZES, "ln_swing", "ln_band")
+
+
+@dataclass(frozen=True)
+class Series:
+    """One axis on an even grid: `y` float64[n] (NaN: missing), `dt` s, `r` float64[n] variance of the white noise
+    relative to the nominal one. `columns` [p, n] of known disturbances; the first is the bias, all ones. A fit has
+    settled when a step changes ln likelihood by less than `ftol`. `y` are means of `block` readings; `r` is above 1
+    where some are lost."""
+
+    y: Array
+    dt: float
+    r: Array
+    columns: Array
+    ftol: float = FTOL
+    block: int = 1
+
+    @property
+    def n(self) -> int:
+        return int(np.isfinite(self.y).sum())
+
+    @property
+    def duration_s(self) -> float:
+        return self.y.size * self.dt
+
+    def beside(self, more: Array) -> Series:
+        """The same with further columns [k, n]."""
+        return replace(self, columns=np.ascontiguousarray(np.vstack([self.columns, np.atleast_2d(more)])))
+
+
+@dataclass(frozen=True)
+class Sums:
+    """What one pass of the filter leaves: Gram matrix [1 + p, 1 + p] of the whitened record and columns, sum of ln s,
+    samples used."""
+
+    G: Array
+    D: float
+    n: float
+    x: Array  # [1 + p, states]: predicted state of the next sample, of the record and of each column
+
+    def coefficients(self) -> tuple[Array, Array, float]:
+        """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares. The last is
+        infinite where the filter overflowed. Solved once."""
+        return self._solved
+
+    @cached_property
+    def _solved(self) -> tuple[Array, Array, float]:
+        A, B = self.G[1:, 1:], self.G[1:, 0]
+        if not np.isfinite(self.G).all():
+            return np.zeros(B.size), np.zeros(A.shape), math.inf
+        # A column of zeros, a step later than these samples, has no coefficient.
+        size = np.sqrt(np.maximum(np.diag(A), 0.0))
+        scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 1e-150)
+        both = np.outer(scale, scale)
+        # The pseudo-inverse; numpy's own takes five times as long over so few columns.
+        values, vectors = np.linalg.eigh(A * both)
+        held = np.abs(values) > 1e-10 * np.abs(values).max()
+        inverse = (vectors * np.divide(1.0, values, out=np.zeros_like(values), where=held)) @ vectors.T * both
+        c = inverse @ B
+        return c, inverse, max(float(self.G[0, 0] - B @ c), 1e-300)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model: `terms` at `theta`, white noise `sigma` of one sample, coefficients `c` of the columns with their
+    standard deviations `sd`, and `ln_likelihood` at its maximum. `information` [k, k], of a fit: that of `theta`."""
+
+    terms: Terms
+    theta: Array
+    sigma: float
+    c: Array
+    sd: Array
+    ln_likelihood: float
+    n: float
+    dt: float
+    duration_s: float
+    information: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+    @cached_property
+    def spread(self) -> Array:
+        """A root of the covariance of theta [k, k]."""
+        return _spread(self.information)
+
+    def value(self, name: str) -> float:
+        """One parameter of the vector."""
+        return float(self.theta[self.terms.names.index(name)])
+
+    def shrunk(self, by: float) -> Fit:
+        """The same model with a drift smaller by exp(-by), within its limits. Only its parameters are of that drift."""
+        less = np.array([by * (name in DRIFT_SIZES) for name in self.terms.names])
+        low = np.array(self.terms.limits(self.dt)).reshape(-1, 2)[:, 0]
+        return replace(self, theta=np.maximum(self.theta - less, low))
+
+    @property
+    def N(self) -> float:
+        """White noise density, unit/sqrt(Hz)."""
+        return self.sigma * math.sqrt(self.dt)
+
+    @property
+    def quantized(self) -> bool:
+        """Whether its noise is white and quantization noise: a moving average of neighbours that pull apart."""
+        return self.terms.color == "ma" and self.value("color") < 0.0
+
+    @property
+    def increment(self) -> float:
+        """Of the counter whose remainders are the quantization noise: sqrt(12) Q, unit times s."""
+        m = math.tanh(self.value("color"))
+        return self.sigma * self.dt * math.sqrt(-12.0 * m / (1.0 + m * m))
+
+    @property
+    def N_of_color(self) -> float:
+        """White noise density at low frequency, of a fit with memory."""
+        m = math.tanh(self.value("color"))
+        of_all = (1.0 + m) ** 2 / (1.0 + m * m) if self.terms.color == "ma" else (1.0 + m) / (1.0 - m)
+        return self.N * math.sqrt(of_all)
+
+    @property
+    def K(self) -> float:
+        """Coefficient of the random walk, unit/s/sqrt(Hz); 0 without one."""
+        return self.sigma * math.exp(self.value("ln_rho")) / math.sqrt(self.dt) if self.terms.walk else 0.0
+
+    @property
+    def sigma_m(self) -> float:
+        """Standard deviation of the Gauss-Markov drift at its samples, unit."""
+        return self.sigma * math.exp(self.value("ln_markov"))
+
+    @property
+    def alpha(self) -> float:
+        """Bandwidth of the Gauss-Markov drift, 1/s."""
+        return math.exp(self.value("ln_alpha"))
+
+
+def run(
+    series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
+) -> tuple[list[Sums], Array, Array]:
+    """One pass, counted as work; sums up to each of `marks` (default: the end), whitened innovations [n, 1 + p], their
+    variances [n]."""
+    G, D, n, x, white, s = passed(series, terms, theta, marks, innovations)
+    return [Sums(G[k], float(D[k]), float(n[k]), x[k]) for k in range(len(G))], white, s
+
+
+def passed(
+    series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
+) -> tuple[Array, Array, Array, Array, Array, Array]:
+    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances."""
+    m = matrices(terms, theta, series.dt, series.duration_s, series.block)
+    at = list(marks) or [series.y.size]
+
+    def of(columns: Array) -> tuple[Array, ...]:
+        work.count(series.y.size, len(columns))
+        found: tuple[Array, ...] = _likelihood.run(
+            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver, at, innovations
+        )
+        return found
+
+    G, D, n, x, white, s = _whole(series.columns, of, {0: (1, 2), 3: (1,), 4: (1,)})
+    return G, D, n, x, white, s
+
+
+def _whole(
+    columns: Array, of: Callable[[Array], tuple[Array, ...]], by_column: Mapping[int, tuple[int, ...]]
+) -> tuple[Array, ...]:
+    """The arrays of a pass over all columns [p, n]. A pass `of` too many is one of every pair of their parts: the
+    filter whitens each column by itself. `by_column`: array by its place -> its axes of length 1 + p."""
+    if len(columns) <= COLUMNS_MOST:
+        return of(columns)
+    parts = np.array_split(np.arange(len(columns)), math.ceil(len(columns) / (COLUMNS_MOST // 2)))
+    whole: list[Array] = []
+    for pair in combinations(parts, 2):
+        chosen = np.concatenate(pair)
+        found = of(np.ascontiguousarray(columns[chosen]))
+        rows = np.concatenate([[0], 1 + chosen])
+        if not whole:
+            whole = [one.copy() for one in found]
+            for place, axes in by_column.items():
+                shape = [1 + len(columns) if axis in axes else size for axis, size in enumerate(found[place].shape)]
+                whole[place] = np.zeros(shape)
+        for place, axes in by_column.items():
+            at = [rows if axis in axes else np.arange(size) for axis, size in enumerate(whole[place].shape)]
+            whole[place][np.ix_(*at)] = found[place]
+    return tuple(whole)
+
+
+@dataclass(frozen=True)
+class Shifts:
+    """Shifts of the level that begin at each sample and stay, before the columns are taken out, relative to the white
+    noise. `sums`: of the record. `A` [n]: information of each. `B` [n, 1 + p]: its products with the whitened record
+    and columns. `impulse` [n]: information of a single shifted sample, 0 where it is missing."""
+
+    sums: Sums
+    A: Array
+    B: Array
+    impulse: Array
+
+
+def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
+    """One pass of the filter, and one backwards over its gains: exact beside gaps, and where the noise changes."""
+    m = matrices(terms, theta, series.dt, series.duration_s, series.block)
+
+    def of(columns: Array) -> tuple[Array, ...]:
+        found = _likelihood.shifts(series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver)
+        return tuple(np.asarray(one) for one in found)
+
+    G, D, A, B, impulse = _whole(series.columns, of, {0: (0, 1), 3: (1,)})
+    return Shifts(Sums(G, float(D), float(series.n), np.empty(0)), A, B, impulse)
+
+
+def ln_det(covariance: NDArray[np.floating[Any]]) -> float:
+    """ln of the determinant of a covariance [p, p] of coefficients, over those that the record knows."""
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    known = sd > 0.0
+    sd = sd[known]
+    values = np.linalg.eigvalsh(covariance[np.ix_(known, known)] / np.outer(sd, sd))
+    return 2.0 * float(np.log(sd).sum()) + float(np.log(values[values > 1e-10]).sum())
+
+
+def ln_likelihood(sums: Sums) -> float:
+    """At the best sigma and coefficients."""
+    rss = sums.coefficients()[2]
+    return -0.5 * (sums.n * (math.log(2.0 * math.pi * rss / sums.n) + 1.0) + sums.D)
+
+
+def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
+    """Slope [k] of ln likelihood by the parameters of a fit, and their information [k, k].
+
+    One pass over the record less its columns: their coefficients are the best ones, and a small change of theta moves
+    the likelihood by none of theirs. sigma is free in the information."""
+    work.count(series.y.size, at.theta.size)
+    terms, theta = at.terms, at.theta
+    m = matrices(terms, theta, series.dt, series.duration_s, series.block)
+    near = [
+        [matrices(terms, theta + sign * move, series.dt, series.duration_s, series.block) for sign in (1.0, -1.0)]
+        for move in NEAR * np.eye(theta.size)
+    ]
+    F_by, Q_by, h_by, P0_by, R_by, lost_by = (
+        np.ascontiguousarray([(getattr(ahead, name) - getattr(back, name)) / (2.0 * NEAR) for ahead, back in near])
+        for name in ("F", "Q", "h", "P0", "R", "lost")
+    )
+    whole = series.y - at.c @ series.columns
+    rss, _, n, rss_by, D_by, innovations, spread = _likelihood.slopes(
+        whole, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, F_by, Q_by, h_by, P0_by, R_by, lost_by, m.driver
+    )
+    rss = max(rss, 1e-300)
+    information = n / rss * innovations + 0.5 * (spread - np.outer(D_by, D_by) / n)
+    return -0.5 * (n * rss_by / rss + D_by), information
+
+
+def refit(series: Series, known: Fit) -> Fit:
+    """The same model on much the same record, from where it was."""
+    return _climbed(series, finish(series, known.terms, known.theta))
+
+
+def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
+    """Best `theta` from `start`, or from the best of a few starts.
+
+    Where a drift has gone to nothing, a larger one is looked for once more: a likelihood may have a second top there,
+    and a Gauss-Markov drift may have gone there with the wrong rate."""
+    low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
+    starts = [start] if start is not None else _starts(terms, np.array([low, high]).T)
+    found = _climbed(series, best([finish(series, terms, np.clip(one, low, high)) for one in starts]))
+    promised: list[tuple[float, Fit]] = []
+    for place in _larger(terms, found.theta):
+        at = finish(series, terms, place)
+        slope, information = slopes(series, at)
+        k = int(np.flatnonzero(place != found.theta)[0])
+        if slope[k] > 0.0:
+            promised.append((at.ln_likelihood + 0.5 * float(slope[k] ** 2 / information[k, k]), at))
+    if not promised:
+        return found
+    return best([found, _climbed(series, max(promised, key=lambda one: one[0])[1])])
+
+
+def _larger(terms: Terms, theta: Array) -> list[Array]:
+    """Places with more of each drift that is nothing at `theta`."""
+    places = []
+    for names, below, values in LARGER:
+        if names[0] in terms.names and theta[terms.names.index(names[0])] < below:
+            for value in values:
+                place = theta.copy()
+                for name, number in zip(names, value, strict=True):
+                    place[terms.names.index(name)] = number
+                places.append(place)
+    return places
+
+
+def _climbed(series: Series, here: Fit) -> Fit:
+    """The top of the likelihood from a fit on, by Fisher's scoring.
+
+    A size that has gone to nothing has little slope and less information. Their ratio still shows whether it should
+    grow, so that no step ends on the flat. A size that the record hardly knows is also tried at nothing."""
+    terms = here.terms
+    if not terms.names:
+        return here
+    low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
+    size = np.array([name in SIZES for name in terms.names])
+    reach = FARTHEST
+    before: tuple[Array, Array] | None = None
+    for _ in range(STEPS):
+        slope, information = slopes(series, here)
+        here = replace(here, information=information)
+        if not (np.isfinite(slope).all() and np.isfinite(information).all()):
+            return here
+        weak = size & (np.diag(information) < WEAK)
+        falling = weak & (slope < -2.0 * SETTLED * series.ftol) & (here.theta > low)
+        information = _bent(size, information, before, slope)
+        while True:
+            move, gain = _move(size, slope, information, low - here.theta, high - here.theta, reach)
+            if gain >= SETTLED * series.ftol:
+                there = finish(series, terms, here.theta + move)
+            elif falling.any():
+                move, gain = np.where(falling, low - here.theta, 0.0), 0.0
+                falling[:] = False
+                there = finish(series, terms, here.theta + move)
+            else:
+                return here
+            more = there.ln_likelihood - here.ln_likelihood
+            if more > 0.0:
+                break
+            reach *= SHORTER
+        before, here = (move, slope), replace(there, information=here.information)
+        # A small gain that came as promised, by a step that nothing has shortened, was the last one.
+        whole = float(np.abs(move).max()) < 0.4 * reach and not (weak & (slope < 0.0)).any()
+        if whole and gain < 3.0 * series.ftol and abs(more - gain) < 0.2 * gain:
+            break
+        reach = min(FARTHEST, reach / SHORTER)
+    return here
+
+
+def _bent(size: Mask, information: Array, before: tuple[Array, Array] | None, slope: Array) -> Array:
+    """The information with the curvature that the last step has shown along itself: a model that is wrong has another.
+
+    `size`: whether each parameter is one. `before`: that step, and the slope at its start."""
+    if before is None:
+        return information
+    move, was = before
+    fallen = size & (move < 0.0)
+    step = np.where(fallen, -0.5 * np.expm1(-2.0 * np.where(fallen, move, 0.0)), move)
+    along = information @ step
+    expected, shown = float(step @ along), float(step @ (np.where(fallen, np.exp(2.0 * move), 1.0) * was - slope))
+    if not 0.0 < shown < math.inf or expected <= 0.0:
+        return information
+    share = min(max(shown / expected, 1.0 / BENT_MOST), BENT_MOST)
+    bent: Array = information + (share - 1.0) / expected * np.outer(along, along)
+    return bent
+
+
+def _move(size: Mask, slope: Array, information: Array, low: Array, high: Array, reach: float) -> tuple[Array, float]:
+    """A step [k] of theta between `low` and `high`, no parameter by more than `reach`, and the gain that it promises.
+
+    A size that falls takes its step as a variance: ln likelihood is nearly a parabola of that down to nothing. One that
+    grows takes a step of more than 1 so: from nothing its logarithm has to go far."""
+    down, up = np.where(size, 0.5 * reach, reach), np.where(size, 4.0 * reach, reach)
+    bounds = np.array([np.maximum(low, -down), np.minimum(high, up)])
+    bend = size & (np.array([[True], [False]]) | (bounds > 1.0))
+    beyond = np.array([[0.0], [1.0]])
+    bounds = np.where(bend, beyond + 0.5 * np.expm1(2.0 * (bounds - beyond)), bounds)
+    step, gain = _highest(slope, information, bounds)
+    start = np.where(step > 0.0, 1.0, 0.0)
+    bend = size & ((step < 0.0) | (step > 1.0))
+    move = np.where(bend, start + 0.5 * np.log1p(2.0 * np.where(bend, step - start, 0.0)), step)
+    return np.clip(move, low, high), gain
+
+
+def _highest(slope: Array, information: Array, bounds: Array) -> tuple[Array, float]:
+    """Where slope x - x information x / 2 is highest between `bounds` [2, k], which hold 0, and how high."""
+    k = slope.size
+    x = np.zeros(k)
+    held = np.zeros(k, bool)
+    curvature = information + 1e-12 * np.diag(np.diag(information)) + 1e-300 * np.eye(k)
+    for _ in range(8 * k):
+        free = ~held
+        if free.any():
+            ahead = x.copy()
+            left = slope[free] - curvature[np.ix_(free, held)] @ x[held]
+            ahead[free] = np.linalg.lstsq(curvature[np.ix_(free, free)], left, rcond=1e-14)[0]
+            way = ahead - x
+            bound = np.where(way > 0.0, bounds[1], bounds[0])
+            share = np.where(way != 0.0, (bound - x) / np.where(way != 0.0, way, 1.0), np.inf)
+            first = int(np.argmin(share))
+            if share[first] < 1.0:
+                x += max(0.0, share[first]) * way
+                x[first] = bound[first]
+                held[first] = True
+                continue
+            x = ahead
+        pull = slope - curvature @ x
+        inwards = np.where(x <= bounds[0], pull, -pull) * held
+        freed = int(np.argmax(inwards))
+        if inwards[freed] <= 1e-9 * float(np.abs(slope).max()):
+            break
+        held[freed] = False
+    return x, float(slope @ x - 0.5 * x @ curvature @ x)
+
+
+def _spread(information: Array) -> Array:
+    """A root of the covariance of theta; 4 at most for what the record hardly knows."""
+    if not np.isfinite(information).all():
+        return 4.0 * np.eye(len(information))
+    values, vectors = np.linalg.eigh(information)
+    spread: Array = vectors / np.sqrt(np.maximum(values, 1.0 / 16.0))
+    return spread
+
+
+def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
+    """Parameters of the drift about a fit's, within their limits, and ln of the share of those that each stands for.
+
+    Within a drift, the prior of its size is Jeffreys' for a weak walk: the information of ln rho is n rho / 2. A flat
+    one counts sizes that no record tells from nothing, and intervals beside a weak walk are too short."""
+    if not found.terms.names or series.n > NODES_MOST or series.ftol > FTOL:
+        return [(found.theta, 0.0)]
+    spread = found.spread
+    limits = np.array(found.terms.limits(found.dt)).reshape(-1, 2)
+    k = found.theta.size
+    length = np.linalg.norm(spread, axis=0)
+    # Of three parameters and more only the two least known are varied.
+    wide = np.argsort(-length)[:2]
+    steps = [np.array(NODES) if j in wide else np.zeros(1) for j in range(k)]
+    for j in wide[length[wide] > HARDLY]:
+        steps[j] = _possible(series, found, spread[:, j] / length[j], limits) / length[j]
+    apart = [float(np.diff(one).mean()) if one.size > 1 else 1.0 for one in steps]
+    volume = float(np.log(length * apart).sum() - np.log(limits[:, 1] - limits[:, 0]).sum())
+    places = [found.theta + spread @ np.array(z) for z in product(*steps)]
+    inside = [theta for theta in places if np.all((theta >= limits[:, 0]) & (theta <= limits[:, 1]))]
+    inside = inside or [found.theta]
+    sizes = [name in DRIFT_SIZES for name in found.terms.names]
+    ln_prior = 0.5 * np.array([theta[sizes].sum() for theta in inside])
+    ln_prior -= logsumexp(ln_prior) - math.log(len(inside))
+    return list(zip(inside, (volume + ln_prior).tolist(), strict=True))
+
+
+def _possible(series: Series, found: Fit, direction: Array, limits: Array) -> Array:
+    """Moves of theta along a `direction` that the record leaves possible, evenly spaced.
+
+    A parameter that the record hardly knows has no normal posterior: on one side its term vanishes, and nothing changes
+    any more. Of that plateau one node is kept: a term so small acts on no coefficient."""
+
+    def value(move: float) -> float:
+        theta = found.theta + move * direction
+        if np.any((theta < limits[:, 0]) | (theta > limits[:, 1])):
+            return -math.inf
+        return ln_likelihood(run(series, found.terms, theta)[0][0])
+
+    found_at = {0.0: value(0.0)}
+    for side in (-NODE_STEP, NODE_STEP):
+        move = side
+        while abs(move) < NODES_FARTHEST and (now := value(move)) >= found_at[0.0] - POSSIBLE:
+            found_at[move] = now
+            move += side
+    moves = np.array(sorted(found_at))
+    bent = np.flatnonzero(np.abs(np.diff([found_at[float(move)] for move in moves])) >= PLATEAU)
+    return moves[bent[0] : bent[-1] + 2] if bent.size else np.zeros(1)
+
+
+def finish(series: Series, terms: Terms, theta: Array) -> Fit:
+    """The fit at given parameters."""
+    sums = run(series, terms, theta)[0][0]
+    c, inverse, rss = sums.coefficients()
+    sigma = math.sqrt(rss / sums.n)
+    sd = sigma * np.sqrt(np.maximum(np.diag(inverse), 0.0))
+    return Fit(terms, theta, sigma, c, sd, ln_likelihood(sums), sums.n, series.dt, series.duration_s)
+
+
+_GUESSES: dict[str, tuple[float, ...]] = {
+    "ln_rho": (-4.0, -8.0),
+    "ln_markov": (-1.5,),
+    "ln_alpha": (-6.0, -4.0, -2.0),
+    "ln_flicker": (-2.0, -6.0),
+    "color": (0.2, -0.2),
+}
+
+
+def _starts(terms: Terms, limits: Array) -> list[Array]:
+    """All combinations of a few guesses a parameter; further ones at the middle of their limits."""
+    grids = [_GUESSES.get(name, (0.5 * (low + high),)) for name, (low, high) in zip(terms.names, limits, strict=True)]
+    if len(grids) > 3:
+        grids = [guess[: 2 if k < 2 else 1] for k, guess in enumerate(grids)]
+    mesh = np.meshgrid(*grids, indexing="ij")
+    return [np.array(point) for point in zip(*(axis.ravel() for axis in mesh), strict=True)]
+
+
+def best(fits: Sequence[Fit]) -> Fit:
+    """The likeliest."""
+    return max(fits, key=lambda one: one.ln_likelihood)
+
+
+def moved(fit_: Fit, terms: Terms) -> Array:
+    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small."""
+    known = dict(zip(fit_.terms.names, fit_.theta, strict=True))
+    fresh = {"ln_rho": -6.0, "ln_markov": -2.5, "ln_alpha": -4.0, "ln_flicker": -3.0, "color": 0.2}
+    return np.array([known.get(name, fresh.get(name, 0.0)) for name in terms.names])

@@ -1,0 +1,302 @@
+"""What is known of one axis at a point of the loop: its record, the model so far, and what a candidate would gain."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.special import chdtrc, ndtr
+
+from selfcal.bank.result import HALF_90, of_mixture
+from selfcal.base.errors import UserError
+from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
+from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Terms
+
+#: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
+P_LOOK = 5e-4
+NET_LEAST = -math.log(P_LOOK)
+#: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
+FAR = 40.0
+#: Two causes whose worth differs by less than this, nats, cannot be told apart.
+ALIKE = 3.0
+#: Score gains below this are not worth a refit: the refit gains about as much.
+SCREEN = 2.0
+#: Columns that one pass of the filter takes beside the model's.
+ABREAST = 8
+
+
+#: No term beside white noise and the drift.
+NONE = Terms()
+
+
+@dataclass(frozen=True)
+class Regressor:
+    """A column that is in an axis' model. `entry` is the model file's (without prior), empty where it
+    cannot state the column; `unit` the column's."""
+
+    name: str
+    cause: str
+    values: Array
+    unit: str
+    entry: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class State:
+    """One axis: the record `y` on its grid (NaN: missing or kept out), the regressors and extras of its model so far.
+
+    `fits` are those of every base drift; `whitened` float64[n] the residual innovations of the best, `variance` [n]
+    theirs. `redrawn`: not all values are as read: clipped ones were drawn anew, or
+    they are block means. `below_lattice`: the noise of a reading is so far below the lattice that rounding is no
+    noise, and no linear model judges the axis. `lsb`: the lattice the values lie on (0: none), `stated_lsb`
+    the model file's. `ftol`: of its fits, `block`: readings of a mean, see Series.
+    """
+
+    axis: str
+    unit: str
+    y: Array
+    dt: float
+    level: float
+    r: Array
+    regressors: tuple[Regressor, ...] = ()
+    extras: Terms = NONE
+    lsb: float = 0.0
+    stated_lsb: float = 0.0
+    fits: tuple[Fit, ...] = ()
+    whitened: Array = field(default_factory=lambda: np.empty(0))
+    variance: Array = field(default_factory=lambda: np.empty(0))
+    redrawn: bool = False
+    below_lattice: bool = False
+    ftol: float = FTOL
+    block: int = 1
+
+    @property
+    def series(self) -> Series:
+        columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
+        return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol, self.block)
+
+    @property
+    def best(self) -> Fit:
+        return best(self.fits)
+
+    def bases(self) -> tuple[Terms, ...]:
+        """The drifts that the model may have, with its extras: the paper's laws; walk includes the constant."""
+        return (replace(self.extras, walk=True), replace(self.extras, markov=True))
+
+    def near(self) -> tuple[Terms, ...]:
+        """Those that a candidate may make the best."""
+        least = self.best.ln_likelihood - FAR
+        far = {one.terms for one in self.fits if one.ln_likelihood < least}
+        return tuple(terms for terms in self.bases() if terms not in far)
+
+    def refit(self, **changes: Any) -> State:
+        """The state with `changes`, fitted. UserError where no model has a likelihood."""
+        state = replace(self, **changes)
+        series = state.series
+        fits = tuple(_fit_from(series, terms, state.fits) for terms in state.bases())
+        if not math.isfinite(best(fits).ln_likelihood):
+            raise UserError(
+                f"{self.axis}: no noise model fits these readings: leave out the time in which the sensor did not rest"
+            )
+        state = replace(state, fits=fits)
+        chosen = state.best
+        _, white, s = run(series, chosen.terms, chosen.theta, innovations=True)
+        residual = (white[:, 0] - white[:, 1:] @ chosen.c) / chosen.sigma
+        return replace(state, whitened=residual, variance=s * chosen.sigma**2)
+
+    def without(self, names: Collection[str]) -> State:
+        """The state less some columns. Its fits are still those with them, from which a fit beside it starts."""
+        return replace(self, regressors=tuple(one for one in self.regressors if one.name not in names))
+
+    def stiffer(self, by: float) -> list[Fit]:
+        """The best fit with a drift smaller by exp(-by), if it has one."""
+        return [self.best.shrunk(by)] if any(name in DRIFT_SIZES for name in self.best.terms.names) else []
+
+    def with_columns(self, more: Array) -> tuple[float, Fit]:
+        """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
+        fits = [self.fitted_with(terms, more) for terms in self.near()]
+        return best(fits).ln_likelihood - self.best.ln_likelihood, best(fits)
+
+    def fitted_with(self, terms: Terms, more: Array) -> Fit:
+        """The fit of one drift with further columns [k, n]."""
+        return _fit_from(self.series.beside(more), terms, self.fits)
+
+    def possible(self, more: Array, *, rich: bool) -> Iterator[tuple[Fit, Array, float]]:
+        """The fit of every near drift with further columns [k, n], `rich`: of one of two terms as well. Of each the
+        parameters that the record leaves possible, and ln of the share of those that they stand for."""
+        series = self.series.beside(more)
+        fits = [self.fitted_with(terms, more) for terms in self.near()]
+        if rich and not self.extras.flicker:
+            fits.append(refit(series, self.rich))
+        yield from _nodes(series, fits)
+
+    def drifts(self) -> Iterator[tuple[Fit, Array, float]]:
+        """The same of the model as it is."""
+        near = self.near()
+        yield from _nodes(self.series, [one for one in self.fits if one.terms in near])
+
+    def posterior(self, *alternatives: Array) -> tuple[Array, Array, Array]:
+        """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
+        [a, m], means [a, m, k] and standard deviations [a, m, k] of the normals that they are the sum of. Each of the
+        `alternatives`, the likeliest first, is one set of columns; before the record they are equally likely."""
+        blocks = [np.atleast_2d(one) for one in alternatives]
+        k = len(blocks[0])
+        found: list[tuple[Array, Array, Array]] = []
+        for one, theta, ln_share in self.possible(blocks[0], rich=True):
+            ln_weight, means, sds = [], [], []
+            for sums in self.sums(one.terms, theta, blocks):
+                c, inverse, rss = sums.coefficients()
+                sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse)[-k:], 1e-300))
+                ln_weight.append(ln_share + ln_likelihood(sums) + float(np.log(sd).sum()))
+                means.append(c[-k:])
+                sds.append(sd)
+            found.append((np.array(ln_weight), np.array(means), np.array(sds)))
+        value = np.array([each[0] for each in found]).T
+        places = [np.swapaxes(np.array([each[i] for each in found]), 0, 1) for i in (1, 2)]
+        return np.exp(value - value.max()), places[0], places[1]
+
+    def sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
+        """Of the model with each of the blocks [k, n] of further columns: one pass for many of them."""
+        known = 1 + 1 + len(self.regressors)
+        at = 0
+        while at < len(blocks):
+            upto, width = at, 0
+            while upto < len(blocks) and (upto == at or width + len(blocks[upto]) <= ABREAST):
+                width += len(blocks[upto])
+                upto += 1
+            sums = run(self.series.beside(np.vstack(blocks[at:upto])), terms, theta)[0][0]
+            place = known
+            for block in blocks[at:upto]:
+                chosen = [*range(known), *range(place, place + len(block))]
+                yield replace(sums, G=sums.G[np.ix_(chosen, chosen)], x=sums.x[chosen])
+                place += len(block)
+            at = upto
+
+    @cached_property
+    def rich(self) -> Fit:
+        """A drift of two terms."""
+        terms = replace(self.extras, walk=True, markov=True)
+        return fit(self.series, terms, moved(self.best, terms))
+
+    def rich_gain(self, more: Array) -> float:
+        """The same gain beside a drift of two terms: a poor drift model makes some nats of any slow column. 1/f noise
+        has several terms by itself."""
+        if self.extras.flicker:
+            return math.inf
+        after = refit(self.series.beside(more), self.rich)
+        return after.ln_likelihood - max(self.rich.ln_likelihood, self.best.ln_likelihood)
+
+    def scores(self, blocks: Sequence[Array], at: Fit | None = None) -> Array:
+        """Gain [b] of each block [k, n] of further columns with the drift of a fit, by default of the best: a bound
+        from below for what they gain with it refitted. One pass for many of them."""
+        at = self.best if at is None else at
+        found = [ln_likelihood(sums) for sums in self.sums(at.terms, at.theta, [np.atleast_2d(one) for one in blocks])]
+        return np.array(found) - self.best.ln_likelihood
+
+    def least(self, column: Array) -> float:
+        """The coefficient of a column that gains NET_LEAST at the fitted noise."""
+        series = self.series.beside(column)
+        G = run(series, self.best.terms, self.best.theta)[0][0].G / self.best.sigma**2
+        k = len(G) - 1
+        cross = G[1:k, k]
+        A = G[k, k] - cross @ np.linalg.pinv(G[1:k, 1:k], rcond=1e-12, hermitian=True) @ cross
+        return math.sqrt(2.0 * NET_LEAST / A) if 1e-9 * G[k, k] < A else math.inf
+
+
+def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, float]]:
+    for one in fits:
+        for theta, ln_share in nodes(series, one):
+            yield one, theta, ln_share
+
+
+def gain_for(worth: Callable[[float], float]) -> float:
+    """The gain that is worth NET_LEAST after its search, over NET_LEAST."""
+    from scipy.optimize import brentq
+
+    gain = brentq(lambda gain: worth(gain) - NET_LEAST, NET_LEAST / 2.0, 10.0 * NET_LEAST)
+    return float(gain) / NET_LEAST
+
+
+def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
+    same = [one for one in known if one.terms == terms]
+    if same:
+        return refit(series, same[0])
+    near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
+    if near:
+        return fit(series, terms, moved(near[0], terms))
+    return fit(series, terms)
+
+
+def net(gain: float, freedom: int = 1, ln_looks: float = 0.0) -> float:
+    """-ln of the probability that noise alone gains as much in the best of exp(ln_looks) looks (capped at 0)."""
+    if gain <= 0.0:
+        return 0.0
+    p = float(chdtrc(freedom, 2.0 * gain))  # as scipy.stats has it, at a hundredth of the time
+    ln_p = math.log(p) if p > 0.0 else -gain
+    return max(0.0, -(ln_p + ln_looks))
+
+
+def ln_looks(bend: Array, gain: float) -> float:
+    """ln of the number of independent looks among scores of neighbouring places: their largest gains `gain` of noise.
+
+    `bend` [places]: 1 - correlation of each place's score with its neighbour's. A score that forgets exponentially
+    crosses u = sqrt(2 gain) about bend u^2 times a place (Leadbetter, Lindgren & Rootzen 1983, theorem 12.2.9). Between
+    samples it is not looked at: Siegmund's factor nu (Sequential Analysis, 1985, chapter X) counts that.
+    """
+    square = 2.0 * bend * max(gain, 0.0)
+    half = 0.5 * np.sqrt(np.maximum(2.0 * square, 1e-12))
+    nu = (ndtr(half) - 0.5) / (half * (half * ndtr(half) + np.exp(-0.5 * half**2) / math.sqrt(2.0 * math.pi)))
+    return math.log1p(float((square * nu).sum()))
+
+
+@dataclass(frozen=True)
+class Look:
+    """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
+    interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be. `measure`: sizes
+    beside a model that lacks the look's columns alone. `before`: the state less earlier columns of its channel, which
+    it takes the place of."""
+
+    cause: str
+    gain: float
+    net: float
+    estimate: Mapping[str, Any]
+    changes: Mapping[str, Any]
+    words: str = ""
+    when: tuple[float, float] | None = None
+    shown_by: str = ""
+    others: tuple[str, ...] = ()
+    measure: Callable[[State], Mapping[str, Any]] | None = None
+    before: State | None = None
+
+    def repeats(self, other: Look) -> bool:
+        """Whether both are the same cause of the same channel."""
+        channels = [(one.cause, one.estimate.get("other"), one.estimate.get("channel")) for one in (self, other)]
+        return channels[0] == channels[1]
+
+    def measured(self, beside: State) -> Look:
+        """The look with the sizes that `measure` has beside a model."""
+        if self.measure is None:
+            return self
+        return replace(self, estimate={**self.estimate, **self.measure(beside)})
+
+
+def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
+    """A posterior that is normal, in the form of the contract."""
+    return {
+        "mean": value,
+        "median": value,
+        "sd": sd,
+        "q05": value - HALF_90 * sd,
+        "q95": value + HALF_90 * sd,
+        "unit": unit,
+    }
+
+
+def mixture(weight: Array, mean: Array, sd: Array | float, unit: str) -> dict[str, Any]:
+    """A posterior that is a sum of normals, `weight` of each not normalized, in the form of the contract."""
+    found = of_mixture(weight, mean, np.broadcast_to(np.asarray(sd, np.float64), mean.shape))
+    return {**dict(zip(("mean", "sd", "q05", "median", "q95"), found, strict=True)), "unit": unit}

@@ -1,0 +1,124 @@
+"""Formats of recordings: a row each. The library that reads a format is imported only for a file of it.
+
+A format is a module of this folder with `read(path, hints)`, which gives the tables of a file. It runs in a child
+process (`child.py`). Text is read by `text_table.py`. `headings.py` knows what other
+programs call their columns, `sources.py` chooses among several sensors of a log.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, TypedDict
+
+from selfcal.base.errors import UserError, install
+
+if TYPE_CHECKING:
+    from selfcal.logs.recording import Scale
+
+#: Text, each with .gz too.
+TEXT = (".csv", ".tsv", ".txt", ".log", ".dat", ".lvm")
+#: Texts of a phone's app together.
+ZIP = ".zip"
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format: how a message calls its files, suffixes, and bytes at places by which a file is known.
+
+    `module` reads it. `library` is the import name of what it takes beside numpy and scipy, and `extra` the group of
+    `pip install` that brings the library, "" where every installation has it. `here`: sizes are checked before anything
+    is read, and columns are read when they are wanted, so it needs no process of its own.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    module: str
+    magic: tuple[tuple[int, bytes], ...] = ()
+    library: str = ""
+    extra: str = ""
+    here: bool = False
+
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+FORMATS = (
+    Format("an npz file", (".npz",), "npz", here=True),
+    Format("a MATLAB file", (".mat",), "matlab"),
+    Format("an R file", (".rda", ".rdata", ".rds"), "r_data", library="rdata", extra="r"),
+    Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags"),
+    Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap"),
+    Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog"),
+    Format("a DataFlash log", (".bin", ".tlog"), "dataflash", ((0, b"\xa3\x95\x80"),), "pymavlink", "ardupilot"),
+    Format("a Betaflight log", (".bbl", ".bfl"), "blackbox", ((0, b"H Product:Blackbox"),)),
+    Format("an HDF5 file", (".h5", ".hdf5"), "hdf5", ((0, _HDF5), (512, _HDF5)), "h5py"),
+    Format("a Parquet file", (".parquet",), "parquet", ((0, b"PAR1"),), "pyarrow", "lab"),
+    Format("a TDMS file", (".tdms",), "tdms", ((0, b"TDSm"),), "nptdms"),
+    Format("an MDF file", (".mf4", ".mdf"), "mf4", ((0, b"MDF     "), (0, b"UnFinMF ")), "asammdf", "automotive"),
+    Format("a log of CAN frames", (".blf", ".asc", ".trc"), "can_log", ((0, b"LOGG"),), "can"),
+)
+
+#: How a message lists what is read, and what is written.
+READ = (
+    f"{', '.join((*TEXT, ZIP, *(suffix for one in FORMATS for suffix in one.suffixes)))}; .gz of text; a ROS 2 folder"
+)
+WRITTEN = ".csv, .csv.gz or .npz"
+
+
+class Reading(TypedDict, total=False):
+    """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
+
+    rate: float | None
+    columns: Mapping[str, str] | None
+    units: Mapping[str, str] | None
+    scale: Mapping[str, Scale] | float | None
+    no_time: bool
+    skip_bad: bool
+    sources: Sequence[str]
+    dbc: Path | str | None
+
+
+#: Bytes from a file's begin that tell its format.
+_HEAD = 520
+#: What a ROS 2 folder holds.
+_ROS_FOLDER = ("metadata.yaml", "*.db3", "*.mcap")
+
+
+def is_text(path: Path) -> bool:
+    """Whether a file's name is a text recording's."""
+    return path.name.lower().removesuffix(".gz").endswith(TEXT)
+
+
+def format_of(path: Path, *, frames: bool = False) -> Format | None:
+    """The format of a file that is no text, by its first bytes, else by its suffix; None for a text. `frames`: it is a
+    log of CAN frames, which may be a text. Raises UserError, and OSError."""
+    if frames:
+        return next(one for one in FORMATS if one.module == "can_log")
+    if path.is_dir():
+        if any(True for pattern in _ROS_FOLDER for _ in path.glob(pattern)):
+            return next(one for one in FORMATS if one.module == "ros")
+        raise UserError(f"{path}: is a folder: name a recording in it ({READ})")
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    suffix = path.suffix.lower()
+    for one in FORMATS:
+        if any(head[at : at + len(sign)] == sign for at, sign in one.magic):
+            return one
+    for one in FORMATS:
+        if suffix in one.suffixes:
+            if not head:
+                raise UserError(f"{path}: the file is empty")
+            return one
+    if is_text(path) or suffix == ZIP:
+        if not head:
+            raise UserError(f"{path}: the file is empty")
+        return None
+    raise UserError(f"{path}: not a recording: its name ends in none of {READ}")
+
+
+def check_library(path: Path, one: Format) -> None:
+    """Raise UserError, with the line to type, where the library of a format is not installed."""
+    if one.library and importlib.util.find_spec(one.library) is None:
+        typed = install(f"selfcal[{one.extra}]" if one.extra else "selfcal")
+        raise UserError(f"{path}: is {one.name}, and {one.library} is not installed: {typed}")

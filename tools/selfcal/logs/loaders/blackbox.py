@@ -1,0 +1,333 @@
+"""Betaflight's blackbox (.bbl, .bfl): the frames of a log as one table, by the description of its own headers.
+
+A file may hold several logs, one an arming: each is a source. Rates are in deg/s by the header `gyro_scale`, ten times
+finer where `blackbox_high_resolution` is on; accelerations are counts of `acc_1G`. A frame that is damaged is left out,
+and those that are built on it, until the next one that stands for itself.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError
+from selfcal.logs.loaders.table import Hints, Table, of_arrays
+
+BEGIN = b"H Product:Blackbox"
+#: Columns that are read: letter of the axes here by the name in the headers.
+_AXES = {"gyroADC": "g", "accSmooth": "a"}
+#: How a field's value is predicted, by the format's numbers.
+_PREVIOUS, _STRAIGHT, _AVERAGE, _MINTHROTTLE, _MOTOR_0, _INC, _1500, _VBATREF, _MINMOTOR = 1, 2, 3, 4, 5, 6, 8, 9, 11
+#: Fields of a frame, and bytes of a log's headers.
+_MOST_FIELDS, _MOST_HEADERS = 256, 1 << 18
+#: Microseconds between frames beyond which one of them is damaged.
+_JUMP = 10_000_000
+#: Bytes of an event's data, by its number; a log's end is told apart by its text.
+_EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30: "vv", 40: "v"}
+_LOG_END = 255
+
+
+class _Damaged(Exception):
+    """A frame that is none."""
+
+
+@dataclass
+class _Frames:
+    """Fields of one kind of frame: predictors and encodings, a number each."""
+
+    predictors: list[int] = field(default_factory=list)
+    encodings: list[int] = field(default_factory=list)
+
+
+class _Bytes:
+    """Numbers from a place in a log on. All raise IndexError at its end."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.at = data, 0
+
+    def byte(self) -> int:
+        value = self.data[self.at]
+        self.at += 1
+        return value
+
+    def unsigned(self) -> int:
+        """Seven bits a byte, the lowest first."""
+        value = shift = 0
+        while shift < 35:
+            one = self.byte()
+            value |= (one & 0x7F) << shift
+            if one < 0x80:
+                return value & 0xFFFFFFFF
+            shift += 7
+        raise _Damaged
+
+    def signed(self) -> int:
+        """The sign in the lowest bit."""
+        value = self.unsigned()
+        return (value >> 1) ^ -(value & 1)
+
+    def little(self, size: int) -> int:
+        """A signed whole number of `size` bytes."""
+        value = int.from_bytes(self.data[self.at : self.at + size], "little", signed=True)
+        self.at += size
+        if self.at > len(self.data):
+            raise IndexError
+        return value
+
+
+def _sign(value: int, bits: int) -> int:
+    return value - (1 << bits) if value >> (bits - 1) else value
+
+
+def _three(data: _Bytes, wide: Sequence[Sequence[int]]) -> list[int]:
+    """Three numbers of one tag: of the bits `wide` by the tag's number 0 to 2, or of 1 to 4 bytes each."""
+    tag = data.byte()
+    kind = tag >> 6
+    if kind == 3:
+        return [data.little(1 + (tag >> 2 * k & 3)) for k in range(3)]
+    bits = wide[kind]
+    total = -(-(2 + sum(bits)) // 8) * 8
+    value, left = tag & 0x3F, 6
+    while left < total - 2:
+        value, left = value << 8 | data.byte(), left + 8
+    found = []
+    # The bits that no number takes stand before the first, and between bytes where numbers take six each.
+    if bits == (6, 6, 6):
+        return [_sign(value >> shift & 0x3F, 6) for shift in (16, 8, 0)]
+    at = sum(bits)
+    for one in bits:
+        at -= one
+        found.append(_sign(value >> at & (1 << one) - 1, one))
+    return found
+
+
+def _four(data: _Bytes) -> list[int]:
+    """Four numbers of one tag, of 0, 4, 8 or 16 bits each, packed by half bytes."""
+    tag = data.byte()
+    held = -1
+    found = []
+
+    def half() -> int:
+        nonlocal held
+        if held >= 0:
+            value, held = held, -1
+            return value
+        one = data.byte()
+        held = one & 0xF
+        return one >> 4
+
+    for k in range(4):
+        count = (0, 1, 2, 4)[tag >> 2 * k & 3]
+        value = 0
+        for _ in range(count):
+            value = value << 4 | half()
+        found.append(_sign(value, 4 * count) if count else 0)
+    return found
+
+
+def _values(data: _Bytes, encodings: Sequence[int]) -> list[int]:
+    """The numbers of a frame before their prediction. Raises _Damaged and IndexError."""
+    found: list[int] = []
+    while len(found) < len(encodings):
+        place = len(found)
+        match encodings[place]:
+            case 0:
+                found.append(data.signed())
+            case 1:
+                found.append(data.unsigned())
+            case 3:  # 14 bits, negative
+                found.append(-_sign(data.unsigned() & 0x3FFF, 14))
+            case 6:  # up to eight numbers, a tag says which are not 0
+                count = 1
+                while count < 8 and place + count < len(encodings) and encodings[place + count] == 6:
+                    count += 1
+                tag = data.byte() if count > 1 else 1
+                found += [data.signed() if tag >> k & 1 else 0 for k in range(count)]
+            case 7:
+                found += _three(data, ((2, 2, 2), (4, 4, 4), (6, 6, 6)))
+            case 8:
+                found += _four(data)
+            case 9:
+                found.append(0)
+            case 10:
+                found += _three(data, ((2, 2, 2), (5, 5, 4), (8, 7, 7)))
+            case _:
+                raise _Damaged
+    if len(found) != len(encodings):
+        raise _Damaged
+    return found
+
+
+class _Log:
+    """One log of a file."""
+
+    def __init__(self, data: bytes) -> None:
+        """Read the headers. Raises ValueError where they describe no frames."""
+        self.data = _Bytes(data)
+        self.headers: dict[str, str] = {}
+        while data[self.data.at : self.data.at + 2] == b"H " and self.data.at < _MOST_HEADERS:
+            end = data.find(b"\n", self.data.at)
+            if end < 0:
+                break
+            name, _colon, value = data[self.data.at + 2 : end].decode("latin-1").partition(":")
+            self.headers[name] = value
+            self.data.at = end + 1
+        self.names = self.headers.get("Field I name", "").split(",")
+        if not 2 < len(self.names) <= _MOST_FIELDS or "time" not in self.names:
+            raise ValueError("its headers describe no frames")
+        self.kinds = {}
+        for kind in "IPSGH":
+            if f"Field {kind} encoding" in self.headers:
+                parts = [self._numbers(f"Field {kind} {part}") for part in ("predictor", "encoding")]
+                if len(parts[0]) == len(parts[1]) <= _MOST_FIELDS:
+                    self.kinds[ord(kind)] = _Frames(*parts)
+        self.time = self.names.index("time")
+        self.motor = self.names.index("motor[0]") if "motor[0]" in self.names else 0
+        self.constants = {
+            _MINTHROTTLE: self._number("minthrottle", 1150),
+            _1500: 1500,
+            _VBATREF: self._number("vbatref", 4095),
+            _MINMOTOR: self._number("motorOutput", self._number("minthrottle", 1150)),
+        }
+        self.step = max(1, self._number("P interval", 1, "/"))
+
+    def _numbers(self, name: str) -> list[int]:
+        return [int(part) for part in self.headers.get(name, "").split(",") if part.lstrip("-").isdigit()]
+
+    def _number(self, name: str, otherwise: int, separator: str = ",") -> int:
+        first = self.headers.get(name, "").split(separator)[-1 if separator == "/" else 0]
+        return int(first) if first.lstrip("-").isdigit() else otherwise
+
+    def frames(self) -> Iterator[list[int]]:
+        """The values of the main frames, in order."""
+        data, history = self.data, list[list[int]]()
+        while data.at < len(data.data):
+            begin = data.at
+            try:
+                kind = data.byte()
+                if kind == ord("E"):
+                    if self._event():
+                        return
+                    continue
+                if kind not in self.kinds:
+                    raise _Damaged
+                frames = self.kinds[kind]
+                values = _values(data, frames.encodings)
+                if data.at < len(data.data) and data.data[data.at] not in b"IPSGHE":
+                    raise _Damaged
+                if kind not in (ord("I"), ord("P")):
+                    continue
+                if kind == ord("P") and not history:
+                    continue
+                values = self._predicted(values, frames.predictors, history if kind == ord("P") else [])
+                if history and not 0 < values[self.time] - history[-1][self.time] < _JUMP:
+                    raise _Damaged
+            except _Damaged:
+                history, data.at = [], begin + 1
+                continue
+            except IndexError:
+                return
+            history = [values, values] if kind == ord("I") else [history[-1], values]
+            yield values
+
+    def _predicted(self, values: list[int], predictors: Sequence[int], history: Sequence[list[int]]) -> list[int]:
+        """The values with what they are predicted by. Raises _Damaged."""
+        for place, predictor in enumerate(predictors):
+            if predictor == 0:
+                continue
+            if predictor in self.constants:
+                values[place] += self.constants[predictor]
+            elif predictor == _MOTOR_0:
+                values[place] += values[self.motor]
+            elif predictor == _INC:
+                values[place] += history[-1][place] + self.step if history else 0
+            elif not history:
+                raise _Damaged
+            elif predictor == _PREVIOUS:
+                values[place] += history[-1][place]
+            elif predictor == _STRAIGHT:
+                values[place] += 2 * history[-1][place] - history[-2][place]
+            elif predictor == _AVERAGE:
+                values[place] += int((history[-1][place] + history[-2][place]) / 2)
+            else:
+                raise _Damaged
+        return values
+
+    def _event(self) -> bool:
+        """Pass by an event; whether it is the log's end."""
+        number = self.data.byte()
+        if number == _LOG_END:
+            if self.data.data[self.data.at : self.data.at + 11] == b"End of log\0":
+                return True
+            raise _Damaged
+        if number not in _EVENTS:
+            raise _Damaged
+        for part in _EVENTS[number]:
+            if part == "v":
+                self.data.unsigned()
+            elif part == "b":
+                if self.data.byte() >= 0x80:
+                    self.data.little(4)
+                else:
+                    self.data.signed()
+        return False
+
+
+def read(path: Path, _: Hints) -> list[Table]:
+    """The tables of a file's logs. Raises UserError."""
+    data = path.read_bytes()
+    begins = [data.find(BEGIN)]
+    while begins[-1] >= 0:
+        begins.append(data.find(BEGIN, begins[-1] + 1))
+    tables = []
+    for number, (begin, end) in enumerate(zip(begins[:-1], [*begins[1:-1], len(data)], strict=True), 1):
+        try:
+            table = _table(_Log(data[begin:end]), f"log {number}")
+        except ValueError as error:
+            raise UserError(f"{path}: log {number}: {error}") from error
+        tables += [table] if table is not None else []
+    if not tables:
+        raise UserError(f"{path}: no log in it has frames with gyroADC")
+    return [replace(tables[0], source="")] if len(tables) == 1 else tables
+
+
+def _table(log: _Log, source: str) -> Table | None:
+    """The table of a log; None without frames or gyro."""
+    headings = {"time": "t[us]"}
+    fine = 10.0 if log.headers.get("blackbox_high_resolution", "0").strip() == "1" else 1.0
+    sizes = {"gyroADC": _gyro_size(log.headers.get("gyro_scale", "")) / fine}
+    one_g = log.headers.get("acc_1G", "")
+    if one_g.isdigit() and int(one_g) > 0:
+        sizes["accSmooth"] = 1.0 / int(one_g)
+    for name, size in sizes.items():
+        for place, axis in enumerate("xyz"):
+            if size > 0.0 and f"{name}[{place}]" in log.names:
+                headings[f"{name}[{place}]"] = f"{_AXES[name]}{axis}[{'deg/s' if name == 'gyroADC' else 'g'}]"
+    places = [log.names.index(name) for name in headings]
+    values = array("q")
+    for frame in log.frames():
+        values.extend(frame[place] for place in places)
+    if "gyroADC[0]" not in headings or not values:
+        return None
+    rows = np.array(values).reshape(-1, len(places))
+    columns: dict[str, NDArray[Any]] = {"t[us]": rows[:, 0]}
+    for place, (name, heading) in enumerate(headings.items()):
+        if place:
+            columns[heading] = rows[:, place] * sizes[name[:-3]]
+    return of_arrays(source, columns)
+
+
+def _gyro_size(text: str) -> float:
+    """Degrees a second of one count, of the bits of a float32: in older logs radians a microsecond."""
+    try:
+        (size,) = struct.unpack(">f", bytes.fromhex(text.strip().removeprefix("0x").rjust(8, "0")))
+    except (ValueError, struct.error):
+        return 0.0
+    return float(np.degrees(size) * 1e6) if 0.0 < size < 1e-4 else float(size) if np.isfinite(size) else 0.0

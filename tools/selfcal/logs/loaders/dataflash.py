@@ -1,0 +1,137 @@
+"""ArduPilot's logs by pymavlink: DataFlash .bin, a table an IMU, and .tlog, a table a message, vehicle and instance.
+
+Stamps are those of the sensor or the vehicle, never the times at which a ground station got a message.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from selfcal.base import units
+from selfcal.base.errors import UserError
+from selfcal.logs.loaders.table import Hints, Table, of_arrays
+
+#: Messages of a DataFlash log, and the source that each belongs to; the instance is in a field, or in the name.
+_SOURCES = {"IMU": "IMU", "GYR": "raw", "ACC": "raw"}
+_DATAFLASH = {f"{name}{number}": source for name, source in _SOURCES.items() for number in ("", "1", "2", "3")}
+#: Names here and units by the name of a field.
+_FIELDS = {
+    **{f"Gyr{axis}": (f"g{axis.lower()}", "rad/s") for axis in "XYZ"},
+    **{f"Acc{axis}": (f"a{axis.lower()}", "m/s^2") for axis in "XYZ"},
+    "T": ("temp", "degC"),
+}
+#: MAVLink messages: stamp and its unit, names of the axes, and the units of gyro, accelerometer and temperature. A
+#: RAW_IMU is in counts, but for ArduPilot's.
+_AXES = {f"{letter}{axis}": f"{axis}{kind}" for letter, kind in (("g", "gyro"), ("a", "acc")) for axis in "xyz"}
+_SCALED = ("time_boot_ms", "ms", "mrad/s", "mg")
+_TLOG = {
+    "RAW_IMU": ("time_usec", "us", "LSB", "LSB"),
+    "SCALED_IMU": _SCALED,
+    "SCALED_IMU2": _SCALED,
+    "SCALED_IMU3": _SCALED,
+    "HIGHRES_IMU": ("time_usec", "us", "rad/s", "m/s^2"),
+}
+_ARDUPILOT = 3
+
+
+class _Rows:
+    """Values of one source, a column each."""
+
+    def __init__(self, headings: list[str]) -> None:
+        self.headings, self.values = headings, array("d")
+
+    def table(self, source: str) -> Table:
+        """The table. A temperature of 0 throughout is none."""
+        values = np.array(self.values).reshape(-1, len(self.headings))
+        columns = {name: values[:, place] for place, name in enumerate(self.headings)}
+        return of_arrays(source, {name: one for name, one in columns.items() if name[:4] != "temp" or one.any()})
+
+
+def read(path: Path, _: Hints) -> list[Table]:
+    """The tables of a .bin or a .tlog. Raises UserError and what pymavlink raises."""
+    found: dict[str, dict[str, _Rows]] = {}
+    with path.open("rb") as stream:
+        binary = stream.read(2) == b"\xa3\x95"
+    for source, kind, headings, values in _bin(path) if binary else _tlog(path):
+        rows = found.setdefault(source, {})
+        if kind not in rows:
+            rows[kind] = _Rows(headings)
+        if rows[kind].headings == headings:
+            rows[kind].values.extend(values)
+    if not found:
+        raise UserError(f"{path}: no message {', '.join(_SOURCES if binary else _TLOG)}")
+    order = list(_DATAFLASH if binary else _TLOG)
+    return [rows[kind].table(source) for source, rows in found.items() for kind in sorted(rows, key=order.index)]
+
+
+def _bin(path: Path) -> Iterator[tuple[str, str, list[str], list[float]]]:
+    """Source, kind, headings and values of each message of an IMU."""
+    from pymavlink.DFReader import DFReader_binary
+
+    class Log(DFReader_binary):  # type: ignore[misc]
+        """A log whose reading ends: the library takes a message of no bytes for ever."""
+
+        def recv_msg(self) -> Any:
+            begin = self.offset
+            message = super().recv_msg()
+            if message is not None and self.offset <= begin:
+                raise UserError(f"{path}: damaged: a message of no bytes at byte {begin}")
+            return message
+
+    log = Log(str(path), zero_time_base=True)
+    known: dict[tuple[Any, Any], tuple[list[int], list[float], list[str], int | None]] = {}
+    while (message := log.recv_match(type=list(_DATAFLASH), strict=True)) is not None:
+        layout = message.fmt
+        key = (layout.name, tuple(layout.units or ()))
+        if key not in known:
+            known[key] = _layout(layout)
+        places, sizes, headings, instance = known[key]
+        elements = message._elements
+        number = int(elements[instance]) if instance is not None else int(layout.name[3:] or 1) - 1
+        values = [float(elements[place]) * size for place, size in zip(places, sizes, strict=True)]
+        yield f"{_DATAFLASH[layout.name]}.{number}", layout.name, headings, values
+
+
+def _layout(layout: Any) -> tuple[list[int], list[float], list[str], int | None]:
+    """Places, sizes of a count and headings of a message's fields, and the place of the instance."""
+    names = list(layout.columns)
+    time = next(name for name in ("SampleUS", "TimeUS", "TimeMS") if name in names)
+    fields = {time: ("t", "ms" if time == "TimeMS" else "us"), **{k: v for k, v in _FIELDS.items() if k in names}}
+    headings = []
+    for name, (here, unit) in fields.items():
+        stated = units.plain(layout.get_unit(name) or "") if here != "t" else ""
+        other = (
+            stated and units.known(stated) and not (units.same_kind(stated, unit) and units.factor(stated, unit) == 1.0)
+        )
+        headings.append(f"{here}[{stated if other else unit}]")
+    places = [names.index(name) for name in fields]
+    sizes = [float(layout.msg_mults[place] or 1.0) for place in places]
+    return places, sizes, headings, names.index("I") if "I" in names else None
+
+
+def _tlog(path: Path) -> Iterator[tuple[str, str, list[str], list[float]]]:
+    """The same of a ground station's log."""
+    from pymavlink import mavutil
+
+    log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega", notimestamps=False)
+    ardupilot: set[int] = set()
+    while (message := log.recv_match(type=["HEARTBEAT", *_TLOG])) is not None:
+        kind, vehicle = message.get_type(), message.get_srcSystem()
+        if kind == "HEARTBEAT":
+            if message.autopilot == _ARDUPILOT:
+                ardupilot.add(vehicle)
+            continue
+        stamp, unit, gyro, accel = _TLOG[kind]
+        if kind == "RAW_IMU" and vehicle in ardupilot:
+            gyro, accel = "mrad/s", "mg"
+        headings = [f"t[{unit}]", *(f"{name}[{gyro if name[0] == 'g' else accel}]" for name in _AXES), "temp[degC]"]
+        values: Mapping[str, Any] = message.to_dict()
+        size = 1.0 if kind == "HIGHRES_IMU" else 0.01
+        row = [values[stamp], *(values[name] for name in _AXES.values()), size * values.get("temperature", 0.0)]
+        instance = f".{values['id']}" if values.get("id") else ""
+        yield f"{kind}{instance}@{vehicle}", kind, headings, row

@@ -1,0 +1,170 @@
+"""MCAP by the libraries mcap and mcap-protobuf-support: a table a topic.
+
+Messages of ROS are read as in a bag (`ros.py`). Those in JSON or protobuf become columns by the paths of their fields,
+`angular_velocity/x`; their units are those of the channel's metadata or of the schema, else ROS's by convention.
+"""
+
+from __future__ import annotations
+
+import json
+from array import array
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from selfcal.base.limits import MOST_COLUMNS
+from selfcal.logs.loaders.headings import TIMES
+from selfcal.logs.loaders.ros import LAYOUTS, Topic, no_topic
+from selfcal.logs.loaders.table import Hints, Table, of_arrays
+
+#: Fields whose message is a stamp: seconds and nanoseconds by these names.
+_STAMPS = ("header/stamp", "timestamp", "stamp", "time")
+_SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs", "nanos")
+#: Depth of a message's fields.
+_DEEPEST = 6
+#: What of a message's fields is a sensor's by convention.
+_BY_CONVENTION = ("angular_velocity/", "linear_acceleration/")
+
+
+class _Fields:
+    """Messages of a topic as columns. All have the fields of the first."""
+
+    def __init__(self, units: Mapping[str, str]) -> None:
+        self.units, self.names, self.values = units, list[str](), array("d")
+        self.stamps, self.published, self.stamped = array("q"), array("q"), True
+
+    def take(self, message: Mapping[str, Any], published: int) -> None:
+        """One message, and when it was published, ns."""
+        fields = dict(_flat(message))
+        stamp = _stamp(fields)
+        if not self.names:
+            inner = tuple(f"{name}/" for name in _STAMPS)
+            self.names = [name for name in fields if not name.startswith(inner)][:MOST_COLUMNS]
+        self.values.extend(fields.get(name, np.nan) for name in self.names)
+        self.stamped = self.stamped and stamp is not None
+        self.stamps.append(stamp or 0)
+        self.published.append(published)
+
+    def table(self, topic: str) -> Table:
+        """The table of a topic of this name."""
+        values = np.array(self.values).reshape(-1, len(self.names))
+        notes = []
+        units = {name: self.units.get(name, self.units.get(name.rpartition("/")[2])) for name in self.names}
+        counted = not self.stamped and any(
+            units[name] is not None and name.lower() in ("t", *TIMES) for name in self.names
+        )
+        if not (self.stamped or counted):
+            notes.append(f"{topic}: its messages have no stamps: the times at which they were published are taken")
+        if any(name.startswith(_BY_CONVENTION) and name not in self.units for name in self.names):
+            notes.append(f"{topic}: units by the convention of ROS, rad/s and m/s^2")
+        columns: dict[str, Any] = {}
+        if not counted:
+            columns["t[ns]"] = np.array(self.stamps if self.stamped else self.published)
+        for place, (name, unit) in enumerate(units.items()):
+            if counted or name.lower() not in ("t", *TIMES):
+                columns[name if unit is None else f"{name}[{unit}]"] = values[:, place]
+        return of_arrays(topic, columns, notes=tuple(notes))
+
+
+def _flat(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, float | int]]:
+    """Numbers of a message by their paths."""
+    if isinstance(value, bool) or depth > _DEEPEST:
+        return
+    if isinstance(value, int | float):
+        yield path, value
+    elif isinstance(value, Mapping):
+        for name, inner in value.items():
+            yield from _flat(inner, f"{path}/{name}" if path else str(name), depth + 1)
+
+
+def _stamp(fields: Mapping[str, float | int]) -> int | None:
+    """The stamp of a message, ns."""
+    for name in _STAMPS:
+        for second in _SECONDS:
+            if f"{name}/{second}" in fields:
+                rest = next((fields[f"{name}/{one}"] for one in _NANOSECONDS if f"{name}/{one}" in fields), 0)
+                return int(fields[f"{name}/{second}"]) * 1_000_000_000 + int(rest)
+    return None
+
+
+def read(path: Path, _: Hints) -> list[Table]:
+    """The tables of an MCAP file. Raises UserError and what mcap raises."""
+    from mcap.reader import make_reader
+
+    found: dict[str, Topic | _Fields] = {}
+    kinds: set[str] = set()
+    decoders: dict[int, Callable[[bytes], Mapping[str, Any]]] = {}
+    with path.open("rb") as stream:
+        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+            kind = schema.name if schema is not None else channel.message_encoding
+            kinds.add(kind)
+            topic = channel.topic
+            if channel.message_encoding in ("cdr", "ros1"):
+                kind = kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
+                if kind in LAYOUTS:
+                    one = found.setdefault(topic, Topic(kind))
+                    if isinstance(one, Topic) and one.kind == kind:
+                        one.take(message.data, cdr=channel.message_encoding == "cdr")
+                continue
+            if channel.message_encoding not in ("json", "protobuf"):
+                continue
+            if channel.id not in decoders:
+                decoders[channel.id] = _decoder(schema, channel)
+            if topic not in found:
+                found[topic] = _Fields({**_units_of(schema), **channel.metadata})
+            fields = found[topic]
+            if isinstance(fields, _Fields):
+                fields.take(decoders[channel.id](message.data), message.publish_time)
+    if not found:
+        raise no_topic(path, kinds)
+    return [one.table(topic) for topic, one in found.items()]
+
+
+def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
+    """What makes a mapping of a message in JSON or protobuf."""
+    if channel.message_encoding == "json":
+        return _json
+    from mcap_protobuf.decoder import DecoderFactory
+
+    decode = DecoderFactory().decoder_for("protobuf", schema)
+    assert decode is not None
+    return lambda data: _messages(decode(data))
+
+
+def _json(data: bytes) -> Mapping[str, Any]:
+    value = json.loads(data)
+    return value if isinstance(value, dict) else {}
+
+
+def _messages(message: Any) -> dict[str, Any]:
+    """The fields of a protobuf message, inner messages as mappings; repeated ones are left out."""
+    found: dict[str, Any] = {}
+    for field in message.DESCRIPTOR.fields:
+        value = getattr(message, field.name)
+        if hasattr(value, "DESCRIPTOR"):
+            found[field.name] = _messages(value)
+        elif isinstance(value, int | float):
+            found[field.name] = value
+    return found
+
+
+def _units_of(schema: Any) -> dict[str, str]:
+    """Units that a JSON schema states, by the paths of the fields."""
+    if schema is None or schema.encoding != "jsonschema" or not schema.data:
+        return {}
+    found: dict[str, str] = {}
+
+    def look(node: Any, path: str, depth: int) -> None:
+        if not isinstance(node, dict) or depth > _DEEPEST:
+            return
+        unit = node.get("unit", node.get("units"))
+        if isinstance(unit, str) and path:
+            found[path] = unit
+        properties = node.get("properties")
+        for name, inner in properties.items() if isinstance(properties, dict) else ():
+            look(inner, f"{path}/{name}" if path else name, depth + 1)
+
+    look(json.loads(schema.data), "", 0)
+    return found

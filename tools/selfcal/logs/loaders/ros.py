@@ -1,0 +1,113 @@
+"""ROS 1 bags and ROS 2 bags by rosbags: `sensor_msgs/Imu` and `sensor_msgs/Temperature`, a table a topic.
+
+The stamps are those of the messages' headers, never the times at which the bag got them. Messages of these two types
+have one layout in every ROS, so that the definitions in a bag, which rosbags would make code of, are not used.
+"""
+
+from __future__ import annotations
+
+import struct
+from array import array
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError
+from selfcal.logs.loaders.table import Hints, Table, of_arrays
+
+#: Doubles after the header, by type. Of an Imu's: an orientation, angular velocity and acceleration, each with nine
+#: covariances after it.
+LAYOUTS = {"sensor_msgs/msg/Imu": 37, "sensor_msgs/msg/Temperature": 2}
+#: Place of the first axis, and its unit, by the first letter of the axes here.
+_AXES = {"g": (13, "rad/s"), "a": (25, "m/s^2")}
+_ROS_1 = b"#ROSBAG V2.0"
+#: Places by which messages may lie out of the order of their stamps, as threads write them.
+_DISORDER = 64
+#: Share of accelerations of exactly 0 from which on a topic has the gyro and the accelerometer in turn.
+_IN_TURN = 0.1
+
+
+class Topic:
+    """The messages of a topic: stamps, ns, and doubles."""
+
+    def __init__(self, kind: str) -> None:
+        """`kind`: one of LAYOUTS."""
+        self.kind, self.stamps, self.values = kind, array("q"), array("d")
+
+    def take(self, data: bytes, *, cdr: bool) -> None:
+        """One message, in CDR or in ROS 1's form. Raises struct.error and IndexError for one that is cut off."""
+        order = ">" if cdr and not data[1] & 1 else "<"
+        seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
+        at = 16 + length
+        if cdr:
+            at += -(at - 4) % 8
+        self.values.extend(struct.unpack_from(f"{order}{LAYOUTS[self.kind]}d", data, at))
+        self.stamps.append(seconds * 1_000_000_000 + nanoseconds)
+
+    def table(self, name: str) -> Table:
+        """The table of a topic of this name."""
+        values = np.array(self.values).reshape(-1, LAYOUTS[self.kind])
+        stamps = np.array(self.stamps, np.int64)
+        order = np.argsort(stamps, kind="stable")
+        if np.abs(order - np.arange(order.size)).max(initial=0) <= _DISORDER:
+            stamps, values = stamps[order], values[order]
+        notes: tuple[str, ...] = ()
+        columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {}
+        if stamps.any():
+            columns["t[ns]"] = stamps
+        else:
+            notes = (f"{name}: no message has a stamp in its header",)
+        if values.shape[1] == 2:
+            columns["temp[degC]"] = values[:, 0]
+        else:
+            columns |= _axes(values)
+        return of_arrays(name, columns, notes=notes)
+
+
+def _axes(values: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
+    """Columns of the axes that an Imu [n, 37] has. A sensor that it has not reads 0 throughout, or has a covariance of
+    -1 (REP 145)."""
+    found = {}
+    for letter, (at, _) in _AXES.items():
+        triad = values[:, at : at + 3]
+        if len(values) and triad.any() and values[0, at + 3] != -1.0:
+            found[letter] = triad
+    if len(found) == 2:
+        none = (found["a"] == 0.0).all(axis=1, keepdims=True)  # at rest gravity is among the axes: no reading is 0
+        found["a"] = np.where(none, np.nan, found["a"])
+        if none.mean() > _IN_TURN:
+            found["g"] = np.where((found["g"] == 0.0).all(axis=1, keepdims=True), np.nan, found["g"])
+    return {
+        f"{letter}{axis}[{_AXES[letter][1]}]": triad[:, place]
+        for letter, triad in found.items()
+        for place, axis in enumerate("xyz")
+    }
+
+
+def read(path: Path, _: Hints) -> list[Table]:
+    """The tables of a .bag, a .db3, or a ROS 2 folder. Raises UserError and what rosbags raises."""
+    from rosbags.rosbag1 import Reader as Reader1
+    from rosbags.rosbag2 import Reader as Reader2
+
+    first = False
+    if path.is_file():
+        with path.open("rb") as stream:
+            first = stream.read(len(_ROS_1)) == _ROS_1
+    topics: dict[tuple[str, str], Topic] = {}
+    with (Reader1 if first else Reader2)(path) as bag:
+        kinds = {one.id: one.msgtype for one in bag.connections}
+        wanted = [one for one in bag.connections if one.msgtype in LAYOUTS]
+        for connection, _received, data in bag.messages(wanted) if wanted else ():
+            topic = topics.setdefault((connection.topic, connection.msgtype), Topic(connection.msgtype))
+            topic.take(data, cdr=not first)
+    if not topics:
+        raise no_topic(path, kinds.values())
+    return [topic.table(name) for (name, _kind), topic in topics.items()]
+
+
+def no_topic(path: Path, kinds: object) -> UserError:
+    """What to raise for a bag without a topic that is read."""
+    there = ", ".join(sorted({str(kind) for kind in kinds})[:6]) or "none"  # type: ignore[attr-defined]
+    return UserError(f"{path}: no message of sensor_msgs/Imu or sensor_msgs/Temperature (there are: {there})")

@@ -1,0 +1,121 @@
+"""A table of a file: columns by their headings, of one clock; and the bounds that readers of arrays share."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError, short
+from selfcal.base.limits import (
+    BLOCK_BYTES,
+    MOST_COLUMNS,
+    MOST_GROWTH,
+    MOST_UNPACKED_BYTES,
+    MOST_UNPACKED_SMALL,
+    reading,
+)
+
+#: What the user states beside the file: `dbc`, the path of a CAN database.
+Hints = Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Member:
+    """An array of a file: its shape and type, and what reads it."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype[Any]
+    read: Callable[[], NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Table:
+    """Columns of one clock. `members` by heading: `name[unit]`, or a plain name whose unit `meta` has.
+
+    `source`: the topic, message or group that it is, empty where a file has no parts. `notes`: what a reader of the
+    results must know of it.
+    """
+
+    source: str
+    members: Mapping[str, Member]
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def of_arrays(
+    source: str, arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any] | None = None, notes: tuple[str, ...] = ()
+) -> Table:
+    """The table of arrays [n] that are in memory."""
+    return Table(source, {name: in_memory(array) for name, array in arrays.items()}, meta or {}, notes)
+
+
+def in_memory(array: NDArray[Any]) -> Member:
+    """An array as a member."""
+    return Member(array.shape, array.dtype, lambda: array)
+
+
+def parse_meta(path: Path, text: str) -> Mapping[str, Any]:
+    """A JSON mapping. Raises UserError."""
+    with reading(path, "meta: not a JSON text"):
+        meta = json.loads(text)
+    if not isinstance(meta, dict):
+        raise UserError(f"{path}: meta: not a JSON mapping")
+    return meta
+
+
+def content(path: Path) -> bytes:
+    """All of a file, in blocks: memory is taken for what is there."""
+    blocks, size = [], 0
+    with path.open("rb") as stream:
+        while (block := stream.read(BLOCK_BYTES)) and size <= MOST_UNPACKED_BYTES:
+            blocks.append(block)
+            size += len(block)
+    return bounded(path, b"".join(blocks), MOST_UNPACKED_BYTES)
+
+
+def room(data: bytes) -> int:
+    """Bytes that a whole file may unpack to."""
+    return min(MOST_UNPACKED_BYTES, max(MOST_UNPACKED_SMALL, MOST_GROWTH * len(data)))
+
+
+def inflated(path: Path, inflater: Any, data: bytes, most: int, before: int = 0) -> bytes:
+    """`data` unpacked; with the bytes `before` it makes at most `most`. Raises UserError, EOFError and what `inflater`
+    raises."""
+    unpacked: bytes = inflater.decompress(data, max(most - before, 0) + 1)
+    if before + len(unpacked) <= most and not inflater.eof:
+        raise EOFError("it is cut off")
+    return bounded(path, unpacked, most, before)
+
+
+def bounded(path: Path, data: bytes, most: int, before: int = 0) -> bytes:
+    """`data`, which with the bytes `before` makes at most `most`. Raises UserError."""
+    if before + len(data) > most:
+        raise UserError(f"{path}: it unpacks to more than {most >> 20} MiB: write it as .csv or .npz")
+    return data
+
+
+def vectors(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Member]:
+    """Vectors as they are, a matrix NAME as NAME:1, NAME:2, ..."""
+    members: dict[str, Member] = {}
+    for name, array in arrays.items():
+        if array.ndim != 2 or 1 in array.shape:
+            add(path, members, name, array.ravel() if array.ndim == 2 else array)
+            continue
+        for column in range(min(array.shape[1], MOST_COLUMNS + 1)):
+            add(path, members, f"{name}:{column + 1}", array[:, column])
+    return members
+
+
+def add(path: Path, members: dict[str, Member], name: str, array: NDArray[Any]) -> None:
+    """Put an array among the members. Raises UserError."""
+    if name in members:
+        raise UserError(f"{path}: column '{short(name)}' appears twice")
+    if len(members) >= MOST_COLUMNS:
+        raise UserError(f"{path}: more than {MOST_COLUMNS} columns")
+    members[name] = in_memory(array)

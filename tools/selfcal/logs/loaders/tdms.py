@@ -1,0 +1,53 @@
+"""LabVIEW's TDMS by nptdms: a table a group, of the channels of one length.
+
+Units are those of the channels (`unit_string`). Without a channel of times a waveform's own increment is the clock.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError
+from selfcal.base.limits import MOST_NUMBERS
+from selfcal.logs.loaders.headings import TIMES
+from selfcal.logs.loaders.table import Hints, Table, of_arrays
+
+
+def read(path: Path, _: Hints) -> list[Table]:
+    """The tables of a file. Raises UserError and what nptdms raises."""
+    from nptdms import TdmsFile
+
+    tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
+    clocks: dict[tuple[str, int], NDArray[Any]] = {}
+    numbers = 0
+    with TdmsFile.open(path) as file:
+        for group in file.groups():
+            for channel in group.channels():
+                numbers += len(channel)
+                if numbers > MOST_NUMBERS:
+                    raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers")
+                values = np.asarray(channel[:])
+                unit = str(channel.properties.get("unit_string", ""))
+                name = channel.name
+                if values.dtype.kind == "M":
+                    name, unit, values = "t", "ns", values.astype("M8[ns]").astype(np.int64)
+                elif values.dtype.kind not in "iuf" or values.ndim != 1:
+                    continue
+                key = (group.name, values.size)
+                tables.setdefault(key, {})[f"{name}[{unit}]" if unit and "[" not in name else name] = values
+                step = channel.properties.get("wf_increment")
+                if isinstance(step, float) and step > 0.0:
+                    begin = float(channel.properties.get("wf_start_offset", 0.0))
+                    clocks[key] = begin + step * np.arange(values.size)
+    for key, columns in tables.items():
+        if key in clocks and not any(name.split("[")[0].lower() in ("t", *TIMES) for name in columns):
+            columns["t[s]"] = clocks[key]
+    longest = {group: max(size for of, size in tables if of == group) for group, _ in tables}
+    return [
+        of_arrays(group if size == longest[group] else f"{group}:{size}", columns)
+        for (group, size), columns in tables.items()
+    ]

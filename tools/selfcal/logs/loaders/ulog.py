@@ -1,0 +1,97 @@
+"""PX4's ULog by pyulog: a table a topic and instance.
+
+Stamps are those of the samples (`timestamp_sample`), where a topic has them. `sensor_gyro.0` and `sensor_accel.0` are
+one source, `sensor.0`; a FIFO topic holds several samples a message. The autopilot's number `sys_uuid` is the serial.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError
+from selfcal.logs.loaders.table import Hints, Table, of_arrays
+
+Columns = dict[str, NDArray[Any]]
+#: Topics that are read, and the source that each belongs to.
+_SOURCES = {
+    "sensor_gyro_fifo": "sensor_fifo",
+    "sensor_accel_fifo": "sensor_fifo",
+    "sensor_gyro": "sensor",
+    "sensor_accel": "sensor",
+    "vehicle_imu": "vehicle_imu",
+    "sensor_combined": "sensor_combined",
+}
+
+
+def read(path: Path, _: Hints) -> list[Table]:
+    """The tables of a ULog file. Raises UserError and what pyulog raises."""
+    from pyulog import ULog
+
+    log = ULog(str(path), [*_SOURCES, "sensor_selection"])
+    found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
+    order = list(_SOURCES)
+    for one in sorted((one for one in log.data_list if one.name in _SOURCES), key=lambda one: order.index(one.name)):
+        found.setdefault((_SOURCES[one.name], one.multi_id), {})[one.name] = one.data
+    if not found:
+        raise UserError(f"{path}: no topic {', '.join(_SOURCES)}")
+    lost = [one.duration for one in log.dropouts]
+    notes = (f"the logger dropped out {len(lost)} times, {sum(lost) / 1000:.3g} s together",) if lost else ()
+    serial = log.msg_info_dict.get("sys_uuid", "")
+    meta = {"serial": serial} if isinstance(serial, str) and serial else {}
+    tables = []
+    for (source, instance), topics in found.items():
+        name = source if source == "sensor_combined" else f"{source}.{instance}"
+        tables += [of_arrays(name, _columns(topic, data), meta, notes) for topic, data in topics.items()]
+    return tables
+
+
+def _columns(topic: str, data: Mapping[str, NDArray[Any]]) -> Columns:
+    """Columns of a topic."""
+    stamps = data["timestamp_sample"] if np.any(data.get("timestamp_sample", 0)) else data["timestamp"]
+    if topic.endswith("_fifo"):
+        return _fifo(topic, data, stamps)
+    columns: Columns = {"t[us]": stamps}
+    match topic:
+        case "sensor_gyro":
+            columns |= _triad("g", [data[axis] for axis in "xyz"])
+        case "sensor_accel":
+            columns |= _triad("a", [data[axis] for axis in "xyz"])
+        case "sensor_combined":
+            columns |= _triad("g", [data[f"gyro_rad[{place}]"] for place in range(3)])
+            columns |= _triad("a", [data[f"accelerometer_m_s2[{place}]"] for place in range(3)])
+        case _:
+            columns |= _triad("g", [_rate(data, "delta_angle", place) for place in range(3)])
+            columns |= _triad("a", [_rate(data, "delta_velocity", place) for place in range(3)])
+    if "temperature" in data and np.isfinite(data["temperature"]).any():
+        columns["temp[degC]"] = data["temperature"]
+    return columns
+
+
+def _triad(letter: str, values: Sequence[NDArray[Any]]) -> Columns:
+    unit = {"g": "rad/s", "a": "m/s^2"}[letter]
+    return {f"{letter}{axis}[{unit}]": one for axis, one in zip("xyz", values, strict=True)}
+
+
+def _rate(data: Mapping[str, NDArray[Any]], name: str, place: int) -> NDArray[np.float64]:
+    """An increment over the interval that it was summed over, us; NaN where that is none."""
+    interval = np.asarray(data[f"{name}_dt"], np.float64) * 1e-6
+    increment = np.asarray(data[f"{name}[{place}]"], np.float64)
+    return np.asarray(np.where(interval > 0.0, increment / np.where(interval > 0.0, interval, 1.0), np.nan))
+
+
+def _fifo(topic: str, data: Mapping[str, NDArray[Any]], stamps: NDArray[Any]) -> Columns:
+    """The samples of a FIFO's messages: each message has `samples` of them, the last at its stamp, `dt` us apart."""
+    depth = 1 + max(int(key[2:-1]) for key in data if key.startswith("x["))
+    place = np.arange(depth)
+    count = np.asarray(data["samples"], np.int64)[:, None]
+    used = place < count
+    time = stamps[:, None].astype(np.float64) - (count - 1 - place) * np.asarray(data["dt"], np.float64)[:, None]
+    columns: Columns = {"t[us]": time[used]}
+    scale = np.asarray(data["scale"], np.float64)[:, None]
+    counts = [np.stack([data[f"{axis}[{k}]"] for k in range(depth)], axis=1) for axis in "xyz"]
+    return columns | _triad("g" if "gyro" in topic else "a", [(one * scale)[used] for one in counts])

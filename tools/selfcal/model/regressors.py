@@ -1,0 +1,238 @@
+"""Regressors: their values along a recording, as the firmware's application gives them to `selfcal_push_with()`, and
+what follows from the evidence of every subset of them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.bank.result import HALF_90, AxisResult, of_mixture
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import Recording, as_float, bridged
+from selfcal.model.file import Model, Regressor
+from selfcal.model.forms import KIND, Source, made, played, source_of, variance_of
+
+#: End of a pulse that is over before the first row, s.
+OVER_S = 1e-6
+#: A law of this probability among those of a subset may be the true one: the widest of these states the coefficient. A
+#: record that does not tell a walk from a Gauss-Markov drift leaves a ramp twice to four times as open beside the walk:
+#: an average over the laws would hold 77 to 85 % of truths beside a walk (tests/noise_coverage.py).
+LIKELY = 0.05
+#: A subset of the regressors.
+Choice = tuple[Regressor, ...]
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """Posterior of one column's coefficient if it is in use, over all subsets with it; of each subset under the law
+    that leaves it most open (LIKELY)."""
+
+    column: str
+    unit: str
+    mean: float
+    sd: float
+    q05: float
+    median: float
+    q95: float
+
+
+@dataclass(frozen=True)
+class Inclusion:
+    """Probability that a regressor is in use, and its coefficients."""
+
+    probability: float
+    coefficients: tuple[Coefficient, ...]
+
+
+@dataclass(frozen=True)
+class Scored:
+    """All subsets of the regressors weighed together.
+
+    `result`: probabilities, evidence and bias over all subsets; parameters of each law are those of its most probable
+    subset. `probability` [subsets] of each choice; `best` is the most probable one.
+    """
+
+    result: AxisResult
+    inclusion: Mapping[str, Inclusion]
+    choices: tuple[Choice, ...]
+    probability: tuple[float, ...]
+    best: int
+
+
+def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
+    """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
+
+    The library forms them (`selfcal_form()`), as it does on a module. A play, which it lacks, is made of its means.
+    Time counts from the first row, s; a step and a pulse have the clock of the recording that the rows were cut from, a
+    turn-on counts from power-on. A column with a `window_s` is the mean over that time up to each row. A step is 1 from
+    its time on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain over the last
+    `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a column that is
+    absent or of another kind.
+    """
+    if not regressors:
+        return np.empty((recording.samples, 0))
+    check_channels(regressors, recording)
+    channels = channels_of(regressors)
+    regressors = from_time(regressors, recording.start_s)
+    missing = np.ascontiguousarray(recording.missing_before, np.uint64)
+    values = [
+        _varying(recording.in_unit(name, unit), missing) if by == "variance" else recording.in_unit(name, unit)
+        for name, unit, by in channels
+    ]
+    rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
+    sources = [source for one in regressors for source in sources_of(one, channels)]
+    columns = made(sources, 1.0 / recording.rate_hz, rows, missing, recording.powered)
+    place = 0
+    for one in regressors:
+        if one.form == "play":
+            columns[:, place] = as_float(played(columns[:, place], one.width))
+        place += len(one.columns)
+    return columns
+
+
+def _varying(values: NDArray[np.float64], missing: NDArray[np.uint64]) -> NDArray[np.float64]:
+    """The variance of a channel at each sample; where there is none yet, the one before or the first."""
+    return bridged(variance_of(values, missing))
+
+
+def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
+    """The regressors for a clock that begins at `start_s` of the one that their times are of."""
+
+    def moved(one: Regressor) -> Regressor:
+        if one.kind == "step":
+            return replace(one, time_s=max(0.0, one.time_s - start_s))
+        if one.kind == "pulse":
+            return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(OVER_S, one.end_s - start_s))
+        return one
+
+    return tuple(moved(one) for one in regressors)
+
+
+def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
+    """Raise UserError for a channel of the regressors that the recording has not."""
+    for name, *_ in channels_of(regressors):
+        if name not in recording.columns:
+            needs = next(one.name for one in regressors if one.column == name)
+            raise UserError(
+                f"{recording.path}: there is no column '{name}', which the model's regressor '{needs}' needs "
+                f"(there are {', '.join(recording.columns)})"
+            )
+
+
+def channels_of(regressors: Sequence[Regressor]) -> list[tuple[str, str, str]]:
+    """Name, unit and input of every recorded channel that the regressors take, each once."""
+    return list(dict.fromkeys(_channel(one) for kind in ("column", "rate") for one in regressors if one.kind == kind))
+
+
+def _channel(one: Regressor) -> tuple[str, str, str]:
+    return one.column, one.channel_unit, one.input
+
+
+def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
+    """Of each of its columns."""
+    if one.kind == "time":
+        return [(KIND["TIME"], 0, 0.0, 0.0)]
+    if one.kind == "step":
+        return [(KIND["STEP"], 0, one.time_s, 0.0)]
+    if one.kind == "turn_on":
+        return [(KIND["TURN_ON"], 0, one.tau_s, 0.0)]
+    if one.kind == "pulse":
+        return [(KIND["PULSE"], 0, one.start_s, one.end_s)]
+    if one.kind == "periodic":
+        return [(KIND[name], 0, one.frequency_hz, 0.0) for name in ("SINE", "COSINE")]
+    channel = channels.index(_channel(one))
+    if one.kind == "rate":
+        return [(KIND["RATE"], channel, one.window_s, 0.0)]
+    return [source_of(one.form, channel, one.number, one.reference, one.mean_s)]
+
+
+def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+    """float64[n]: mean of the last `window` values at each, of fewer at the beginning, as a module forms it."""
+    if window <= 1:
+        return values
+    return made([(KIND["CHANNEL"], 0, float(window), 0.0)], 1.0, values[:, None])[:, 0]
+
+
+def offered(model: Model, axis: str) -> Choice:
+    """The regressors that an axis has: those with a prior for its group. An axis is no regressor of itself."""
+    return tuple(one for one in model.regressors if model.group_of(axis).name in one.sd and one.column != axis)
+
+
+def choices_of(regressors: Choice) -> list[Choice]:
+    """Every subset, the empty one first."""
+    return [choice for count in range(len(regressors) + 1) for choice in itertools.combinations(regressors, count)]
+
+
+def mask_of(regressors: Choice, choice: Choice) -> int:
+    """A bit for every column in use, in the order of `regressors`."""
+    names = [column for one in regressors for column in one.columns]
+    return sum(1 << names.index(column) for one in choice for column in one.columns)
+
+
+def coefficient_unit(unit: str, regressor: str) -> str:
+    """Unit of a coefficient: `unit` of the axis per unit of the `regressor`; deg/s per degC/s is deg/s/degC*s."""
+    swap = str.maketrans("*/", "/*")
+    if unit == regressor:  # another axis of the same kind
+        return "1"
+    return unit if regressor == "1" else f"{unit}/{regressor.translate(swap)}"
+
+
+def combine(
+    choices: Sequence[Choice], results: Sequence[AxisResult], hypotheses: Mapping[str, float], unit: str
+) -> Scored:
+    """Weigh the subsets by their evidence; `unit` is that of the axis. At least one must have evidence."""
+    from scipy.special import logsumexp
+
+    ln_before = np.array([ln_prior(choices[-1], choice) for choice in choices])
+    ln_law = np.log([hypotheses[law] for law in hypotheses])
+    evidence = np.array([[result.log_evidence[law] for law in hypotheses] for result in results])
+    joint = ln_before[:, None] + ln_law[None, :] + evidence
+    weight = np.exp(joint - logsumexp(joint))  # [subsets, laws]
+    of_law, of_choice = weight.sum(axis=0), weight.sum(axis=1)
+    mean = np.array([result.bias_mean if math.isfinite(result.bias_mean) else 0.0 for result in results])
+    sd = np.array([result.bias_sd if math.isfinite(result.bias_sd) else 0.0 for result in results])
+    bias = float(of_choice @ mean)
+    combined = AxisResult(
+        results[0].n,
+        {law: float(logsumexp(ln_before + evidence[:, k])) for k, law in enumerate(hypotheses)},
+        {law: float(of_law[k]) for k, law in enumerate(hypotheses)},
+        {law: results[int(np.argmax(joint[:, k]))].parameters[law] for k, law in enumerate(hypotheses)},
+        bias,
+        math.sqrt(float(of_choice @ (sd**2 + (mean - bias) ** 2))),
+    )
+    inclusion = {}
+    for one in choices[-1]:
+        having = [i for i, choice in enumerate(choices) if one in choice]
+        coefficients = []
+        for place, column in enumerate(one.columns):
+            parts = []
+            for i in having:
+                at = place + sum(len(other.columns) for other in choices[i][: choices[i].index(one)])
+                likely = [law for k, law in enumerate(hypotheses) if weight[i, k] >= LIKELY * of_choice[i] > 0.0]
+                if likely:
+                    widest = max((results[i].coefficients[law][at] for law in likely), key=lambda found: found[1])
+                    parts.append((of_choice[i], *widest))
+            coefficients.append(_coefficient(column, coefficient_unit(unit, one.unit), np.array(parts)))
+        inclusion[one.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
+    return Scored(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
+
+
+def ln_prior(regressors: Choice, choice: Choice) -> float:
+    """ln of the prior probability that of `regressors` those of the `choice` are in use, and no other."""
+    return sum(math.log(one.probability if one in choice else 1.0 - one.probability) for one in regressors)
+
+
+def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coefficient:
+    """One whose posterior is normal."""
+    return Coefficient(column, unit, mean, sd, mean - HALF_90 * sd, mean, mean + HALF_90 * sd)
+
+
+def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
+    """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
+    found = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
+    return Coefficient(column, unit, *found)

@@ -1,0 +1,342 @@
+"""The numbers behind a model: nodes, splines and priors as the C library wants them (`selfcal_model_t`)."""
+
+from __future__ import annotations
+
+import functools
+import math
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal import _library32
+from selfcal.base.errors import UserError
+from selfcal.base.units import same_kind
+from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior, Regressor
+from selfcal.model.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, SWING_MOST, Law
+from selfcal.model.regressors import channels_of, sources_of
+
+#: Hz; beyond these the bank interval has no meaning for a drift.
+RATE_LIMITS = (1e-6, 1e6)
+#: Samples a bank interval: the float sums of one block lose digits with more.
+MOST_BLOCK = 1_000_000
+#: Bank intervals that a stated correlation time lasts: ALPHA_DT_MAX in lib/bank.h, TIME_MAX in lib/bank_states.c.
+ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
+
+
+class PriorLaw(IntEnum):
+    """`selfcal_prior_law_t`."""
+
+    LOG_UNIFORM = 0
+    UNIFORM = 1
+    LOG_NORMAL = 2
+
+    def __repr__(self) -> str:
+        """As when there were two: a model's checksum stays."""
+        return ("False", "True", "log_normal")[self]
+
+
+#: ln limits, law, whether measured: `selfcal_prior_t`.
+PriorRow = tuple[float, float, PriorLaw, bool]
+
+
+@dataclass(frozen=True)
+class Grid:
+    """One grid dimension: `nodes` even steps; `fit` [nodes, nodes] turns node values into B-spline coefficients."""
+
+    nodes: int
+    fit: NDArray[np.float64]
+
+
+@functools.cache
+def make_grid(nodes: int) -> Grid:
+    """The not-a-knot spline through `nodes` points one apart (knots: `knot()` in lib/report_spline.c)."""
+    z = np.arange(nodes, dtype=float)
+    knots = np.concatenate([np.zeros(6), np.arange(3.0, nodes - 3.0), np.full(6, nodes - 1.0)])
+    return Grid(nodes, np.asarray(np.linalg.inv(_basis(z, knots, 5)), np.float64))
+
+
+def _basis(z: NDArray[np.float64], knots: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+    """B-splines [points, splines] at `z` by the recursion of Cox and de Boor. The same as scipy's design matrix, whose
+    import takes longer than `identify` of an hour."""
+    interval = np.searchsorted(knots, z, side="right") - 1
+    interval = np.minimum(interval, len(knots) - degree - 2)  # the last point belongs to the last interval
+    basis = np.eye(len(knots) - 1)[interval]
+    for d in range(1, degree + 1):
+        span = knots[d:] - knots[:-d]
+        rise = np.where(span > 0.0, (z[:, None] - knots[:-d]) / np.where(span > 0.0, span, 1.0), 0.0)
+        basis = rise[:, :-1] * basis[:, :-1] + (1.0 - rise[:, 1:]) * basis[:, 1:]
+    return basis
+
+
+@dataclass(frozen=True)
+class AxisTable:
+    """One axis: ln limits and law of each parameter's prior (order of PARAMETERS), and the read-out."""
+
+    name: str
+    unit: str
+    ln_min: tuple[float, ...]
+    ln_max: tuple[float, ...]
+    law: tuple[PriorLaw, ...]
+    bias_sd: float
+    range: float
+    stuck_limit: int
+
+
+@dataclass(frozen=True)
+class RegressorTable:
+    """One column of the regressors; `coefficient_sd` [axes] in the axis's unit per `unit`, 0 where it has it not.
+
+    `source`: kind, number and second number (`selfcal_source_t`), and the channel's name and unit, "" without one.
+    `ln_odds` [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]:
+    none is 0."""
+
+    name: str
+    unit: str
+    reference: float
+    coefficient_sd: tuple[float, ...]
+    source: tuple[int, float, float, str, str] = (0, 0.0, 0.0, "", "")
+    ln_odds: tuple[float, ...] = ()
+    coefficient_mean: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class HypothesisTable:
+    """One hypothesis: its law, prior probability and grids; of a sum or a warm start also each axis's priors in the
+    order of PARAMETERS."""
+
+    name: str
+    law: Law
+    ln_probability: float
+    rho: Grid | None
+    alpha: Grid | None
+    priors: tuple[tuple[PriorRow, ...], ...] = ()
+
+    @property
+    def nodes(self) -> int:
+        """Filters of this hypothesis."""
+        return (self.rho.nodes if self.rho else 1) * (self.alpha.nodes if self.alpha else 1)
+
+
+@dataclass(frozen=True)
+class GateTable:
+    """The gate for one sampling rate: `window` in samples; of each axis `sigma` (infinite: left out), and if it is a
+    gyro."""
+
+    window: int
+    false_alarm: float
+    hold: int
+    settle: int
+    memory: int
+    sigma: tuple[float, ...]
+    is_rate: tuple[bool, ...]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """A model for one bank interval `dt_s` = `block` samples, for some axes and one target's node counts."""
+
+    dt_s: float
+    block: int
+    axes: tuple[AxisTable, ...]
+    hypotheses: tuple[HypothesisTable, ...]
+    regressors: tuple[RegressorTable, ...] = ()
+    half_life_s: float = 0.0
+    handling: Handling = NOT_HANDLED
+
+    @property
+    def rate_hz(self) -> float:
+        """Of the samples."""
+        return self.block / self.dt_s
+
+    @property
+    def nodes(self) -> int:
+        """Filters of all hypotheses."""
+        return sum(h.nodes for h in self.hypotheses)
+
+    @property
+    def channels(self) -> tuple[tuple[str, str], ...]:
+        """Name and unit of what the regressors take beside the readings of these axes."""
+        axes = {(axis.name, axis.unit) for axis in self.axes}
+        taken = dict.fromkeys(column.source[3:] for column in self.regressors if column.source[3])
+        return tuple(one for one in taken if one not in axes)
+
+    def source_of(self, column: RegressorTable) -> tuple[int, int, float, float]:
+        """`selfcal_source_t` of a column: kind, place of its channel (the axes' readings, then `channels`), numbers."""
+        kind, number, second, name, unit = column.source
+        places = [*((axis.name, axis.unit) for axis in self.axes), *self.channels]
+        return kind, places.index((name, unit)) if name else 0, number, second
+
+    @property
+    def term_nodes(self) -> int:
+        """Filters of the laws that are sums."""
+        return sum(h.nodes for h in self.hypotheses if h.law.is_sum)
+
+    @property
+    def id(self) -> int:
+        """32-bit checksum of everything that decides what the sums mean."""
+        hypotheses = [
+            (
+                h.name,
+                h.ln_probability,
+                h.rho.nodes if h.rho else 0,
+                h.alpha.nodes if h.alpha else 0,
+                *h.priors,
+                *([h.law.as_tuple] if h.law.is_sum else []),
+            )
+            for h in self.hypotheses
+        ]
+        extras = (
+            *self.regressors,
+            *([self.half_life_s] if self.half_life_s else []),
+            *([self.handling] if self.handling != NOT_HANDLED else []),
+        )
+        text = repr((self.dt_s, self.block, self.axes, hypotheses, *extras))
+        return zlib.crc32(text.replace(" law=(", " uniform=(").encode())  # its name when the first checksums were made
+
+
+def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
+    """Samples averaged into one bank sample; a recording slower than the bank rate is taken as it is."""
+    return max(1, round(rate_hz / bank_rate_hz))
+
+
+def gate_table(model: Model, tables: Tables) -> GateTable | None:
+    """The model's gate for the axes and the rate of `tables`; None if it has none, or a bank interval is one sample."""
+    if model.gate is None or tables.block < 2:
+        return None
+    gate, rate_hz = model.gate, tables.rate_hz
+    wanted = gate.window_s * rate_hz
+    divisors = [n for n in range(2, tables.block + 1) if tables.block % n == 0]
+    groups = [model.group_of(axis.name) for axis in tables.axes]
+    return GateTable(
+        window=min(divisors, key=lambda n: abs(math.log(n / wanted))),
+        false_alarm=gate.false_alarm,
+        hold=gate.hold,
+        settle=gate.settle,
+        memory=gate.memory,
+        sigma=tuple(gate.N[g.name] * math.sqrt(rate_hz) if g.name in gate.N else math.inf for g in groups),
+        is_rate=tuple(same_kind(group.unit, "rad/s") for group in groups),
+    )
+
+
+def make_tables(
+    model: Model,
+    rate_hz: float,
+    axes: tuple[str, ...] | None = None,
+    target: str = "host",
+    bank_rate_hz: float | None = None,
+) -> Tables:
+    """The tables for samples at `rate_hz` on `axes` (default: all of the model).
+
+    Raises UserError for an unknown target or axis, or a bank interval that the priors do not fit.
+    """
+    if target not in model.nodes:
+        raise UserError(f"{model.path}: nodes has no target '{target}' (it has {', '.join(model.nodes)})")
+    nodes = model.nodes[target]
+    bank_rate = bank_rate_hz or model.bank_rate_hz
+    for rate, what in ((rate_hz, "the sampling rate"), (bank_rate, "the bank rate")):
+        if not RATE_LIMITS[0] <= rate <= RATE_LIMITS[1]:
+            low, high = RATE_LIMITS
+            raise UserError(f"{what}, {rate:g} Hz, is outside {low:g} to {high:g} Hz")
+    names = model.axes if axes is None else axes
+    block = bank_block(rate_hz, bank_rate)
+    if block > MOST_BLOCK:
+        raise UserError(f"{block} samples a bank interval ({rate_hz:g} to {bank_rate:g} Hz) are more than {MOST_BLOCK}")
+    axis_tables = []
+    for name in names:
+        group = model.group_of(name)
+        priors = [group.priors[key] for key in PARAMETERS]
+        axis_tables.append(
+            AxisTable(
+                name=name,
+                unit=group.unit,
+                ln_min=tuple(math.log(p.min) for p in priors),
+                ln_max=tuple(math.log(p.max) for p in priors),
+                law=tuple(_law(p) for p in priors),
+                bias_sd=group.priors["bias"].sd,
+                range=group.range,
+                stuck_limit=group.stuck_limit,
+            )
+        )
+    if 0.0 < model.half_life_s < _library32.BATCH * block / rate_hz:
+        raise UserError(
+            f"{model.path}: half_life_s: {model.half_life_s:g} s are less than {_library32.BATCH} bank intervals "
+            f"({_library32.BATCH * block / rate_hz:g} s)"
+        )
+    dt = block / rate_hz
+    for name, law in model.laws.items():
+        for period_s in (2.0 * math.pi / term.bandwidth for term in law.terms if term.kind == "oscillation"):
+            if not SWING_LEAST * dt <= period_s <= 2.0 * math.pi * SWING_MOST * dt:
+                raise UserError(
+                    f"{model.path}: hypotheses.{name}: period_s: must be from {SWING_LEAST * dt:.3g} to "
+                    f"{2.0 * math.pi * SWING_MOST * dt:.3g} s at bank intervals of {dt:g} s, not {period_s:g}"
+                )
+        for time_s in (1.0 / term.bandwidth for term in law.terms if term.stated and term.kind == "markov"):
+            if not dt / ALPHA_DT_MAX <= time_s <= TIME_MAX * dt:
+                where = "correlation_time_s" if name in NAMED else f"hypotheses.{name}: correlation_time_s"
+                raise UserError(
+                    f"{model.path}: {where}: must be from {dt / ALPHA_DT_MAX:.3g} to {TIME_MAX * dt:.3g} s at bank "
+                    f"intervals of {dt:g} s, not {time_s:g}"
+                )
+
+    def grids(name: str) -> tuple[Grid | None, Grid | None]:
+        counts = nodes.of.get(name, ())
+        rho, alpha = (*(make_grid(count) for count in counts), None, None)[:2]
+        return rho, alpha
+
+    return Tables(
+        dt_s=float(np.float32(block / rate_hz)),
+        block=block,
+        axes=tuple(axis_tables),
+        hypotheses=tuple(
+            HypothesisTable(
+                name,
+                model.laws[name],
+                math.log(probability),
+                *grids(name),
+                priors=tuple(priors_of(model.group_of(axis), name) for axis in names)
+                if model.laws[name].is_sum
+                else (),
+            )
+            for name, probability in model.hypotheses.items()
+        ),
+        regressors=tuple(
+            RegressorTable(
+                column,
+                one.unit,
+                one.offset,
+                tuple(_coefficient_sd(model, one, name) for name in names),
+                _source(one, place),
+                len(names) * ((math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0),),
+            )
+            for one in model.regressors
+            for place, column in enumerate(one.columns)
+        ),
+        half_life_s=model.half_life_s,
+        handling=model.handling,
+    )
+
+
+def priors_of(group: Group, law: str) -> tuple[PriorRow, ...]:
+    """In each place the prior of the parameter that the law has there, else that of the axis."""
+    of_place = dict(enumerate(PARAMETERS)) | {PLACES[name]: name for name in group.laws[law].parameters}
+    chosen = (group.priors[of_place[place]] for place in range(len(PARAMETERS)))
+    return tuple((math.log(p.min), math.log(p.max), _law(p), False) for p in chosen)
+
+
+def _law(prior: Prior) -> PriorLaw:
+    return PriorLaw[prior.law.upper()]
+
+
+def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, str]:
+    """Of a column by its place in the regressor."""
+    channels = channels_of((regressor,))
+    kind, _, number, second = sources_of(regressor, channels)[place]
+    return kind, number, second, *(channels[0][:2] if channels else ("", ""))
+
+
+def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:
+    """0 where the axis does not have the regressor: no prior for its group, or it is the axis itself."""
+    return 0.0 if regressor.column == axis else regressor.sd.get(model.group_of(axis).name, 0.0)

@@ -1,0 +1,1 @@
+"""What the readings are, before any fit."""

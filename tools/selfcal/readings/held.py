@@ -1,0 +1,265 @@
+"""Readings that a logger asks for oftener than the part measures: each repeats until the next one.
+
+Asked twice as often and more, most rows repeat: the runs of equal rows show the part. Asked less often, a row repeats
+only now and then: at the beat of the two rates. The phase of that beat tells the repeats from readings that are equal
+by chance. Where the rows come at random the beat is lost. Repeats on a fine lattice are no chance even then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.fft import next_fast_len, rfft
+
+from selfcal.logs.sampling import followed_phase
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+
+#: Runs of equal readings that show held ones at least.
+RUNS_LEAST = 50
+#: Of a beat: repeats beyond those by chance, their share of the rows and their standard deviations, at least.
+REPEATS_LEAST, SHARE_LEAST, SURE = 50, 0.008, 6.0
+#: Rows that show its line, the power of a line over the mean beyond the largest by chance, and that over the mean in
+#: the blocks that follow its phase.
+HEAD, LINE, IN_BLOCK = 1 << 17, 12.0, 60.0
+#: Share of the rows that repeat, over the beat's frequency, at least: one a beat, and one more for each late row.
+ONE_EACH = 0.75
+#: Share of the rows in whose phase none repeats, at least, and of the repeats that those phases have, at most.
+SMEARED, LEFT = 0.25, 0.35
+#: Share of readings that are equal by chance from which on a row may be; rows that repeat at no beat, at most.
+CHANCE, RUN_MOST = 0.01, 5
+#: Rows to a reading in a stretch at most, net evidence of a stretch, nats, and stretches at most. The chance that a row
+#: of it does not repeat, and equal readings that are supposed among those of a stretch.
+RATIO_MOST, STRETCH_NATS, STRETCHES, MISSED, SUPPOSED = 5, 12.0, 8, 0.02, 2.0
+#: Of a channel that is read anew each period: rows of one at least, changes at least, and their evidence, nats.
+PERIOD_LEAST, CHANGES_LEAST, PERIOD_NATS = 2.5, 8, 20.0
+#: Rows in a bin of the phase, and bins at most.
+IN_BIN, BINS = 50, 100
+
+
+@dataclass(frozen=True)
+class Held:
+    """`rows` [m] at which a new reading of the part begins, `missing` [m]: how many it made unasked before each, and
+    the `ratio` of rows to readings. `even`: the rows show when the readings were made; else their mean rate is known,
+    but for those never asked for."""
+
+    ratio: float
+    rows: Rows
+    missing: Rows
+    even: bool = True
+
+
+def held(columns: Sequence[Array], at: Rows, off: Array | None) -> Held | None:
+    """The part's own readings among rows [n], where the values of all columns [n] are held; None where they are not.
+
+    `at` [n]: places of the rows on the logger's grid; `off` [n]: the stamps' distance from it, in intervals.
+    """
+
+    def equal(lag: int) -> Mask:
+        """Whether a row repeats the one so many before, [n]."""
+        found = np.zeros(at.size, bool)
+        found[lag:] = np.logical_and.reduce([column[lag:] == column[:-lag] for column in columns])
+        return found
+
+    if at.size < 4 * RUNS_LEAST:
+        return None
+    same, again = equal(1), equal(2)
+    return _in_runs(same, at) or _at_a_beat(same, again, at, off) or _now_and_then(same, again, at)
+
+
+@dataclass(frozen=True)
+class Slower:
+    """A stretch in which each reading is held for `ratio` rows: `rows` [k] are those that repeat; `nats` net."""
+
+    ratio: int
+    rows: Rows
+    nats: float
+
+
+def slower(values: Array) -> list[Slower]:
+    """Stretches of readings [n], NaN where there is none, in which the part or the logger ran at a part of its rate.
+
+    In a stretch every row but each `ratio`th repeats. A repeat counts by its chance: the share of the readings that
+    equal one two to four rows before, or of the stretch's own where more of these are equal.
+    """
+    n = values.size
+    if n < 4 * RATIO_MOST:
+        return []
+    same = np.zeros(n, bool)
+    same[1:] = values[1:] == values[:-1]
+    later = sum(float(np.count_nonzero(values[k:] == values[:-k])) for k in (2, 3, 4))
+    chance = max(later / 3.0, 1.0) / n
+    found: list[Slower] = []
+    while len(found) < STRETCHES:
+        best = max((_slower(same, ratio, chance) for ratio in range(2, RATIO_MOST + 1)), key=lambda one: one.nats)
+        if best.nats < STRETCH_NATS:
+            break
+        found.append(best)
+        same[best.rows] = False
+    return found
+
+
+def _slower(same: Mask, ratio: int, chance: float) -> Slower:
+    """The likeliest stretch of rows [n] that repeat the one before, but for every `ratio`th row."""
+    n, best = same.size, Slower(ratio, np.zeros(0, np.int64), 0.0)
+    for phase in range(ratio):
+        holds = np.arange(n) % ratio != phase
+        worth = np.where(same, math.log((1.0 - MISSED) / chance), math.log(MISSED / (1.0 - chance)))
+        total = np.concatenate([[0.0], np.cumsum(np.where(holds, worth, 0.0))])
+        gain = total - np.minimum.accumulate(total)
+        end = int(np.argmax(gain))
+        begin = int(np.argmin(total[: end + 1]))
+        rows = begin + np.flatnonzero((holds & same)[begin:end])
+        # Readings that rest, or are narrower in this stretch, repeat at every place.
+        new = same[begin:end][~holds[begin:end]]
+        own = max(chance, (float(new.sum()) - SUPPOSED) / max(new.size, 1))
+        held = int(np.count_nonzero(holds[begin:end]))
+        nats = rows.size * math.log((1.0 - MISSED) / own) + (held - rows.size) * math.log(MISSED / (1.0 - own))
+        nats -= 2.0 * math.log(n) + math.log(RATIO_MOST**2)
+        if nats > best.nats:
+            best = Slower(ratio, rows, nats)
+    return best
+
+
+def updates(values: Array, at: Rows) -> Rows | None:
+    """Rows at which a channel [n] is read anew, where its value is held in between or bridged by straight lines; None
+    where no one period shows. `at` [n]: places of the rows on the logger's grid.
+
+    A new value may equal the last one, so all changes lie whole periods apart. Chance would spread them evenly."""
+    steps = np.diff(values)
+    bends = np.abs(np.diff(steps)) > 1e-9 * float(np.ptp(values))
+    held_rows = np.flatnonzero(steps) + 1
+    rows = held_rows if 2 * held_rows.size < values.size else np.flatnonzero(bends) + 1
+    if rows.size <= CHANGES_LEAST:
+        return None
+    gaps = np.diff(at[rows])
+    nats, period = max(_of_period(gaps, part) for part in (1, 2, 3))
+    if nats < PERIOD_NATS:
+        return None
+    times = np.maximum(1, np.rint(gaps / period))
+    count = np.concatenate([[0.0], np.cumsum(times)])
+    before, after = (math.floor(float(rest) / period) for rest in (at[rows[0]] - at[0], at[-1] - at[rows[-1]]))
+    count = np.concatenate([[-before], count, [count[-1] + after]])
+    place = np.concatenate([[at[rows[0]] - before * period], at[rows], [at[rows[-1]] + after * period]])
+    every = np.interp(np.arange(count[0], count[-1] + 1.0), count, place)
+    return np.unique(np.minimum(np.searchsorted(at, np.rint(every)), at.size - 1))
+
+
+def _of_period(gaps: Rows, part: int) -> tuple[float, float]:
+    """Evidence, nats, that gaps [k] are whole multiples of one period: of the short ones, or a part of them."""
+    period = float(np.quantile(gaps, 0.05, method="lower")) / part
+    for _ in range(20):
+        times = np.maximum(1, np.rint(gaps / period))
+        few = times <= 3 * part
+        period = float(gaps[few].sum() / times[few].sum())
+    if period < PERIOD_LEAST:
+        return 0.0, period
+    off = np.abs(gaps - np.rint(gaps / period) * period)
+    return gaps.size * math.log(period / (1.0 + 2.0 * float(np.quantile(off, 0.95)))), period
+
+
+def _in_runs(same: Mask, at: Rows) -> Held | None:
+    """Readings that repeat by chance make runs of any length, most of them of one. Held ones make few shorter than half
+    of the usual run. A run of several lengths is of as many readings that are equal by chance."""
+    n = same.size
+    starts = np.flatnonzero(~same)
+    if not RUNS_LEAST < starts.size < 0.55 * n:
+        return None
+    lengths = np.diff(starts, append=n)
+    inner = lengths[1:-1]
+    low, usual = np.quantile(inner, [0.05, 0.5], method="lower")
+    if usual < 2 or low <= 0.5 * usual:
+        return None
+    ratio = float(inner[inner <= 1.5 * usual].mean())
+    for _ in range(20):
+        times = np.maximum(1, np.rint(inner / ratio))
+        single = times <= 3
+        again = float(inner[single].sum() / times[single].sum())
+        if abs(again - ratio) < 1e-9 * ratio:
+            break
+        ratio = again
+    times = np.maximum(1, np.rint(lengths / ratio)).astype(np.int64)
+    run = np.repeat(np.arange(starts.size), times)
+    place = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)
+    rows = starts[run] + place * lengths[run] // times[run]
+    apart = np.rint(np.diff(at[rows], prepend=at[rows[0]] - ratio) / ratio).astype(np.int64)
+    return Held(ratio, rows, np.maximum(0, apart - 1))
+
+
+def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | None:
+    """Rows that repeat the one before at the beat of two rates. `again` [n]: a row equals the one two before, which a
+    held reading does by chance alone."""
+    n = same.size
+    next_one = np.diff(at, prepend=at[0] - 2) == 1
+    share, chance = float(same[next_one].mean()), float(again[next_one].mean())
+    excess, sd = share - chance, math.sqrt((share + chance) / n)
+    if excess < max(SHARE_LEAST, REPEATS_LEAST / n, SURE * sd):
+        return None
+    x = np.where(next_one, same - share, 0.0)
+    size = min(n, HEAD)
+    place = at[:size] - at[0]
+    if place[-1] > 4 * HEAD:
+        return None
+    grid = np.zeros(next_fast_len(4 * (int(place[-1]) + 1), real=True))
+    grid[place] = x[:size]
+    power = np.abs(rfft(grid)) ** 2
+    mean = float(np.median(power)) / math.log(2.0)
+    least = round(SHARE_LEAST * grid.size)
+    most = round(min(0.5, (excess + 3.0 * sd) / (1.0 - chance) / ONE_EACH) * grid.size)
+    top = least + int(np.argmax(power[least : most + 1]))
+    if power[top] < (math.log(size) + LINE) * mean:
+        return None
+    frequency = top / grid.size
+    block = max(256, math.ceil(size * IN_BLOCK * mean / float(power[top])))
+    even = (at - at[0]).astype(np.float64)
+    phase, size_of_line = followed_phase(x, even, frequency, block)
+    if off is not None:
+        stamped = followed_phase(x, even + off, frequency, block)
+        phase = stamped[0] if stamped[1] > size_of_line else phase
+    # The share that repeats at each phase: where it is no more than chance the row is a new reading.
+    bins = max(8, min(BINS, n // IN_BIN))
+    bin_of = np.floor((phase % 1.0) * bins).astype(np.int64) % bins
+    count = np.bincount(bin_of[next_one], minlength=bins)
+    there = np.bincount(bin_of[next_one & same], minlength=bins) / np.maximum(count, 1)
+    held_there = (there - chance) > 0.5 * (1.0 - chance) * there
+    # Elsewhere rows are equal by chance alone. A line, or two levels, in the readings changes that chance.
+    elsewhere = next_one & ~held_there[bin_of]
+    if not SMEARED * n < np.count_nonzero(elsewhere) < n - 1:
+        return None
+    left = float(same[elsewhere].mean()) - chance
+    if not -0.05 * chance - 4.0 * sd < left < LEFT * excess + 3.0 * sd:
+        return None
+    rows = np.flatnonzero(~(same & next_one & held_there[bin_of]))
+    # A row repeats where the phase passes a whole number: it is as many readings behind the rows.
+    index = at[rows] - np.floor(phase[rows] + 0.5 * frequency).astype(np.int64)
+    ratio = float(at[rows[-1]] - at[rows[0]]) / float(index[-1] - index[0])
+    ahead = np.maximum.accumulate(index - np.arange(rows.size))
+    missing = np.diff(ahead, prepend=ahead[0])
+    if chance > CHANCE:
+        # The part made a reading more there, and a row was left out: it was equal by chance.
+        equal = np.flatnonzero((missing > 0) & (np.diff(rows, prepend=0) > 1))
+        missing[equal] -= 1
+        rows, missing = np.insert(rows, equal, rows[equal] - 1), np.insert(missing, equal, 0)
+    return Held(ratio, rows, missing)
+
+
+def _now_and_then(same: Mask, again: Mask, at: Rows) -> Held | None:
+    """Rows that repeat the one before at no beat, where readings are hardly ever equal by chance. A run of more than
+    RUN_MOST is a stuck one."""
+    n = same.size
+    starts = np.flatnonzero(~same)
+    lengths = np.diff(starts, append=n)
+    repeats = same & np.repeat(lengths <= RUN_MOST, lengths)
+    share, chance = float(repeats.mean()), float((again & ~same).mean())
+    if share < max(SHARE_LEAST, REPEATS_LEAST / n, 10.0 * chance) or chance > CHANCE:
+        return None
+    rows = np.flatnonzero(~repeats)
+    ratio = n / rows.size
+    unasked = np.diff(at[rows] - rows, prepend=at[rows[0]] - rows[0])
+    return Held(ratio, rows, np.rint(unasked / ratio).astype(np.int64), even=False)

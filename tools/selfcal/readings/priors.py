@@ -1,0 +1,230 @@
+"""Priors of an axis whose recording lies outside the model's: limits that are laid about the recording itself.
+
+A record within the limits keeps the model's priors. So does one that moved: its readings show motion, not the sensor.
+The limits depend on the recording and the model alone, so that every verb and every target has the same.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import Recording
+from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Gate, Group, Model, Prior
+from selfcal.model.laws import RATIOS
+from selfcal.readings.rest import BIAS_SD, rest_of
+
+#: N is laid so far either way about the record's, and a drift beyond the default ratio to N by so much.
+DECADES, DRIFT_MARGIN = 100.0, 10.0
+#: Limits of N nearer than this factor are knowledge of the part (a warm start, a model by hand): they stay.
+NARROW = 10.0
+#: The record's N is outside a limit from so many of its own standard deviations on; that of ln N times sqrt(n).
+OUTSIDE_SD, MEDIAN_SD = 2.0, 1.2
+#: Its drift is outside where the deviation over some time is above all that the priors allow by so much.
+DRIFT_ABOVE = 1.5
+#: Differences of neighbouring means that show a deviation.
+FEWEST, FEWEST_OF_DRIFT = 8, 24
+#: Median of the square of a normal value over its variance.
+MEDIAN_SQUARE = 0.4549364
+#: Greatest Allan deviation of a Gauss-Markov drift over its sigma_m.
+MARKOV_PEAK = 0.62
+#: A level is so many sd of the bias that is laid for it.
+LEVEL_SD = 2.0
+#: The gate starts from so many times the noise: default.yaml has two to six.
+GATE_NOISE = 3.0
+#: What the JSON has of an axis's priors.
+OF_MODEL, OF_RECORD = "model", "from this record"
+
+
+@dataclass(frozen=True)
+class Seen:
+    """An axis at rest, in its group's unit: its `level`, its Allan deviations at `tau_s` [k], the shortest the bank's
+    interval, each from the median of `differences` [k] (all of them, where the median is of no noise)."""
+
+    level: float
+    tau_s: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+    differences: NDArray[np.int64]
+
+    @property
+    def N(self) -> float:
+        """White noise density of the shortest interval."""
+        return float(self.deviation[0] * math.sqrt(self.tau_s[0]))
+
+
+def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model:
+    """The model with own priors for those of `axes` that rested outside its own. Itself where there is none."""
+    own: dict[str, dict[str, Prior]] = {}
+    noise: dict[str, float] = {}
+    for name in axes:
+        with suppress(UserError):  # of another kind, or without a sample: said where the axis is read
+            group, seen = model.group_of(name), at_rest(recording, name, model)
+            if seen is not None:
+                own[name] = about(group, seen)
+                noise[group.name] = max(noise.get(group.name, 0.0), GATE_NOISE * seen.N)
+    if not own:
+        return model
+    groups = tuple(
+        replace(group, own_priors={**group.own_priors, **{name: own[name] for name in group.axes if name in own}})
+        for group in model.groups
+    )
+    return replace(model, groups=groups, gate=_gate(model.gate, noise))
+
+
+def add_sources(document: Mapping[str, Any], model: Model, changed: Model) -> None:
+    """State in each axis of a document where its priors are from; `changed`: the model by `for_record`."""
+    for name, axis in document["axes"].items():
+        if "error" not in axis:
+            same = model.group_of(name).priors == changed.group_of(name).priors
+            axis["priors"] = OF_MODEL if same else OF_RECORD
+
+
+def state_own(tree: dict[str, Any], model: Model) -> None:
+    """Put the own priors of the model's axes into its file's `tree`; those that are the group's are left out."""
+    for group in model.groups:
+        if group.own_priors:
+            tree["groups"][group.name]["own_priors"] = {
+                axis: {key: prior_tree(prior) for key, prior in own.items() if prior != group.priors.get(key)}
+                for axis, own in group.own_priors.items()
+            }
+
+
+def prior_tree(prior: Prior) -> dict[str, Any]:
+    """A prior as a model file has it."""
+    if prior.law == "normal":
+        return {"law": prior.law, "sd": prior.sd}
+    if prior.law == "log_normal":
+        return {"law": prior.law, "median": prior.median, "sd": prior.sd}
+    return {"law": prior.law, "min": prior.min, "max": prior.max}
+
+
+def _gate(gate: Gate | None, noise: Mapping[str, float]) -> Gate | None:
+    """The gate's noise is a bound: a noisier axis raises it."""
+    if gate is None:
+        return None
+    return replace(gate, N={name: max(N, rounded(noise.get(name, 0.0))) for name, N in gate.N.items()})
+
+
+def at_rest(recording: Recording, name: str, model: Model) -> Seen | None:
+    """An axis that rested outside the priors of its group; None for one inside, or one that moved out of them."""
+    group, own = model.group_of(name), recording.along(name)
+    seen = seen_of(own, name, model)
+    if seen is None or not outside(group, seen):
+        return None
+    rest = rest_of(own, [axis for axis in model.axes if axis in own.columns])
+    if not rest.moved:
+        return seen
+    time_s, kept = own.time_s + own.start_s, np.ones(own.samples, bool)
+    for begin_s, end_s in rest.moved:
+        kept &= (time_s < begin_s) | (time_s >= end_s)
+    if np.count_nonzero(kept) < 2:
+        return None
+    seen = seen_of(own.with_rows(kept), name, model)
+    return seen if seen is not None and outside(group, seen) else None
+
+
+def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
+    """The level and the Allan deviations of an axis by its own clock; None where too little of it is there.
+
+    Outliers, steps and short motion leave a median alone."""
+    group = model.group_of(name)
+    values = recording.in_unit(name, group.unit)
+    sound = np.isfinite(values) & (np.abs(values) < (group.range if group.range > 0.0 else math.inf))
+    if not sound.any():
+        return None
+    block = max(1, round(recording.rate_hz / model.bank_rate_hz))
+    tau_s = block / recording.rate_hz
+    place = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
+    size = np.ones(place.size)
+    tau: list[float] = []
+    deviations: list[float] = []
+    counts: list[int] = []
+    level = math.nan
+    with np.errstate(over="ignore", invalid="ignore"):
+        total = values[sound]
+        while True:
+            first = np.flatnonzero(np.diff(place, prepend=place[0] - 1))
+            place, total, size = place[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
+            whole = size > 0.5 * size.max()
+            mean = total[whole] / size[whole]
+            level = level if tau else float(np.median(mean))
+            step = np.diff(mean)[np.diff(place[whole]) == 1]
+            if step.size < (FEWEST_OF_DRIFT if tau else FEWEST):
+                break
+            square = step * step
+            typical, all_of_them = float(np.median(square)) / MEDIAN_SQUARE, float(square.mean())
+            # On a coarse lattice the median is of its steps: never more than the mean square.
+            deviations.append(math.sqrt(0.5 * (min(typical, all_of_them) or all_of_them)))
+            tau.append(tau_s)
+            counts.append(step.size)
+            tau_s *= 2.0
+            place = place // 2
+    if not tau or not 0.0 < deviations[0] < math.inf:
+        return None
+    return Seen(level, np.array(tau), np.array(deviations), np.array(counts))
+
+
+def outside(group: Group, seen: Seen) -> bool:
+    """Whether a resting axis lies outside the priors of its group: its noise, its drift or its level. Never of a group
+    whose N is known."""
+    N = group.priors["N"]
+    if N.max < NARROW * N.min:
+        return False
+    margin = math.exp(OUTSIDE_SD * MEDIAN_SD / math.sqrt(float(seen.differences[0])))
+    beyond = not N.min / margin <= seen.N <= N.max * margin
+    return beyond or _drifts(group, seen) or abs(seen.level) > BIAS_SD * group.priors["bias"].sd
+
+
+def _drifts(group: Group, seen: Seen) -> bool:
+    """Whether the deviation over some time is above all that the priors allow."""
+    N, K, sigma_m = (group.priors[key].max for key in ("N", "K", "sigma_m"))
+    most = np.sqrt(N**2 / seen.tau_s + K**2 * seen.tau_s / 3.0 + (MARKOV_PEAK * sigma_m) ** 2)
+    return bool((seen.deviation > DRIFT_ABOVE * most).any())
+
+
+def about(group: Group, seen: Seen) -> dict[str, Prior]:
+    """Priors about a resting axis: N two decades either way, the drift's in the group's ratio to the middle of N. Where
+    the axis drifts faster, these reach as far as it does. The bias' is as wide as its level needs."""
+    peak = float(seen.deviation.max())
+    reach = {"K": float(seen.deviation[-1] * math.sqrt(3.0 / seen.tau_s[-1])), "sigma_m": peak, "B": peak}
+    return laid(group.priors, seen.N, seen.level, reach)
+
+
+def laid(
+    priors: Mapping[str, Prior], N: float, level: float = 0.0, reach: Mapping[str, float] | None = None
+) -> dict[str, Prior]:
+    """Priors about a white noise `N`, as `about` has them. `level` and `reach`, the sizes of the drift by parameter, in
+    the unit of the priors."""
+    N = rounded(N)
+    scale = N / math.sqrt(priors["N"].min * priors["N"].max)
+    sd = priors["bias"].sd
+    if abs(level) > BIAS_SD * sd:
+        sd = rounded(LEVEL_SD * abs(level))
+    # A bias prior may be so much wider than the least N: first it gives way, then N.
+    sd = max(min(sd, WIDEST_BIAS * N / DECADES), rounded(abs(level) / LEVEL_SD))
+    least = max(N / DECADES, rounded(1.01 * sd / WIDEST_BIAS))
+    own = {"bias": Prior("normal", sd=sd), "N": _limits(priors["N"].law, least, DECADES * N)}
+    for key, prior in priors.items():
+        if key not in ("bias", "N", "alpha", *RATIOS):
+            most = max(scale * prior.max, DRIFT_MARGIN * (reach or {}).get(key, 0.0))
+            own[key] = _limits(prior.law, scale * prior.min, most)
+    return {**priors, **own}
+
+
+def _limits(law: str, low: float, high: float) -> Prior:
+    """Rounded limits, within those of any prior."""
+    law = "uniform" if law == "uniform" else "log_uniform"
+    least, most = math.exp(0.99 * -LN_LIMIT), math.exp(0.99 * LN_LIMIT)
+    return Prior(law, min=min(max(rounded(low), least), most / 2.0), max=max(min(rounded(high), most), least * 2.0))
+
+
+def rounded(value: float) -> float:
+    """Two digits: all that is meant."""
+    return float(f"{value:.2g}")

@@ -1,0 +1,634 @@
+"""What the readings of a recording show by themselves: changes of rate, motion, held, stuck and clipped ones.
+
+None of it needs a fit. `identify` and `diagnose` look at it once, at the recording's own rate, whatever they average.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
+from scipy.special import log_ndtr, ndtr, ndtri_exp
+
+from selfcal.logs.recording import Column, Recording
+from selfcal.logs.sampling import Change, rate_changes
+from selfcal.model.file import Group
+from selfcal.readings.codes import Uneven, uneven_of
+from selfcal.readings.held import Held, Slower, held, slower
+from selfcal.readings.lattice import Lattice, lattice_of
+from selfcal.readings.lost_words import Recurring, recurring_of
+from selfcal.readings.motion import Moved, loud
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+
+#: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
+CLOCK_LEAST = 1e-3
+#: Pieces on either side of a change, and standard deviations of their slopes that it takes.
+SLOPES, SLOPES_LEAST = 10, 8.0
+#: Longest common interval of two rates, s, and how far off it may be.
+COMMON_S, COMMON_OFF = 1.0, 3e-3
+#: Longest gap that motion is looked for across, s.
+GAP_MOST_S = 240.0
+#: ln of the probability, a record, of a run of equal readings that is no chance.
+LN_STUCK = math.log(1e-9)
+#: Samples on either side that make the level of one.
+AROUND = 32
+#: Readings at a limit are told of from this evidence on, nats: as a look of the diagnosis.
+CLIPPED_LEAST = -math.log(5e-4)
+#: On a lattice coarser than the noise: the evidence in nats, pieces of a record that have a level each, and codes, at
+#: most.
+PILED_LEAST, PIECES, CODES_MOST = 30.0, 200, 40
+#: A reading that bears less than this share of an unclipped one's information bears none.
+INFORMATION_LEAST = 0.05
+#: Steps of EM at most, and the change of the noise at which it has settled.
+ITERATIONS, SETTLED = 200, 1e-6
+
+
+@dataclass(frozen=True)
+class RateChange:
+    """A change of the sampling rate: `time_s`, the rates before and after, and the evidence in nats."""
+
+    time_s: float
+    before_hz: float
+    after_hz: float
+    nats: float
+
+
+@dataclass(frozen=True)
+class Clipped:
+    """Readings at limits: by limit [unit] the mask [n] of its readings, and the evidence in nats."""
+
+    limits: Mapping[float, Mask]
+    nats: float
+
+    @property
+    def mask(self) -> Mask:
+        """Every clipped reading, [n]."""
+        found: Mask = np.logical_or.reduce(list(self.limits.values()))
+        return found
+
+    @property
+    def limit(self) -> float:
+        """The limit with the most readings."""
+        return max(self.limits, key=lambda limit: int(self.limits[limit].sum()))
+
+
+#: A model file has a range to six digits: readings at the limit that it states may lie so much beyond.
+ROUNDED = 1e-5
+#: An axis moves with others if its mean square is so many standard deviations above that of the rest. A wild reading
+#: counts as so many of it at most.
+LOUDER_SD, WILD = 6.0, 30.0
+
+
+@dataclass(frozen=True)
+class Readings:
+    """The readings of one axis: `values` [n] in the group's unit as read, NaN where they are `stuck` or `recurring`.
+    `working` [n] are those to average: NaN where the sensor is `moving` [n], and clipped ones give their information to
+    others (see `_unclipped`). In `drawn` [n] a clipped one is drawn by chance beyond its limit. `kept_out` counts the
+    stuck, the recurring and the clipped ones; repeats in stretches that are `slower` are stuck.
+
+    `recording`: of the part's own readings, [n] rows, where the logger `held` each.
+    """
+
+    recording: Recording
+    values: Array
+    working: Array
+    drawn: Array
+    lattice: Lattice | None
+    stuck: Mask
+    moving: Mask
+    stuck_nats: float = 0.0
+    clipped: Clipped | None = None
+    recurring: Recurring | None = None
+    moved: Moved | None = None
+    kept_out: Mapping[str, int] = field(default_factory=dict)
+    held: Held | None = None
+    changes: tuple[RateChange, ...] = ()
+    slower: tuple[Slower, ...] = ()
+
+    @cached_property
+    def uneven(self) -> Uneven | None:
+        """How the codes of the readings are unequal."""
+        return uneven_of(self.values, self.lattice)
+
+    @property
+    def held_hz(self) -> float | None:
+        """The rate of the part, where the logger asked oftener."""
+        return None if self.held is None else self.recording.rate_hz
+
+    def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
+        """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
+        found = {**self.kept_out, **{key: count + self.kept_out.get(key, 0) for key, count in kept_out.items()}}
+        return {**found, "not_finite": found["not_finite"] - int((~np.isfinite(self.working)).sum())}
+
+    @property
+    def coarse(self) -> float:
+        """Spacing of float32 at the largest reading, in the noise of one."""
+        values = self.working[np.isfinite(self.working)]
+        with np.errstate(over="ignore"):
+            largest = np.float32(np.abs(values).max(initial=0.0))
+        noise = float(np.diff(values).std()) / math.sqrt(2.0) if values.size > 2 else 0.0
+        return float(np.spacing(largest)) / noise if noise > 0.0 and np.isfinite(largest) else 0.0
+
+    def without(self, moved: Sequence[Sequence[float]]) -> Readings:
+        """The same where other axes show that the sensor moved: stretches, seconds of the whole recording. An axis that
+        shows no motion of its own must be louder in them than in the rest."""
+        time, mask = self.recording.start_s + self.recording.time_s, self.moving.copy()
+        for begin_s, end_s in moved:
+            mask |= (time >= begin_s) & (time < end_s)
+        if not moved or (self.moved is None and not self._louder(mask)):
+            return self
+        working, times = np.where(mask, np.nan, self.working), tuple(_intervals(self.recording, mask))
+        found = Moved(times, 0.0, 0.0) if self.moved is None else replace(self.moved, intervals=times)
+        return replace(self, moving=mask, working=working, moved=found)
+
+    def _louder(self, mask: Mask) -> bool:
+        """Whether differences of neighbours are larger inside a mask [n] than outside, beyond chance."""
+        square = np.diff(self.working) ** 2
+        inside, outside = square[mask[1:]], square[~mask[1:]]
+        inside, outside = inside[np.isfinite(inside)], outside[np.isfinite(outside)]
+        if not inside.size or not outside.size:
+            return False
+        # A squared difference of normal noise scatters by 1.7 times its mean: the two neighbours share a reading.
+        least = 1.0 + LOUDER_SD * math.sqrt(3.0 / inside.size)
+        return bool(np.minimum(inside, WILD * outside.mean()).mean() > least * outside.mean())
+
+    @property
+    def intervals(self) -> list[list[float]]:
+        """Start and end of every stuck stretch, s."""
+        return [list(interval) for interval in _intervals(self.recording, self.stuck)]
+
+    @property
+    def slower_intervals(self) -> list[list[float]]:
+        """Start and end of every stretch of a slower rate, s."""
+        time, step = self.recording.time_s, 1.0 / self.recording.rate_hz
+        return sorted([float(time[one.rows[0] - 1]), float(time[one.rows[-1]]) + step] for one in self.slower)
+
+
+def look(recording: Recording, axis: str, group: Group) -> Readings:
+    """The readings of an axis at the part's own rate. O(n log n)."""
+    even, changes = evened(recording)
+    own, found = thinned(even, (axis,))
+    seen = replace(readings_of(own, axis, group), held=found, changes=changes)
+    times = () if seen.moved is None else seen.moved.intervals
+    recording.motion_seen[axis] = [[a + own.start_s, b + own.start_s] for a, b in times]
+    return seen
+
+
+def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
+    """The readings of an axis of an evened and thinned recording."""
+    values = recording.in_unit(axis, group.unit)
+    none = np.zeros(values.size, bool)
+    # Readings beyond the part's range are none: the engines leave them out.
+    inside = np.abs(values) <= (group.range * (1.0 + ROUNDED) if group.range > 0.0 else math.inf)
+    if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
+        return Readings(recording, values, values, values, None, none, none)
+    sound = values if inside.all() else np.where(inside, values, np.nan)
+    lattice = lattice_of(_known(sound), recording.rate_hz)
+    recurring = recurring_of(sound, recording.rate_hz)
+    if recurring is not None and uneven_of(sound, lattice) is not None:
+        recurring = None  # a dead band takes its counts from its neighbours
+    if recurring is not None:
+        values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
+        lattice = lattice_of(_known(sound), recording.rate_hz)
+    stuck, nats = _stuck(sound, lattice, group.stuck_limit)
+    if stuck.any():
+        values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
+    stretches = tuple(slower(sound))
+    repeats = np.zeros(values.size, bool)
+    for one in stretches:
+        repeats[one.rows] = True
+    if stretches:
+        values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
+    clipped = _clipped(sound, lattice)
+    whole = sound if clipped is None else _unclipped(sound, clipped, lattice)[1]
+    moving, moved = _moving(recording, whole, lattice)
+    if moving.any():
+        sound = np.where(moving, np.nan, sound)
+        clipped = _clipped(sound, lattice)
+    working = drawn = values
+    if clipped is not None:
+        working, drawn = _unclipped(sound, clipped, lattice)
+    if moving.any():
+        working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
+    lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
+    counts = {"saturated": lost, "stuck": int((stuck | repeats).sum())}
+    if recurring is not None:
+        counts["outliers"] = int(recurring.mask.sum())
+    found = Readings(recording, values, working, drawn, lattice, stuck, moving, nats, clipped, recurring, moved, counts)
+    return replace(found, slower=stretches)
+
+
+def _known(values: Array) -> Array:
+    """Those of the values that are finite; no copy where all are."""
+    finite = np.isfinite(values)
+    return values if finite.all() else values[finite]
+
+
+def _stretches(mask: Mask) -> list[tuple[int, int]]:
+    """First row and the row after the last of every stretch of a mask [n]."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+
+
+def _intervals(recording: Recording, mask: Mask) -> list[tuple[float, float]]:
+    """Start and end of every stretch of a mask [n], s."""
+    time, step = recording.time_s, 1.0 / recording.rate_hz
+    return [(float(time[a]), float(time[b - 1]) + step) for a, b in _stretches(mask)]
+
+
+def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
+    """Rows [n] in which values [n], NaN where they are none, show that the sensor moved, and its motion. A gap is no
+    longer than those that matter."""
+    rate = recording.rate_hz
+    place: Rows | None = None
+    even = values
+    if recording.missing_before.any():
+        place = np.arange(values.size) + np.cumsum(np.minimum(recording.missing_before, math.ceil(GAP_MOST_S * rate)))
+        place -= place[0]
+        even = np.full(int(place[-1]) + 1, np.nan)
+        even[place] = values
+    found = loud(even, rate, lattice.step if lattice is not None else 0.0)
+    if found is None:
+        return np.zeros(values.size, bool), None
+    mask = np.zeros(even.size, bool)
+    for begin_s, end_s in found.intervals:
+        mask[round(begin_s * rate) : round(end_s * rate)] = True
+    mask = mask if place is None else mask[place]
+    return mask, replace(found, intervals=tuple(_intervals(recording, mask)))
+
+
+# ------------------------------------------------------------------------------------------------------ change of rate
+
+
+def evened(recording: Recording) -> tuple[Recording, tuple[RateChange, ...]]:
+    """The recording on one even grid, where its rate changes: means over an interval that all rates share."""
+    off = recording.off_grid_s
+    if off is None or off.size < 60:
+        return recording, ()
+    time = recording.time_s
+    time += off
+    found = rate_changes(time) or _small_change(time, recording)
+    if not found:
+        return recording, ()
+    rows = [one.row for one in found]
+    intervals = [found[0].before_s, *(one.after_s for one in found)]
+    return _regridded(recording, time, rows, intervals), tuple(
+        RateChange(float(time[one.row] - time[0]), 1.0 / one.before_s, 1.0 / one.after_s, one.nats) for one in found
+    )
+
+
+def _small_change(time: Array, recording: Recording) -> list[Change]:
+    """One change so small that the grid is known: the time stamps laid on it have a bend."""
+    off = recording.off_grid_s
+    assert off is not None
+    k = np.arange(off.size)
+    off = off - (off[0] + (off[-1] - off[0]) / k[-1] * k)
+    edge = max(10, off.size // 50)
+    at = edge + int(np.argmax(np.abs(off[edge:-edge])))
+    step = 1.0 / recording.rate_hz
+    bend = float(np.abs(off).max())
+    if bend < 3.0 * step:
+        return []
+    halves = (slice(None, at), slice(at, None))
+    lines = [np.polyfit(k[half], off[half], 1) for half in halves]
+    bent = np.concatenate([np.polyval(line, k[half]) for line, half in zip(lines, halves, strict=True)])
+    scatter = float((off - bent).std())
+    change = float(lines[1][0] - lines[0][0]) / step
+    if abs(change) < CLOCK_LEAST or bend < 5.0 * scatter:
+        return []
+    # Random times walk off any grid. The slopes of pieces show how far.
+    slopes = [np.diff(off[half][:: max(1, off[half].size // SLOPES)]) * SLOPES / off[half].size for half in halves]
+    if abs(change) * step < SLOPES_LEAST * math.hypot(*(float(one.std()) / math.sqrt(one.size) for one in slopes)):
+        return []
+    nats = min(1e6, 0.5 * (bend / max(scatter, 1e-3 * step)) ** 2)
+    return [Change(at, step + float(lines[0][0]), step + float(lines[1][0]), nats)]
+
+
+def _regridded(recording: Recording, time: Array, rows: Sequence[int], intervals: Sequence[float]) -> Recording:
+    """Means of whole blocks over an interval that all parts share; a block with a gap in it is missing. `rows`: where
+    each part but the first begins; `intervals` of every part, s."""
+    blocks = _common(intervals)
+    cell_s = float(np.dot(blocks, intervals)) / len(blocks)
+    sizes = []
+    first, last_s = 0, -math.inf
+    index = np.empty(time.size, np.int64)
+    for (begin, end), step, block in zip(pairwise([0, *rows, time.size]), intervals, blocks, strict=True):
+        here = time[begin:end]
+        if last_s > -math.inf and here[0] - last_s > cell_s + step:  # a gap at the change itself
+            sizes.append(np.zeros(round((here[0] - last_s) / cell_s), np.int64))
+            first += sizes[-1].size
+        gaps = np.rint(np.maximum(0.0, np.diff(here, prepend=here[0]) - 0.5 * step) / step).astype(np.int64)
+        gaps = np.where(gaps > 1, gaps - 1, 0)  # a late stamp is no gap
+        at = (np.arange(here.size) + np.cumsum(gaps)) // block
+        index[begin:end] = first + at
+        sizes.append(np.full(int(at[-1]) + 1, block))
+        first, last_s = first + sizes[-1].size, float(here[-1])
+    size = np.concatenate(sizes)
+    used = np.bincount(index, minlength=first)
+    whole = np.flatnonzero(used == size)
+    columns = {
+        name: column
+        if column.clock is not None
+        else Column(name, column.unit, np.bincount(index, column.values, minlength=first)[whole] / used[whole])
+        for name, column in recording.columns.items()
+    }
+    missing = np.diff(whole, prepend=-1) - 1
+    missing[0] = 0
+    rate = float(f"{1.0 / cell_s:.10g}")
+    moved = _with_moving(recording, np.searchsorted(index, whole), missing, time.size / first)
+    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
+
+
+def _with_moving(recording: Recording, rows: Rows, missing: Rows, ratio: float) -> dict[str, Any]:
+    """The samples left out for motion of a recording of fewer rows: these `rows` [m] of it, each of `ratio` of its own,
+    and `missing` [m] before each."""
+    if recording.moving_before is None:
+        return {}
+    total = np.cumsum(recording.moving_before)[rows]
+    moved = np.rint(np.diff(total, prepend=total[:1]) / ratio).astype(np.int64)
+    return {"moving_before": np.minimum(moved, missing), "moving": round(recording.moving / ratio)}
+
+
+def _common(intervals: Sequence[float]) -> tuple[int, ...]:
+    """Samples of each interval (s) that take the same time: the fewest, else those that fit best within COMMON_S."""
+    best, least, longest = (1,) * len(intervals), math.inf, max(*intervals, 1e-9)
+    for count in range(1, max(1, int(COMMON_S / longest)) + 1):
+        counts = tuple(max(1, round(count * longest / one)) for one in intervals)
+        off = max(abs(number * one / (count * longest) - 1.0) for number, one in zip(counts, intervals, strict=True))
+        if off < COMMON_OFF:
+            return counts
+        if off < least:
+            best, least = counts, off
+    return best
+
+
+# -------------------------------------------------------------------------------------------------------- held readings
+
+
+def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, Held | None]:
+    """The recording with each reading of the part once, where all of `axes` hold every reading for as long. Else the
+    recording as it is, and None."""
+    each = [_held(recording, (name,)) for name in axes]
+    if not axes or any(one is None for one in each):
+        return recording, None
+    ratios = [one.ratio for one in each if one is not None]
+    found = each[0] if len(axes) == 1 else _held(recording, axes)
+    if found is None or max(ratios) > 1.01 * min(ratios):
+        return recording, None
+    columns = {
+        name: one if one.clock is not None else Column(name, one.unit, one.values[found.rows])
+        for name, one in recording.columns.items()
+    }
+    rate, missing = recording.rate_hz / found.ratio, found.missing
+    moved = _with_moving(recording, found.rows, missing, found.ratio)
+    own = replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
+    return own, found
+
+
+def own_rows(recording: Recording, axis: str) -> Rows | None:
+    """The rows that hold a new reading of an axis, where it holds each for several rows; else None."""
+    found = _held(recording, (axis,))
+    return None if found is None else found.rows
+
+
+def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
+    off = recording.off_grid_s
+    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
+    values = [recording.columns[name].values for name in axes]
+    return held(values, at, None if off is None else off * recording.rate_hz)
+
+
+# ------------------------------------------------------------------------------------------------------- stuck readings
+
+
+def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, float]:
+    """Whole runs of equal readings [n] that are no chance, and the evidence in nats. `stated`: a length from which on a
+    run is stuck whatever the chance; 0: none.
+
+    The chance that a reading repeats is the largest of three: the noise stays within one cell of the lattice, the level
+    in its middle; the share of repeats; their share among readings after a repeat, since a dead band has more.
+    """
+    n = values.size
+    change = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    lengths = np.diff(change, append=n)
+    none = np.zeros(n, bool)
+    if lengths.max(initial=0) < 4:
+        return none, 0.0
+    inside = 0.0
+    if lattice is not None and math.isfinite(lattice.coarseness):
+        # A coarse lattice shows its noise only roughly: 0.7 of it is the least.
+        noise = math.sqrt(max(1.0 / lattice.coarseness**2 - 1.0 / 12.0, 0.01)) * (0.7 if lattice.too_coarse else 1.0)
+        inside = 2.0 * float(ndtr(0.5 / noise)) - 1.0
+    limit = n
+    chance = max(inside, 0.01)
+    for _ in range(4):
+        wanted = 1 + math.ceil((LN_STUCK - math.log(n)) / math.log(min(chance, 1.0 - 1e-12)))
+        if wanted == limit:
+            break
+        limit = wanted
+        short = lengths[lengths < limit]
+        repeats, twice = int((short - 1).sum()), int(np.maximum(short - 2, 0).sum())
+        chance = max(inside, (repeats + 0.5) / n, (twice + 0.5) / (repeats + 50.0), 0.01)
+    least = min(limit, stated) if stated > 0 else limit
+    stuck = lengths >= least
+    if not stuck.any():
+        return none, 0.0
+    frozen = values[change[stuck]]
+    again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
+    if again > 1 and 2 * int(lengths[stuck].sum()) > n:
+        return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
+    nats = float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
+    return np.repeat(stuck, lengths), min(1e6, max(nats, -LN_STUCK))
+
+
+# ----------------------------------------------------------------------------------------------------- clipped readings
+
+
+def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
+    """Readings [n] that pile up at their largest or smallest value: noise would go on beyond it, and none does.
+
+    The number expected beyond is the evidence, in nats (Poisson). Noise is normal about the mean of its neighbours.
+    """
+    rows = np.flatnonzero(np.isfinite(values))
+    y = values[rows]
+    if y.size < 4 * AROUND:
+        return None
+    half = 0.5 * lattice.step if lattice is not None else 0.0
+    edges = [(sign, float((sign * y).max())) for sign in (1, -1)]
+    at_edges = [sign * y >= edge - max(1e-9 * max(1.0, abs(edge)), 0.5 * half) for sign, edge in edges]
+    if all(at_edge.sum() < 3 for at_edge in at_edges):
+        return None
+    if lattice is not None and lattice.too_coarse:
+        found = {
+            sign * edge: (worth, rows[at_edge])
+            for (sign, edge), at_edge, worth in zip(edges, at_edges, _piled(y, lattice.step), strict=True)
+            if worth > PILED_LEAST and at_edge.sum() >= 3
+        }
+        masks = {edge: np.isin(np.arange(values.size), at) for edge, (_, at) in found.items()}
+        return Clipped(masks, sum(worth for worth, _ in found.values())) if found else None
+    size = 2 * AROUND + 1
+    level = (uniform_filter1d(y, size, mode="reflect") * size - y) / (size - 1)
+    # The level's own noise, 1 / (2 AROUND), is in the scatter, and a second time in the level.
+    variance = float((y - level).var()) * max(0.0, 1.0 - 2.0 / (size - 1))
+    deviation = math.sqrt(max(variance - half * half / 3.0, 0.01 * variance))  # before rounding
+    limits: dict[float, Mask] = {}
+    nats = 0.0
+    for (sign, edge), at_edge in zip(edges, at_edges, strict=True):
+        count = int(at_edge.sum())
+        if count < 3 or not deviation > 0.0:
+            continue
+        beyond = ndtr((sign * level - edge - half) / deviation)
+        expected = float(beyond.sum())
+        # Unclipped, the expectation beyond the largest reading is itself distributed as exp(-x): either side is a look.
+        worth = expected - math.log(2.0)
+        if half > 0.0:
+            # Clipped, a reading of the last code was of that code or beyond it. Some ten codes might be the last.
+            cell = ndtr((sign * level - edge + half) / deviation) - beyond
+            pile = float(np.log1p(beyond[at_edge] / np.maximum(cell[at_edge], 1e-300)).sum())
+            worth = max(worth, pile - math.log(20.0))
+        else:
+            # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
+            worth = max(worth, (count - 2) * math.log(100.0))
+        if worth < CLIPPED_LEAST or count < 0.5 * expected:
+            continue
+        mask = np.zeros(values.size, bool)
+        mask[rows[at_edge]] = True
+        limits[sign * edge] = mask
+        nats += worth + math.log(2.0)
+    return Clipped(limits, nats) if limits else None
+
+
+def _piled(y: Array, step: float) -> tuple[float, float]:
+    """Evidence, nats, that the last and the first code of readings [n] on a coarse lattice hold those beyond as well.
+
+    It is the likelihood of codes of rounded normal noise with a limit over that without. Each piece of the readings has
+    its best level, and the record its best noise.
+    """
+    code = np.rint((y - y.min()) / step).astype(np.int64)
+    many = int(code.max()) + 1
+    if not 3 <= many <= CODES_MOST:
+        return 0.0, 0.0
+    length = max(2 * AROUND, -(-y.size // PIECES))
+    pieces = y.size // length
+    place = np.repeat(np.arange(pieces), length) * many + code[: pieces * length]
+    count = np.bincount(place, minlength=pieces * many).reshape(pieces, many).astype(np.float64)
+    level = np.arange(-2.0, many + 1.0, 0.05)
+    ends = np.arange(many + 1)[:, None] - 0.5 - level
+    best = np.full(3, -math.inf)
+    for sigma in np.geomspace(0.1, 2.0, 40):
+        below, above = ndtr(ends / sigma), ndtr(-ends / sigma)
+        # The smaller tail keeps its digits.
+        chance = np.where(ends[:-1] > 0.0, above[:-1] - above[1:], below[1:] - below[:-1])
+        for k, last in enumerate((None, many - 1, 0)):
+            here = chance.copy()
+            if last is not None:
+                here[last] = above[last] if last else below[1]
+            best[k] = max(best[k], float((count @ np.log(here + 1e-12)).max(axis=1).sum()))
+    return float(best[1] - best[0]), float(best[2] - best[0])
+
+
+def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:
+    """Readings [n] to average in place of clipped ones, NaN for those left out: means of them have the level and the
+    spread that unclipped readings would have, and as many are left as the clipped record has information. And the
+    readings [n] with each clipped one drawn anew.
+
+    A clipped reading shows that the true one lies beyond the limit (Tobit's model). To first order in the level the
+    scores of the readings hold all that the record shows of it. EM finds the level and the noise to take them at. With
+    the noise as the unit a score has the variance I, the information of a reading. So the scores of 1 / I readings have
+    a sum of variance 1, as the deviation of one unclipped reading has.
+    """
+    rows = np.flatnonzero(np.isfinite(values))
+    y = values[rows]
+    half = 0.5 * lattice.step if lattice is not None else 0.0
+    # A limit at or below the middle of the readings is a lower one.
+    middle = 0.5 * (float(y.max()) + float(y.min()))
+    upper = [limit for limit in clipped.limits if limit > middle]
+    lower = [limit for limit in clipped.limits if limit <= middle]
+    at_upper = clipped.limits[upper[0]][rows] if upper else np.zeros(y.size, bool)
+    at_lower = clipped.limits[lower[0]][rows] if lower else np.zeros(y.size, bool)
+    high = upper[0] - half if upper else math.inf
+    low = lower[0] + half if lower else -math.inf
+    window = _quiet_window(y)
+    level = np.full(y.size, float(y.mean())) if window >= y.size else uniform_filter1d(y, window, mode="nearest")
+    sigma = float((y - level).std())
+    score, information = y, y
+    for _ in range(ITERATIONS):
+        up = np.clip((high - level) / sigma, -4.0, None)
+        down = np.clip((low - level) / sigma, None, 4.0)
+        score, second, information = _tobit((y - level) / sigma, up, down, at_upper, at_lower)
+        known = np.maximum(_smooth(information, window), INFORMATION_LEAST)
+        level = _smooth(information * level + sigma * score, window) / known
+        level = np.clip(level, low - 4.0 * sigma, high + 4.0 * sigma)
+        before, sigma = sigma, sigma * math.sqrt(float(second.mean()))
+        if abs(sigma / before - 1.0) < SETTLED:
+            break
+    score = np.where(information < INFORMATION_LEAST, 0.0, score)
+    total = np.cumsum(np.where(information < INFORMATION_LEAST, 0.0, information))
+    last = np.flatnonzero(np.floor(total) > np.floor(np.concatenate([[0.0], total[:-1]])))
+    sums = np.diff(np.concatenate([[0.0], np.cumsum(score)[last]]))
+    working = np.full(values.size, np.nan)
+    working[rows[last]] = level[last] + sigma * sums
+    drawn = values.copy()
+    random = np.random.default_rng(1)
+    for mask, sign, edge in ((at_upper, 1.0, high), (at_lower, -1.0, low)):
+        # The tail of the normal beyond the limit, by its inverse.
+        least = sign * (edge - level[mask]) / sigma
+        ln_p = log_ndtr(-least) + np.log(1.0 - random.random(int(mask.sum())))
+        drawn[rows[mask]] = level[mask] - sign * sigma * ndtri_exp(ln_p)
+    return working, drawn
+
+
+def _tobit(u: Array, up: Array, down: Array, at_upper: Mask, at_lower: Mask) -> tuple[Array, Array, Array]:
+    """Of readings `u` about their level in units of the noise, with limits `up` and `down`: the score of the level, the
+    expected square, and the expected information of a reading; [n] each."""
+
+    def density(z: Array) -> Array:
+        found: Array = np.exp(-0.5 * np.minimum(z * z, 1400.0)) / math.sqrt(2.0 * math.pi)
+        return found
+
+    def product(z: Array, value: Array) -> Array:
+        found: Array = np.where(np.isfinite(z), np.where(np.isfinite(z), z, 0.0) * value, 0.0)
+        return found
+
+    def tail(z: Array) -> Array:
+        """Density over the probability beyond, of `z` upwards; 0 where there is no limit."""
+        here = np.where(np.isfinite(z), np.minimum(z, 37.0), 0.0)
+        return np.where(np.isfinite(z), density(here) / ndtr(-here), 0.0)
+
+    p, q = density(up), density(down)
+    above, below = tail(up), tail(-down)
+    score = np.where(at_upper, above, np.where(at_lower, -below, u))
+    second = np.where(at_upper, 1.0 + product(up, above), np.where(at_lower, 1.0 - product(down, below), u * u))
+    information = ndtr(up) - ndtr(down) - product(up, p) + product(down, q) + p * above + q * below
+    return score, second, information
+
+
+def _smooth(values: Array, window: int) -> Array:
+    if window >= values.size:
+        return np.full(values.size, float(values.mean()))
+    found: Array = uniform_filter1d(values, window, mode="nearest")
+    return found
+
+
+def _quiet_window(y: Array) -> int:
+    """Readings over which the mean of a record [n] is quietest: the averaging length of the least Allan variance. It is
+    all of them where the longest that the record shows is the best."""
+    best, least, length = 2 * AROUND, math.inf, 2 * AROUND
+    means = y[: y.size // length * length].reshape(-1, length).mean(axis=1)
+    while means.size >= 8:
+        variance = 0.5 * float((np.diff(means) ** 2).mean())
+        if variance < least:
+            best, least = length, variance
+        means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
+        length *= 2
+    return y.size if 2 * best >= length else best

@@ -1,0 +1,316 @@
+"""The table of `identify` and `replay`: what a person reads of the document `selfcal.identify/1`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from selfcal.adequacy.document import as_typed
+from selfcal.adequacy.summary import MOST_REST
+from selfcal.base import units
+from selfcal.base.errors import called, printable
+from selfcal.batch.verdicts import duration_words
+from selfcal.model.laws import RATIOS
+from selfcal.readings.priors import OF_RECORD
+
+#: The table never folds its numbers: a narrower terminal wraps its lines.
+TABLE_WIDTH = 140
+#: Laws of smaller probability are not spoken of where the grid does not bear them.
+TOLD_OF = 0.01
+#: Stretches of motion that are listed at most.
+TIMES_MOST = 4
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False) -> None:
+    """The tables a person reads: per axis the numbers of a data sheet; then the laws, their probabilities and
+    parameters, and the bias.
+
+    They go to stderr where stdout is the JSON's. `datasheet`: the laws' numbers in the units of data sheets. In a
+    terminal that is too narrow columns lose their intervals: those of the data sheets' units, then the recording's; of
+    the laws that of 1/alpha, then N's, then K's.
+    """
+    console = Console(stderr=to_stderr)
+    recording = document["recording"]
+    title = (
+        f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        f"{recording['duration_s']:g} s{since(recording)}"
+    )
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    numbered = {name: axis for name, axis in axes.items() if axis.get("summary")}
+    summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
+    choices = [_law_table(document, left_out, datasheet) for left_out in range(4)]
+    laws = _fitting(console, [table for table, _ in choices])
+    notes = choices[0][1]
+    first = summary if numbered else laws
+    first.title, first.title_justify = title, "left"
+    if not console.is_terminal:
+        console.width = max(console.width, TABLE_WIDTH)
+    if numbered:
+        console.print(summary)
+    console.print(laws)
+    if any("regressors" in axis for axis in axes.values()):
+        console.print(_regressor_table(axes))
+    for line in notes:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def _fitting(console: Console, tables: Sequence[Table]) -> Table:
+    """The first of `tables` that the terminal is wide enough for, else the last; the first where there is none."""
+    if not console.is_terminal:
+        return tables[0]
+    wide = console.options.update(width=10 * TABLE_WIDTH)
+    fitting = (one for one in tables if console.measure(one, options=wide).maximum <= console.width)
+    return next(fitting, tables[-1])
+
+
+#: Names of the numbers of summary.py, of an angular rate, of an acceleration, and of anything else.
+_NUMBERS = {
+    "arw": ("ARW", "VRW", "white noise"),
+    "rrw": ("RRW", "RRW", "random walk"),
+    "bias_instability": ("bias instability",) * 3,
+    "quantization_noise": ("quantization noise",) * 3,
+}
+
+
+def _summary_table(axes: Mapping[str, Any], left_out: int) -> Table:
+    """The numbers of a data sheet; without the intervals of the last `left_out` columns."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=left_out == 0, collapse_padding=left_out > 0)
+    for heading in ("axis", "", "in the recording's units", "as in data sheets"):
+        table.add_column(heading, no_wrap=True)
+    for name, axis in axes.items():
+        unit = axis["bias_now"]["unit"]
+        kind = next((k for k, of in enumerate(("rad/s", "m/s^2")) if units.same_kind(unit, of)), 2)
+        for key, number in axis["summary"].items():
+            table.add_row(
+                name if key == "arw" else "",
+                _NUMBERS[key][kind],
+                _number(number, number, brief=left_out > 1),
+                _number(number["datasheet"], number, brief=left_out > 0) if kind < 2 else "-",
+                end_section=key == list(axis["summary"])[-1],
+            )
+    return table
+
+
+def _number(spread: Mapping[str, Any], number: Mapping[str, Any], *, brief: bool) -> str:
+    """Median and interval, or the upper limit of a number that is not identified."""
+    unit = units.typeset(spread["unit"])
+    if not number["identified"]:
+        return f"< {spread['q95']:.3g} {unit}, not identified"
+    interval = "" if brief else f" \\[{spread['q05']:.3g}, {spread['q95']:.3g}]"
+    return f"{spread['median']:.3g}{interval} {unit}"
+
+
+def _unidentified(axes: Mapping[str, Any]) -> list[str]:
+    """Why numbers of the summary are not identified, a line a reason."""
+    found: dict[tuple[str, str], list[str]] = {}
+    for name, axis in axes.items():
+        for key, number in (axis.get("summary") or {}).items():
+            if not number["identified"]:
+                found.setdefault((_NUMBERS[key][0], number["reason"]), []).append(name)
+    lines = [f"{what} not identified: {', '.join(names)}: {reason}" for (what, reason), names in found.items()]
+    for name, axis in axes.items():
+        for parameter, rest_s in axis.get("halved_after_s", {}).items():
+            times = f"not even {MOST_REST:g} times this rest halves"
+            how = times if rest_s is None else f"another {duration_words(rest_s)} would about halve"
+            lines.append(f"{name}: {how} the interval of {parameter}")
+    return lines
+
+
+def since(recording: Mapping[str, Any]) -> str:
+    """Where a stretch of a recording begins, for its heading."""
+    start_s = recording.get("start_s", 0.0)
+    return f" from {start_s:g} s on" if start_s else ""
+
+
+def _why(check: str, outcome: Mapping[str, Any], unit: str) -> str:
+    """What a failed check of an axis in `unit` shows, and what helps."""
+    value = outcome["value"]
+    match check:
+        case "lattice":
+            step = f"{outcome['distinct']} distinct readings {outcome['step']:.3g} {unit} apart"
+            return f"lattice: {step}: noise is below that, N includes the rounding, the bias may stick"
+        case "drift_in_average":
+            share = f"the drift hides {100.0 * value:.0f} % of the white noise"
+            return f"drift_in_average: {share}: average less, with a higher --decimate"
+        case "batch":
+            return f"{value:.1f} sd from the batch of the model's priors: identify it with the model without that batch"
+        case "outliers":
+            share = f"{100.0 * value:.2g} % of the readings are {outcome['at']:.6g} {unit}"
+            return f"outliers: {share}, too many for noise: lost words of the bus?"
+        case "held_samples":
+            share = f"{100.0 * value:.2g} % of the rows repeat the one before at no fixed rate"
+            return f"held_samples: {share}: log at the sensor's own rate"
+        case "motion":
+            times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in outcome["intervals"][:TIMES_MOST])
+            more = len(outcome["intervals"]) - TIMES_MOST
+            return f"motion, left out: {times}{f' and {more} more' if more > 0 else ''}"
+        case "channel":
+            told = f"{outcome['column']} ({outcome['form']}) explains {value:.0f} nats of it"
+            return f"channel: {told}: N, K and the bias include that"
+        case "turn_on":
+            told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {value:.0f} nats"
+            return f"turn_on: {told}: K includes that"
+        case "jump":
+            return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {value:.0f} nats: K includes that"
+    return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
+
+
+def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> tuple[Table, list[str]]:
+    """The table without the intervals of its last `left_out` columns, and the lines below it."""
+    recording = document["recording"]
+    brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        collapse_padding=left_out > 0,
+        pad_edge=left_out == 0,
+        caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
+        "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
+        caption_justify="left",
+    )
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    known = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
+    drift = "K or sigma_m" if "B" not in known else "K, sigma_m or B"
+    second = "1/alpha, s" + (", or ratio" if known & set(RATIOS) else "")
+    for heading in ("law", "P", "N", drift, second):
+        table.add_column(heading, no_wrap=True)
+    without: dict[str, list[str]] = {}
+    for name, axis in document["axes"].items():
+        if name not in axes:
+            without.setdefault(axis["error"], []).append(name)
+    failed = [f"no result: {', '.join(names)}: {error}; choose axes with --axis" for error, names in without.items()]
+    outside = [name for name, axis in axes.items() if axis.get("priors") == OF_RECORD]
+    kept = [f"priors: {', '.join(outside)}: from this record, which lies outside the model's"] if outside else []
+    for name, axis in axes.items():
+        best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
+        bias = axis["bias_now"]
+        level = f"bias {bias['mean']:.6g} ± {bias['sd']:.2g}"
+        heading = f"{name} \\[{bias['unit']}]"
+        if datasheet:
+            unit = units.datasheet_unit("bias", bias["unit"])
+            factor = units.factor(bias["unit"], unit)
+            level = f"bias {bias['mean'] * factor:.6g} ± {bias['sd'] * factor:.2g} {units.typeset(unit)}"
+            heading = name
+        level, _, spread = level.partition(" ±") if brief["N"] else (level, "", "")
+        table.add_row(heading, "", level, f"±{spread}" if spread else "", "", style="cyan")
+        for law, probability in axis["hypotheses"].items():
+            parameters = axis["parameters"][law]
+            table.add_row(
+                law,
+                f"{probability:.4f}",
+                _interval(parameters, ("N",), datasheet=bias["unit"] if datasheet else "", brief=brief["N"]),
+                _interval(
+                    parameters, ("K", "sigma_m", "B"), datasheet=bias["unit"] if datasheet else "", brief=brief["K"]
+                ),
+                _interval(parameters, ("alpha",), inverse=True, brief=brief["alpha"])
+                or _interval(parameters, RATIOS, brief=brief["alpha"]),
+                style="bold" if law == best else None,
+                end_section=law == list(axis["hypotheses"])[-1],
+            )
+        coarse = [
+            law
+            for law, parameters in axis["parameters"].items()
+            if axis["hypotheses"][law] >= TOLD_OF and any(e["off_grid"] for e in parameters.values())
+        ]
+        if coarse:
+            failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
+        counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
+        if counts:
+            kept.append(f"kept out: {name}: {', '.join(counts)}")
+        failed += [
+            f"not adequate: {name}: {_why(check, outcome, bias['unit'])}"
+            for check, outcome in axis["checks"].items()
+            if not outcome["passed"] and not check.startswith("allan_")
+        ]
+        off = [
+            f"{check.removeprefix('allan_')} {100.0 * outcome['value']:+.0f} %"
+            for check, outcome in axis["checks"].items()
+            if not outcome["passed"] and check.startswith("allan_")
+        ]
+        if off:  # allan_16s model -9 %, 128s +22 %: the model's deviation over the recording's
+            failed.append(f"not adequate: {name}: allan_{', '.join(off).replace(' ', ' model ', 1)}")
+    for said, chosen in (("identified with", True), ("strongest suspicion", False)):
+        suspected = [
+            f"{name}: {axis['suspicion'].replace('_', ' ')}"
+            for name, axis in axes.items()
+            if "suspicion" in axis and ("added_law" in axis) is chosen
+        ]
+        if suspected:
+            failed.append(f"{said}: {'; '.join(suspected)}")
+    for name, axis in axes.items():
+        if "more_laws" in axis:
+            laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]
+            told = ", ".join(f"{law} {P:.2g}" for law, P in laws)
+            failed.append(f"with the laws of sums.yaml: {name}: {told}")
+    if any(line.startswith("not adequate") for line in failed):
+        failed.append(f"why, and what mends it: {called()} diagnose {as_typed(recording)}")
+    return table, [*kept, *_unidentified(axes), *_ahead(axes), *failed]
+
+
+def _ahead(axes: Mapping[str, Any]) -> list[str]:
+    """What the module's calibration is worth some time after a report, of `replay`."""
+    told = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
+    return [
+        f"corrected output {one['horizon_s']:g} s after a report: {name}: rms error {one['rmse']:.3g} {one['unit']} "
+        f"({one['reports']} reports, means of {one['mean_s']:g} s)"
+        for name, one in told.items()
+    ]
+
+
+def _regressor_table(axes: Mapping[str, Any]) -> Table:
+    table = Table(
+        box=box.SIMPLE_HEAD,
+        caption="coefficients if in use: medians [5 %, 95 %]; the laws' parameters are those of each law's best subset",
+        caption_justify="left",
+    )
+    for heading in ("axis", "regressor", "P(in use)", "coefficient", "unit"):
+        table.add_column(heading, no_wrap=True)
+    for name, axis in axes.items():
+        entries = list(axis.get("regressors", {}).items())
+        for regressor, entry in entries:
+            for column, c in entry["coefficients"].items():
+                table.add_row(
+                    name,
+                    column,
+                    f"{entry['probability']:.4f}",
+                    "-" if not math.isfinite(c["median"]) else f"{c['median']:.4g} \\[{c['q05']:.4g}, {c['q95']:.4g}]",
+                    c["unit"],
+                    style="bold" if regressor in axis["regressors_in_use"] else None,
+                    end_section=regressor == entries[-1][0] and column == list(entry["coefficients"])[-1],
+                )
+    return table
+
+
+def _interval(
+    parameters: Mapping[str, Any],
+    names: Sequence[str],
+    *,
+    inverse: bool = False,
+    datasheet: str = "",
+    brief: bool = False,
+) -> str:
+    """Median and interval of the one of `names` that a law has, `brief` without the interval; `datasheet`: unit of the
+    axis, to be turned into that of data sheets."""
+    name = next((name for name in names if name in parameters), None)
+    if name is None:
+        return ""
+    estimate = parameters[name]
+    low, middle, high = estimate["q05"], estimate["median"], estimate["q95"]
+    if not math.isfinite(middle):
+        return "-"
+    if inverse:
+        low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
+    unit = ""
+    if datasheet:
+        to = units.datasheet_unit(name, datasheet)
+        factor = units.factor(estimate["unit"], to)
+        low, middle, high, unit = low * factor, middle * factor, high * factor, f" {units.typeset(to)}"
+    mark = "" if estimate["identified"] else "~"
+    if brief:
+        return f"{mark}{middle:.3g}{unit}"
+    return f"{mark}{middle:.3g} \\[{low:.3g}, {high:.3g}]{unit}"

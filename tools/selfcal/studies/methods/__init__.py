@@ -1,0 +1,64 @@
+"""Other ways to identify the same record, each in a module of its own, and the table that names them all.
+
+A rival is a function of a `Problem`. It returns an `Answer`. No rival sees the truth, and none is tuned to it.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+
+from selfcal.base.errors import install
+from selfcal.studies.methods.problem import Answer, Problem
+
+
+@dataclass(frozen=True)
+class Rival:
+    """`function` of `module` (in this package). `package`: what it needs beyond selfcal's own dependencies."""
+
+    name: str
+    title: str
+    module: str
+    function: str
+    package: str = ""
+
+    def load(self) -> Callable[[Problem], Answer]:
+        """The function. Its import is not part of the time that is measured."""
+        found: Callable[[Problem], Answer] = getattr(
+            import_module(f"selfcal.studies.methods.{self.module}"), self.function
+        )
+        return found
+
+    @property
+    def missing(self) -> str:
+        """Why it cannot run here, with the next step; empty if it can."""
+        if not self.package or importlib.util.find_spec(self.package) is not None:
+            return ""
+        return f"{self.package} is not installed: {install(self.package)}"
+
+
+RIVALS = {
+    rival.name: rival
+    for rival in (
+        Rival("library", "selfcal, the library", "library", "library"),
+        Rival("grid", "the bank on a dense grid, own", "grid", "grid"),
+        Rival("allan_slopes", "Allan deviation, slopes read", "allan", "slopes"),
+        Rival("allan_fit", "Allan deviation, weighted fit", "allan", "fit"),
+        Rival("gmwm", "wavelet moments (GMWM)", "wavelets", "gmwm"),
+        Rival("autocorrelation", "autocorrelation fit", "autocorrelation", "autocorrelation"),
+        Rival("whittle", "spectrum (Whittle) fit", "whittle", "whittle"),
+        Rival("ml", "maximum likelihood, statsmodels", "likelihood", "maximum_likelihood", "statsmodels"),
+        Rival("steady_state", "steady-state Kalman likelihood", "steady_state", "steady_state"),
+        Rival("arma", "ARMA prediction error, statsmodels", "prediction_error", "arma", "statsmodels"),
+        Rival("rls", "recursive least squares, ARMA form", "recursive", "recursive_least_squares"),
+        Rival("subspace", "subspace, stochastic realization", "subspace", "subspace", "statsmodels"),
+        Rival("ekf", "joint EKF, filterpy", "joint_filters", "ekf", "filterpy"),
+        Rival("ukf", "joint UKF, filterpy", "joint_filters", "ukf", "filterpy"),
+        Rival("dual_ekf", "dual EKF", "dual", "dual_ekf"),
+        Rival("particles", "bootstrap particle filter", "particles", "particles"),
+        Rival("rbpf", "Rao-Blackwellised particle filter", "rao_blackwell", "rao_blackwell"),
+        Rival("mmae", "multiple models (MMAE), filterpy", "multiple_model", "mmae", "filterpy"),
+    )
+}

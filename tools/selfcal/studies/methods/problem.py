@@ -1,0 +1,189 @@
+"""What every rival gets and gives, and the search that several of them share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize
+
+from selfcal.adequacy.allan import Terms, overlapping, terms_of
+from selfcal.bank.result import HALF_90
+from selfcal.model.file import Group, Prior
+from selfcal.model.laws import NAMED
+
+Floats = NDArray[np.float64]
+
+#: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
+REACH = 1e5
+#: Step of a derivative, in the logarithm of a parameter: a tenth of the least posterior sd at 3000 samples.
+STEP = 1e-3
+#: A Kalman filter with a level begins at the first reading, with an sd of this many times the record's.
+LEVEL_SD = 10.0
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Bank samples `y` [n] every `dt_s`, without a gap, in the group's unit. The priors are those of `group`; a rival
+    without priors does not look at them."""
+
+    y: Floats
+    dt_s: float
+    group: Group
+    laws: tuple[str, ...]
+
+    @property
+    def drifts(self) -> tuple[str, ...]:
+        """The laws with a drift."""
+        return tuple(law for law in self.laws if law != "constant")
+
+    def terms(self, law: str, ln_theta: Floats) -> Terms:
+        """The law at the logarithms of its parameters."""
+        theta = dict(zip(NAMED[law].parameters, np.exp(ln_theta).tolist(), strict=True))
+        return terms_of(NAMED[law], theta, self.dt_s)
+
+    def starts(self, law: str) -> list[Floats]:
+        """Where a search begins: moments of the record, and for Gauss-Markov three correlation times."""
+        n, dt = self.y.size, self.dt_s
+        white = max(float(np.diff(self.y).std()) / math.sqrt(2.0), 1e-12 * float(np.abs(self.y).max()), 1e-30)
+        N = white * math.sqrt(dt)
+        if law == "constant":
+            return [np.log([N])]
+        m = max(2, n // 10)
+        long = math.sqrt(max(overlapping(self.y, m)[0] - white**2 / m, 0.01 * white**2))
+        if law == "random_walk":
+            return [np.log([N, long * math.sqrt(3.0 / (m * dt))])]
+        return [np.log([N, long, 1.0 / (part * n * dt)]) for part in (0.2, 0.03, 0.005)]
+
+
+@dataclass(frozen=True)
+class Value:
+    """An estimate with the 90 % interval that the method states; NaN where it states none."""
+
+    value: float
+    q05: float = math.nan
+    q95: float = math.nan
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Estimates by law and parameter. `weights`: by criterion, the probability or weight of each law."""
+
+    estimates: Mapping[str, Mapping[str, Value]]
+    weights: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A maximum of an objective: its place in ln parameters, the value, and the inverse of the curvature there."""
+
+    at: Floats
+    value: float
+    covariance: Floats
+
+    def values(self, law: str) -> dict[str, Value]:
+        """Estimates with the interval of a normal distribution in the logarithm."""
+        return logarithmic(NAMED[law].parameters, self.at, self.covariance)
+
+
+def logarithmic(names: Sequence[str], ln_value: Floats, covariance: Floats) -> dict[str, Value]:
+    """Estimates from logarithms and their covariance. A variance that is not positive gives no interval."""
+    found = {}
+    for k, name in enumerate(names):
+        variance = float(covariance[k, k])
+        half = HALF_90 * math.sqrt(variance) if variance > 0.0 else math.nan
+        ln = float(ln_value[k])
+        found[name] = Value(_exp(ln), _exp(ln - half), _exp(ln + half))
+    return found
+
+
+def weighted(names: Sequence[str], ln_theta: Floats, weight: Floats) -> dict[str, Value]:
+    """Weighted medians with 5 % and 95 % points of ln parameters [d, m]; `weight` [m] sums to 1."""
+    found = {}
+    for name, column in zip(names, ln_theta, strict=True):
+        values, place = np.unique(column, return_inverse=True)
+        mass = np.bincount(place, weight)
+        found[name] = Value(*np.exp(np.interp([0.5, 0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)).tolist())
+    return found
+
+
+def ln_moments(prior: Prior) -> tuple[float, float]:
+    """Mean and sd of a parameter's logarithm between the limits of its prior."""
+    return math.log(prior.median), prior.ln_sd
+
+
+def root(square: float) -> Value:
+    """NaN of a negative square: the method has no answer then."""
+    return Value(math.sqrt(float(square)) if square > 0.0 else math.nan)
+
+
+def _exp(ln: float) -> float:
+    return math.exp(ln) if ln < 700.0 else math.inf
+
+
+def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> Peak:
+    """The highest of the local maxima that the search finds from `starts`, by L-BFGS with numerical derivatives."""
+    best: tuple[float, Floats] | None = None
+    reach = math.log(REACH)
+    for start in starts:
+        bounds = [(value - reach, value + reach) for value in start]
+        with np.errstate(all="ignore"):
+            found = optimize.minimize(lambda at: -_finite(objective(at)), start, method="L-BFGS-B", bounds=bounds)
+        if best is None or -found.fun > best[0]:
+            best = (-float(found.fun), np.asarray(found.x))
+    assert best is not None
+    with np.errstate(all="ignore"):
+        curvature = -hessian(objective, best[1])
+    return Peak(best[1], best[0], inverse(curvature))
+
+
+def hessian(objective: Callable[[Floats], float], at: Floats) -> Floats:
+    """Second derivatives by central differences."""
+    d = at.size
+    step = np.eye(d) * STEP * 10.0
+    found = np.empty((d, d))
+    for i in range(d):
+        for j in range(i, d):
+            values = [
+                objective(at + a * step[i] + b * step[j])
+                for a, b in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
+            ]
+            found[i, j] = found[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * (STEP * 10.0) ** 2)
+    return found
+
+
+def inverse(information: Floats) -> Floats:
+    """The inverse of a positive definite matrix; NaN if it is none: the record does not determine the parameters."""
+    try:
+        np.linalg.cholesky(information)
+    except np.linalg.LinAlgError:
+        return np.full_like(information, math.nan)
+    return np.asarray(np.linalg.inv(information))
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else -1e300
+
+
+def weights(criterion: Mapping[str, float]) -> dict[str, float]:
+    """Akaike weights: e^(-criterion/2), normalised. A law whose criterion is not finite has none."""
+    finite = {law: value for law, value in criterion.items() if math.isfinite(value)}
+    least = min(finite.values(), default=0.0)
+    raw = {law: math.exp(-0.5 * (finite[law] - least)) if law in finite else 0.0 for law in criterion}
+    total = sum(raw.values())
+    return {law: value / total if total else math.nan for law, value in raw.items()}
+
+
+def probabilities(ln_evidence: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """Equally likely laws weighed by Bayes' rule."""
+    return {"Bayes": weights({law: -2.0 * value for law, value in ln_evidence.items()})}
+
+
+def information_criteria(ln_likelihood: Mapping[str, float], n: int) -> dict[str, dict[str, float]]:
+    """AIC and BIC weights of laws from their greatest ln likelihoods over the same `n` samples."""
+    aic = {law: 2.0 * len(NAMED[law].parameters) - 2.0 * value for law, value in ln_likelihood.items()}
+    bic = {law: math.log(n) * len(NAMED[law].parameters) - 2.0 * value for law, value in ln_likelihood.items()}
+    return {"AIC": weights(aic), "BIC": weights(bic)}

@@ -1,0 +1,44 @@
+"""The Kalman filter's likelihood with the steady-state gain from the first sample on (Ye, Bar-Shalom et al., IEEE
+Sensors J. 24(24), 2024; own derivation). One recursion a parameter value, the scale in closed form."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+
+import numpy as np
+from scipy import signal
+
+from selfcal.studies.methods.problem import Answer, Floats, Peak, Problem, maximum
+
+
+def steady_state(problem: Problem) -> Answer:
+    """Estimates with intervals from the curvature. The method gives no weights of laws."""
+    peaks: dict[str, Peak] = {}
+    for law in problem.laws:
+        peaks[law] = maximum(partial(ln_likelihood, problem, law), problem.starts(law))
+    return Answer({law: peak.values(law) for law, peak in peaks.items()})
+
+
+def ln_likelihood(problem: Problem, law: str, ln_theta: Floats) -> float:
+    """Of all samples but the first, or about the best constant where the law has a mean."""
+    y, dt = problem.y, problem.dt_s
+    theta = np.exp(ln_theta)
+    r = theta[0] ** 2 / dt
+    if law == "random_walk":
+        q = theta[1] ** 2 * dt
+        p = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
+        g = p / (p + r)
+        e = signal.lfilter([1.0], [1.0, -(1.0 - g)], np.diff(y))
+        return float(-0.5 * e.size * math.log(p + r) - 0.5 * (e @ e) / (p + r))
+    phi, q = 0.0, 0.0
+    if law == "gauss_markov":
+        phi = math.exp(-theta[2] * dt)
+        q = theta[1] ** 2 * -math.expm1(-2.0 * theta[2] * dt)
+    b = (1.0 - phi * phi) * r - q
+    p = 0.5 * (-b + math.sqrt(b * b + 4.0 * q * r))
+    g = p / (p + r)
+    whitened = signal.lfilter([1.0, -phi], [1.0, -phi * (1.0 - g)], np.stack([y - y.mean(), np.ones(y.size)]), axis=1)
+    e, u = whitened
+    square = float(e @ e - (e @ u) ** 2 / (u @ u))
+    return float(-0.5 * y.size * math.log(p + r) - 0.5 * square / (p + r))

@@ -1,0 +1,65 @@
+"""The generalised method of wavelet moments (Guerrier et al., JASA 108, 2013), own and short.
+
+The Haar wavelet variance at scale 2m is half the Allan variance at m readings. The fit weighs the differences between
+the record's variances and the law's. First the weights are the record's own, scale by scale, then the inverse of the
+covariance that the first fit implies. The interval is that of the second step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+
+import numpy as np
+
+from selfcal.adequacy.allan import Terms, overlapping
+from selfcal.model.laws import NAMED
+from selfcal.studies.methods.allan import WINDOWS
+from selfcal.studies.methods.problem import STEP, Answer, Floats, Problem, Value, inverse, logarithmic, maximum
+
+#: Weights of a second difference of sums over m readings.
+_SECOND = ((0, 1.0), (1, -2.0), (2, 1.0))
+
+
+def covariance(terms: Terms, m: Floats, n: int) -> Floats:
+    """Of the overlapping Allan variances [t, t] at `m` readings of a normal record of `n`: twice the sum of the squared
+    covariances of the differences behind them."""
+    found = np.empty((m.size, m.size))
+    for i, a in enumerate(m.tolist()):
+        for k, b in enumerate(m.tolist()[: i + 1]):
+            first, second = n - 2 * int(a) + 1, n - 2 * int(b) + 1
+            lag = np.arange(-(first - 1), second, dtype=float)
+            cross = sum(p * q * terms.sums(lag + (v * b - u * a)) for u, p in _SECOND for v, q in _SECOND) / (a * b)
+            pairs = np.minimum(np.minimum(lag + first, second - lag), min(first, second))
+            found[i, k] = found[k, i] = 0.5 * float((pairs * cross**2).sum()) / (first * second)
+    return found
+
+
+def gmwm(problem: Problem) -> Answer:
+    """Estimates by law. The method gives no weights of laws without a bootstrap, so none are stated."""
+    y = problem.y - problem.y.mean()
+    m = 2.0 ** np.arange(max(1, math.floor(math.log2(max(2, y.size // WINDOWS))) + 1), dtype=np.float64)
+    variance = np.array([overlapping(y, int(length))[0] for length in m.tolist()])
+    own = np.diag(y.size / (2.0 * m * variance**2))
+    found: dict[str, dict[str, Value]] = {}
+    for law in problem.laws:
+        if m.size < len(NAMED[law].parameters):
+            continue
+
+        def model(ln_theta: Floats, law: str = law) -> Floats:
+            return problem.terms(law, ln_theta).allan_variance(m)
+
+        def objective(weight: Floats, ln_theta: Floats, model: Callable[[Floats], Floats] = model) -> float:
+            off = variance - model(ln_theta)
+            return -0.5 * float(off @ weight @ off)
+
+        first = maximum(partial(objective, own), problem.starts(law))
+        weight = inverse(covariance(problem.terms(law, first.at), m, y.size))
+        if not np.isfinite(weight).all():
+            found[law] = {name: Value(value.value) for name, value in first.values(law).items()}
+            continue
+        at = maximum(partial(objective, weight), [first.at]).at
+        jacobian = np.array([(model(at + s) - model(at - s)) / (2.0 * STEP) for s in np.eye(at.size) * STEP])
+        found[law] = logarithmic(NAMED[law].parameters, at, inverse(jacobian @ weight @ jacobian.T))
+    return Answer(found)

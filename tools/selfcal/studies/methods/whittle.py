@@ -1,0 +1,32 @@
+"""Whittle's likelihood on the cosine spectrum.
+
+The cosine transform (DCT-II) of white noise and of a random walk has independent coefficients, so for these laws the
+likelihood without the bias is exact. For Gauss-Markov it is Whittle's approximation. Coefficient k stands for the
+frequency pi k / n a reading. Coefficient 0 holds the bias and is left out.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy import fft
+
+from selfcal.studies.methods.problem import Answer, Floats, Problem, information_criteria, maximum
+
+
+def whittle(problem: Problem) -> Answer:
+    """Maximum of Whittle's likelihood, intervals from its curvature, laws by AIC and BIC."""
+    n = problem.y.size
+    power = fft.dct(problem.y - problem.y.mean(), norm="ortho")[1:] ** 2
+    omega = math.pi * np.arange(1, n) / n
+    peaks = {}
+    for law in problem.laws:
+
+        def objective(ln_theta: Floats, law: str = law) -> float:
+            spectrum = problem.terms(law, ln_theta).spectrum(omega)
+            return -0.5 * float((np.log(spectrum) + power / spectrum).sum())
+
+        peaks[law] = maximum(objective, problem.starts(law))
+    criteria = information_criteria({law: peak.value for law, peak in peaks.items()}, n - 1)
+    return Answer({law: peak.values(law) for law, peak in peaks.items()}, criteria)

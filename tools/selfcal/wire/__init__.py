@@ -1,0 +1,1 @@
+"""Telemetry: frames, DBC files, modules live."""

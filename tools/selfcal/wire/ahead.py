@@ -1,0 +1,68 @@
+"""How far the corrected output is off some time after a report: what a calibration is worth until the next one.
+
+The bias that a module reports, with its coefficients' part of what the columns do meanwhile, against the readings then.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.units import factor
+from selfcal.logs.recording import Recording
+from selfcal.model.file import Model
+from selfcal.model.regressors import columns_of, offered
+from selfcal.wire.frames import AxisReport, names_of
+
+Array = NDArray[np.float64]
+
+#: s from a report to the middle of the readings that it is held against; their length, s: white noise averages out.
+AHEAD_S, MEAN_S = 300.0, 60.0
+#: Reports that make a figure.
+LEAST = 3
+
+
+@dataclass(frozen=True)
+class Known:
+    """The bias at a time, s of the recording, and the coefficients [p] of the model's columns; 0 of one not in use."""
+
+    time_s: float
+    bias: float
+    coefficients: Array
+
+
+def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence[Known]) -> dict[str, Any] | None:
+    """Rms error of the corrected output AHEAD_S after a report, means of MEAN_S, in the recording's unit; None where
+    too few reports have readings so long after them.
+
+    The bias is taken to stay: a Gauss-Markov drift returns to its mean meanwhile, which the module's own corrected
+    samples know."""
+    recording = recording.along(name)
+    regressors, group, unit = offered(model, name), model.group_of(name), recording.columns[name].unit
+    time, readings = recording.time_s, recording.in_unit(name, group.unit)
+    columns = columns_of(regressors, recording)
+    errors = []
+    for report in reports:
+        then = np.abs(time - report.time_s - AHEAD_S) <= 0.5 * MEAN_S
+        now = np.flatnonzero(time <= report.time_s)
+        if not now.size or 2 * int(then.sum()) < MEAN_S * recording.rate_hz or time[-1] < report.time_s + AHEAD_S:
+            continue
+        change = columns[then].mean(axis=0) - columns[now[-1]]
+        errors.append(float(np.nanmean(readings[then])) - report.bias - float(report.coefficients @ change))
+    if len(errors) < LEAST or not all(map(math.isfinite, errors)):
+        return None
+    rmse = math.sqrt(float(np.mean(np.square(errors)))) * factor(group.unit, unit)
+    return {"horizon_s": AHEAD_S, "mean_s": MEAN_S, "rmse": rmse, "reports": len(errors), "unit": unit}
+
+
+def of_report(report: AxisReport, model: Model) -> Known:
+    """What a module's report says of its axis: a column is in use where that is the likelier."""
+    told = report.coefficients(names_of(model))
+    sent = [told.get(column, (0.0, 0.0, 0.0)) for one in offered(model, report.axis) for column in one.columns]
+    coefficients = np.array([mean if probability > 0.5 else 0.0 for mean, _, probability in sent], np.float64)
+    return Known(report.time_s, report.value("bias_mean"), coefficients)

@@ -1,0 +1,435 @@
+"""Logs of frames: written by python-can's loggers, and read back as if the module sent them now."""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+import struct
+import time
+import zlib
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO, cast
+
+from selfcal.base.errors import UserError
+from selfcal.wire.streams import McapFrames, McapLog
+
+if TYPE_CHECKING:
+    import can
+
+#: What `monitor --log` writes, and what --read reads.
+WRITTEN = (".asc", ".blf", ".csv", ".log", ".mcap", ".trc")
+#: Those that are no text.
+BINARY = (".blf", ".mcap")
+
+#: Of Vector's BLF: size of the file's header, then an object's signature, size and kind; a container's own header.
+BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL"), struct.Struct("<4s4xLL")
+BLF_CONTAINER, BLF_CONTAINER_HEAD, BLF_ZLIB = 10, 16, b"\x02\x00"
+#: Bytes that a container may unpack to; python-can and Vector write 128 KB.
+BLF_CONTAINER_MAX = 16 << 20
+
+#: s that a frame may wait on its way to the disk: what a killed monitor loses.
+FLUSH_S = 1.0
+
+#: A line of `candump` without -l, and the first line of the CSV files of GVRET and SavvyCAN.
+CANDUMP = re.compile(
+    r"\s*(?:\((?P<time>[^)]*)\)\s+)?\w+\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})\s+"
+    r"\[(?P<length>\d+)\](?P<data>\s+remote request|(?:\s+[0-9A-F]{2})*)\s*(?:'.*'?)?\s*"
+)
+GVRET = "Time Stamp,ID,Extended,"
+#: Lines that are looked at for candump's screen form: the first may be damaged.
+CANDUMP_WITHIN = 20
+#: Characters of a line at most: the rest of a longer one counts as another line.
+LONGEST_LINE = 1 << 16
+#: Sound lines without a frame, by suffix.
+PASSED = {
+    ".asc": re.compile(
+        r"//|(begin|end)\s+triggerblock|date\s|base\s|(no\s+)?internal\s+events|"
+        r"\d+\.\d+\s+(can\s+)?(\d+\s+)?(?![0-9a-f]+x?\s)[a-z][a-z0-9_:-]+",
+        re.ASCII | re.IGNORECASE,
+    ),
+    ".csv": re.compile(rf"timestamp,arbitration_id,|{GVRET}"),
+    ".trc": re.compile(r";|\d+\)?\s+[\d.]+\s+(\d\s+)?(Warng|Error|ST|EC|ER|EV)\s", re.ASCII),
+}
+#: Bytes of a frame at most, but for CAN FD.
+LONGEST_FRAME = 8
+
+
+class _NoFrame(ValueError):
+    """A place of a log that is no frame, in words."""
+
+
+class FrameWriter:
+    """A new log of frames; its name's suffix chooses python-can's format, or MCAP, which takes the reports too. An
+    older log is never written over.
+
+    What a kill leaves is a log up to FLUSH_S before.
+    """
+
+    def __init__(self, path: Path | str) -> None:
+        import can
+
+        self.path = Path(path)
+        check_suffix(path)
+        try:
+            if self.path.is_file() and self.path.stat().st_size:
+                raise UserError(f"{path}: this log exists, and is not written over: delete it or give another name")
+            mcap = self.path.suffix.lower() == ".mcap"
+            self._writer = cast(Any, McapLog(self.path.open("wb")) if mcap else can.Logger(str(path)))
+            self._writer.file.flush()
+        except OSError as error:
+            raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
+        self._flushed = time.monotonic()
+        self._due = False
+
+    def write(self, frame: can.Message) -> None:
+        """Add a frame. Raises UserError where the disk is full."""
+        self._do(lambda: self._writer(frame))
+        self._due = True
+
+    def report(self, report: Mapping[str, Any], at_s: float) -> None:
+        """Add what streams.content() made of a report that came at `at_s`, where the format has a place for it."""
+        if isinstance(self._writer, McapLog):
+            self._do(lambda: self._writer.send(report, at_s))
+            self._due = True
+
+    def keep(self) -> None:
+        """Bring the frames to the file once FLUSH_S has passed. To be called from time to time."""
+        if self._due and time.monotonic() - self._flushed >= FLUSH_S:
+            self._flushed, self._due = time.monotonic(), False
+            self._do(self._flush)
+
+    def _flush(self) -> None:
+        block = getattr(self._writer, "_flush", None)  # python-can gathers 128 KB of a .blf
+        if block is not None:
+            block()
+        self._writer.file.flush()
+
+    def _do(self, what: Callable[[], None]) -> None:
+        try:
+            what()
+        except OSError as error:
+            raise UserError(f"{self.path}: cannot be written: {error.strerror or error}") from error
+
+    def __enter__(self) -> FrameWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._do(self._writer.stop)
+
+
+def check_suffix(path: Path | str) -> None:
+    """Raise UserError for a name that chooses no format."""
+    if Path(path).suffix.lower() not in WRITTEN:
+        raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
+
+
+class FrameLog:
+    """The frames of a log, `speed` times as fast as they came; None: as fast as they are read.
+
+    `closed` at its end; `damage` says why that came early, if it did. `malformed` counts the damaged lines of a text:
+    they are left out. A binary log ends at its first damage.
+    """
+
+    def __init__(self, path: Path | str, speed: float | None = None) -> None:
+        import can
+
+        logging.getLogger("can").setLevel(logging.CRITICAL)  # its readers tell of lines that they leave out
+        self.path = Path(path)
+        self.closed = False
+        self.damage = ""
+        self._speed = speed
+        self._waiting: can.Message | None = None
+        self._due: float | None = None
+        self._last_s = math.nan  # time stamp of the frame before
+        self._read = 0
+        check_suffix(path)
+        if not self.path.is_file():
+            missing = "there is no such file" if not self.path.exists() else "this is no file"
+            raise UserError(f"{path}: cannot read the frame log: {missing}")
+        if self.path.suffix.lower() == ".blf":
+            _check_blf(self.path)
+        try:
+            suffix = self.path.suffix.lower()
+            self._lines = None if suffix in BINARY else _Lines(self.path)
+            self._reader: Any = (
+                _reader_of(self._lines)
+                if self._lines is not None
+                else McapFrames(self.path)
+                if suffix == ".mcap"
+                else can.LogReader(self.path)
+            )
+            self._frames: Iterator[can.Message] = iter(self._reader)
+            self._waiting = self._next()
+        except Exception as error:  # python-can's readers raise what they stumble over
+            raise UserError(f"{path}: no frame log as python-can writes it: {self._said(error)}") from error
+        if self._waiting is None:
+            self.close()
+            if self.malformed:
+                lines = f"{self.malformed} line{'s' if self.malformed > 1 else ''}"
+                raise UserError(f"{path}: no frame log as python-can writes it: there is no frame in its {lines}")
+            raise UserError(f"{path}: there is no frame in this log")
+
+    @property
+    def malformed(self) -> int:
+        """Damaged lines of a text so far."""
+        return 0 if self._lines is None else self._lines.malformed
+
+    def recv(self, timeout: float) -> can.Message | None:
+        """The next frame when it is due, or None after `timeout` seconds or at the end."""
+        frame = self._waiting
+        if frame is None:
+            self.closed = True
+            return None
+        wait = self._wait(frame.timestamp)
+        if wait > timeout:
+            time.sleep(timeout)
+            return None
+        time.sleep(wait)
+        self._due = None
+        self._last_s = frame.timestamp
+        try:
+            self._waiting = self._next()
+        except Exception as error:
+            self._waiting, self.damage = None, self._said(error)
+        self.closed = self._waiting is None
+        if self.closed and not self.damage and _is_cut(self.path):
+            self.damage = "its last line is cut off"
+        return frame
+
+    def _next(self) -> can.Message | None:
+        """The next frame of the file; None at its end. Raises _NoFrame, and whatever python-can's readers do: of a text
+        only where a reader does not get on."""
+        while True:
+            try:
+                frame = next(self._frames, None)
+                if frame is not None:
+                    _check_frame(frame, self._read + 1)
+            except Exception:
+                if self._lines is None or not self._lines.restart():
+                    raise
+                self._frames = iter(self._reader)
+                continue
+            if frame is not None:
+                self._read += 1
+                if self._lines is not None:
+                    self._lines.taken()
+            return frame
+
+    def _said(self, error: Exception) -> str:
+        return str(error) if isinstance(error, _NoFrame) else f"frame {self._read + 1} cannot be read"
+
+    def _wait(self, stamp_s: float) -> float:
+        """Seconds until the frame with this time stamp is due; a stamp that goes back does not wait."""
+        if self._speed is None:
+            return 0.0
+        now = time.monotonic()
+        if self._due is None:
+            gap = (stamp_s - self._last_s) / self._speed
+            self._due = now + (gap if 0.0 < gap < math.inf else 0.0)
+        return max(0.0, self._due - now)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._reader.stop()
+
+    def __enter__(self) -> FrameLog:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def _is_cut(path: Path) -> bool:
+    """Whether a log of lines ends amid one: python-can may take the half of a frame for one, or pass it by."""
+    with path.open("rb") as file:
+        if path.suffix.lower() in BINARY or not file.seek(0, 2):
+            return False
+        file.seek(-1, 2)
+        return file.read(1) not in b"\r\n"
+
+
+def _check_frame(frame: can.Message, number: int) -> None:
+    """Raises _NoFrame for one that python-can's readers make of a damaged place."""
+    if not math.isfinite(frame.timestamp):
+        raise _NoFrame(f"frame {number} has the time stamp {frame.timestamp:g}")
+    plain = not (frame.is_fd or frame.is_remote_frame or frame.is_error_frame)
+    if plain and (len(frame.data) != frame.dlc or frame.dlc > LONGEST_FRAME):
+        raise _NoFrame(f"frame {number} has {len(frame.data)} bytes and the length {frame.dlc}")
+
+
+class _Lines:
+    """The lines of a text log, as python-can's readers take a file. `malformed` counts those of which no frame comes.
+
+    A reader that stumbled over a line begins anew with the next one: an empty line takes the place of its header.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.malformed = 0
+        self._suffix = path.suffix.lower()
+        self._passed = PASSED.get(self._suffix)
+        self._file: TextIO = path.open(encoding="utf-8", errors="replace")
+        self._line = self._held = ""  # handed out last, until a frame comes of it; to be handed out next
+        self._read, self._restarted = 0, -1
+        self._empty = self._suffix == ".csv"  # its reader passes by the first line unseen
+        self._header = self._suffix == ".asc"  # its reader passes by the first line that is no header
+
+    def __iter__(self) -> Iterator[str]:
+        return self
+
+    def __next__(self) -> str:
+        if self._empty:
+            self._empty = False
+            return "\n"
+        self._judge()
+        line, self._held = self._held or self._file.readline(LONGEST_LINE), ""
+        if self._header and line[:1].isdigit():
+            self._header, self._held = False, line
+            return "\n"
+        if not line:
+            raise StopIteration
+        self._read += 1
+        self._line = line
+        return line
+
+    def taken(self) -> None:
+        """A frame has come of the last line."""
+        self._line = ""
+
+    def restart(self) -> bool:
+        """Be ready for a reader that begins anew. False if none would get on."""
+        self._judge()
+        if self._restarted == self._read:
+            return False
+        self._restarted, self._empty = self._read, True
+        return True
+
+    def _judge(self) -> None:
+        """Count the last line if it is damaged."""
+        line, self._line = self._line.strip(), ""
+        self.malformed += bool(line) and not (self._passed is not None and self._passed.match(line))
+
+    def close(self) -> None:
+        self._file.close()
+
+
+class _Foreign:
+    """A reader of one frame a line, for forms that python-can has no reader of."""
+
+    def __init__(self, lines: _Lines, frame: Callable[[str], can.Message]) -> None:
+        self._lines, self._frame = lines, frame
+
+    def __iter__(self) -> Iterator[can.Message]:
+        return (self._frame(line) for line in self._lines if line.strip())
+
+    def stop(self) -> None:
+        self._lines.close()
+
+
+def _reader_of(lines: _Lines) -> Any:
+    """The reader of a text log: python-can's, or our own."""
+    import can
+
+    suffix = lines.path.suffix.lower()
+    with lines.path.open("rb") as file:
+        first = [file.readline(LONGEST_LINE).decode("ascii", "replace") for _ in range(CANDUMP_WITHIN)]
+    if suffix == ".csv" and first[0].startswith(GVRET):
+        return _Foreign(lines, _of_gvret)
+    if suffix == ".log" and any(CANDUMP.fullmatch(line) for line in first):
+        return _Foreign(lines, _of_candump)
+    readers: dict[str, Callable[..., Any]] = {
+        ".asc": can.ASCReader,
+        ".csv": can.CSVReader,
+        ".log": can.CanutilsLogReader,
+        ".trc": can.TRCReader,
+    }
+    return readers[suffix](lines)
+
+
+def _of_candump(line: str) -> can.Message:
+    """A frame of a line such as ` (1700000000.000000)  can0  200   [8]  C0 27 09 00 00 80 B5 88`."""
+    match = CANDUMP.fullmatch(line)
+    if match is None:
+        raise ValueError
+    return _message(match["time"] or "", match["id"], len(match["id"]) > 3, int(match["length"]), match["data"].split())
+
+
+def _of_gvret(line: str) -> can.Message:
+    """A frame of a line such as `1000,00000200,false,Rx,0,8,04,00,00,00,41,80,B5,0E,`; its time is in us."""
+    time_us, identifier, extended, _, _, length, *data = line.strip().split(",")
+    frame = _message(time_us, identifier, extended == "true", int(length), data[: int(length)])
+    frame.timestamp *= 1e-6
+    return frame
+
+
+def _message(stamp: str, identifier: str, extended: bool, length: int, data: list[str]) -> can.Message:
+    import can
+
+    try:
+        time_s = float(stamp)
+    except ValueError:  # candump -tA writes a date
+        time_s = 0.0
+    remote = data == ["remote", "request"]
+    if not remote and len(data) != length:
+        raise ValueError
+    return can.Message(
+        timestamp=time_s,
+        arbitration_id=int(identifier, 16),
+        is_extended_id=extended,
+        is_remote_frame=remote,
+        dlc=length,
+        data=None if remote else bytes(int(byte, 16) for byte in data),
+        check=True,
+    )
+
+
+def _check_blf(path: Path) -> None:
+    """Raises UserError for a BLF file on which python-can's reader would take all memory, or go round for ever.
+
+    A file is a header and objects; an object's header tells its size, and a container holds objects, packed by zlib.
+    """
+    with path.open("rb") as file:
+        left = path.stat().st_size
+        start = file.read(BLF_HEADER.size)
+        header = BLF_HEADER.unpack(start)[1] if len(start) == BLF_HEADER.size else 0
+        if header > left:
+            raise UserError(f"{path}: no frame log: its header is cut off")
+        file.seek(max(header, len(start)))
+        tail = b""
+        while len(head := file.read(BLF_OBJECT.size)) == BLF_OBJECT.size:
+            signature, size, kind = BLF_OBJECT.unpack(head)
+            if signature != b"LOBJ" or not BLF_OBJECT.size <= size <= left:
+                return  # python-can stops there
+            body = file.read(size - BLF_OBJECT.size)
+            file.seek(size % 4, 1)
+            if kind == BLF_CONTAINER:
+                tail = _check_objects(path, tail + _unpacked(path, body))
+
+
+def _unpacked(path: Path, body: bytes) -> bytes:
+    """What a container holds, as far as it can be unpacked."""
+    data = body[BLF_CONTAINER_HEAD:]
+    if body[:2] == BLF_ZLIB:
+        packed = zlib.decompressobj()
+        try:
+            data = packed.decompress(data, BLF_CONTAINER_MAX + 1)
+        except zlib.error:
+            data = b""
+    if len(data) > BLF_CONTAINER_MAX:
+        raise UserError(f"{path}: a part of this frame log unpacks to more than {BLF_CONTAINER_MAX >> 20} MB")
+    return data
+
+
+def _check_objects(path: Path, data: bytes) -> bytes:
+    """Walk through the objects of a container as python-can does; returns the beginning of one that goes on."""
+    at = 0
+    while (at := data.find(b"LOBJ", at, at + 8)) >= 0 and len(data) - at >= BLF_OBJECT.size:
+        _, size, _ = BLF_OBJECT.unpack_from(data, at)
+        if not BLF_OBJECT.size <= size <= BLF_CONTAINER_MAX:
+            raise UserError(f"{path}: damaged frame log: an object of {size} bytes")
+        if at + size > len(data):
+            return data[at:]
+        at += size
+    return b""

@@ -1,0 +1,899 @@
+"""The wire: telemetry frames in, reports out. `lib/selfcal.dbc` describes identifiers, items and units.
+
+A frame is believed only if its form, checksum and counter are right. What is lost is counted. A report with frames
+missing stays incomplete: it is never filled up with older values. Reports are by place; a model gives the names.
+"""
+
+from __future__ import annotations
+
+import errno
+import logging
+import math
+import os
+import shlex
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, cast
+
+from selfcal.bank.result import AxisResult, Estimate
+from selfcal.base.errors import UserError, called
+from selfcal.model.file import Model
+from selfcal.wire.dbc_file import AXIS_UNITS, BASE, BY_PLACE, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
+
+if TYPE_CHECKING:
+    import can
+    from cantools.database.can import Database, Message
+
+#: Version of the wire that this module reads.
+VERSION = 4
+#: Axis messages are named after the axis, in capitals.
+AXES = tuple(AXIS_UNITS)
+STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
+STATISTICS = ("mean", "median", "sd", "q05", "q95")
+IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
+
+#: nat; the item of an evidence difference ends there: so much less, or none at all.
+LEAST_EVIDENCE = -(2**31) * 0.001
+
+COUNTER = 64  # the counter is modulo this
+JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
+BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
+FOREIGN_STATUSES = 2  # whole statuses in a row that state another version, of a module that stated this one before
+RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter; a stream is no stranger's from then
+
+
+#: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
+TREE = Path(__file__).resolve().parent / "tree"
+ROOT = TREE if TREE.is_dir() else TREE.parents[2]
+
+
+@lru_cache(maxsize=1)
+def load_dbc() -> Database:
+    """The frame format, lib/selfcal.dbc."""
+    import cantools
+    from cantools.database.can import Database
+
+    database = cantools.database.load_file(ROOT / "lib" / "selfcal.dbc")
+    assert isinstance(database, Database)
+    return database
+
+
+def axis_unit(axis: str) -> str:
+    """Unit of an axis's readings on the wire. Raises UserError for an axis that has no message."""
+    if axis not in AXES:
+        raise UserError(f"axis '{axis}' has no telemetry message (there are {', '.join(AXES)})")
+    return AXIS_UNITS[axis]
+
+
+def names_of(model: Model) -> Names:
+    """The model's names of hypotheses, of their parameters by place, and of regressor columns.
+
+    Place 0 is N, place 1 the drift parameter, place 2 the bandwidth or ratio."""
+    columns = tuple((column, one.unit) for one in model.regressors for column in one.columns)
+    return Names(tuple(model.hypotheses), tuple(model.laws[name].parameters for name in model.hypotheses), columns)
+
+
+def carries(axis: str, unit: str) -> bool:
+    """Whether telemetry has a message for the axis, in this unit."""
+    return axis in AXES and axis_unit(axis) == unit
+
+
+def choices(message: str, signal: str) -> dict[int, str]:
+    """The words that the DBC has for the values of a signal; none if it has no words."""
+    named: Mapping[int, Any] = load_dbc().get_message_by_name(message).get_signal_by_name(signal).choices or {}
+    return {number: str(name) for number, name in named.items()}
+
+
+#: What the words of a reason mean (selfcal_reason_t), and what to do. Those of a judgement alone are not among them.
+REASONS = {
+    "no_report": "no report yet: leave it at rest for three bank samples; none come: see the sensor's state",
+    "moving": "moving: a report needs rest",
+    "retired": "retired: exchange the sensor, then reset forget",
+    "outside_priors": "outside the priors: widen them in the model file",
+    "inadequate": "not adequate: record, and run selfcal diagnose",
+    "not_identified": "not yet identified: leave it at rest for longer",
+    "bad_sample": "bad sample, not finite or saturated on some axis: look at the sensor",
+    "stuck": "stuck at one reading: exchange the sensor",
+}
+
+
+def reasons(*told: Mapping[str, float]) -> dict[str, str]:
+    """Why each axis has no calibration to rely on, in the DBC's words; axes without a reason are left out. `told`:
+    status and corrected sample, as far as they came; of two the later one counts."""
+    found: dict[str, str] = {}
+    latest = -math.inf
+    for values in told:
+        said = {axis: values[f"reason_{axis}"] for axis in AXES if f"reason_{axis}" in values}
+        if said and values.get("time_ms", -math.inf) >= latest:
+            latest = values.get("time_ms", -math.inf)
+            words = {axis: choices(STATUS, f"reason_{axis}").get(int(code), f"{code:g}") for axis, code in said.items()}
+            found = {axis: word for axis, word in words.items() if word != "none"}
+    return found
+
+
+def status_text(signal: str, value: float) -> str:
+    """A value of the status as the DBC names it, else the number with its unit; axes for a mask of them."""
+    entry = load_dbc().get_message_by_name("STATUS").get_signal_by_name(signal)
+    if entry.choices:
+        return choices("STATUS", signal).get(int(value), f"{value:g}")
+    if signal == "axes_retired":
+        return ",".join(axis for index, axis in enumerate(AXES) if int(value) >> index & 1)
+    return f"{int(value)}" if value == int(value) and not entry.unit else f"{value:g} {entry.unit or ''}".strip()
+
+
+def _crc_table() -> tuple[int, ...]:
+    table = []
+    for byte in range(256):
+        crc = byte << 4
+        for _ in range(8):
+            crc = (crc << 1) ^ (0xF13 if crc & 0x800 else 0)
+        table.append(crc & 0xFFF)
+    return tuple(table)
+
+
+_CRC = _crc_table()
+
+
+def crc12(data: bytes) -> int:
+    """CRC-12/CDMA2000: polynomial 0xF13, initial value 0xFFF, most significant bit first; "123456789" gives 0xD4D."""
+    crc = 0xFFF
+    for byte in data:
+        crc = ((crc << 8) & 0xFFF) ^ _CRC[(crc >> 4) ^ byte]
+    return crc
+
+
+def frame_crc(frame_id: int, data: bytes) -> int:
+    """What bits 52 to 63 of a frame with this id and these 8 bytes must be."""
+    return crc12(bytes((frame_id >> 8, frame_id & 0xFF, len(data))) + data[:6] + bytes((data[6] & 0x0F,)))
+
+
+@dataclass
+class Statistics:
+    """Frames of one stream.
+
+    `lost` were sent but not accepted, as far as the counters tell; those that arrived `damaged` (checksum) are among
+    them. `refused` had a wrong form (id, length, item), a value that cannot be, or a counter that repeats or goes back.
+    `foreign` stated another version of the wire.
+    """
+
+    received: int = 0
+    lost: int = 0
+    damaged: int = 0
+    refused: int = 0
+    foreign: int = 0
+
+
+@dataclass(frozen=True)
+class AxisReport:
+    """What arrived of one axis's report.
+
+    `values` by signal name, units as in the DBC; those of hypothesis k begin with `hk_`. `time_s`: module time when it
+    was begun, to the second below if the opening frame is missing.
+    """
+
+    axis: str
+    time_s: float
+    complete: bool
+    values: dict[str, float]
+    node: int = 0
+
+    def value(self, signal: str) -> float:
+        """One value, NaN if it did not arrive."""
+        return self.values.get(signal, math.nan)
+
+    @property
+    def hypotheses(self) -> int | None:
+        """How many the module's model has; None if that did not arrive."""
+        return int(self.values["hypotheses"]) if "hypotheses" in self.values else None
+
+    def result(self, names: Names = BY_PLACE) -> AxisResult:
+        """The report as the engines give it. For complete reports only (KeyError otherwise), whose hypotheses `names`
+        has."""
+        v = self.values
+        best = v["ln_evidence"]
+        named = list(enumerate(names.hypotheses[: self.hypotheses]))
+
+        def estimate(k: int, place: str) -> Estimate:
+            numbers = {statistic: v[f"h{k}_{place}_{statistic}"] for statistic in STATISTICS}
+            flags = int(v[f"h{k}_{place}_flags"])
+            return Estimate(**numbers, identified=bool(flags & IDENTIFIED), off_grid=bool(flags & OFF_GRID))
+
+        def evidence(k: int) -> float:
+            difference = v[f"h{k}_ln_evidence_diff"]
+            return best + (difference if difference > LEAST_EVIDENCE else -math.inf)
+
+        def parameters(k: int) -> dict[str, Estimate]:
+            there = [place for place in PLACE_NAMES if f"h{k}_{place}_mean" in v]
+            return {name: estimate(k, place) for name, place in zip(names.parameters[k], there, strict=False)}
+
+        return AxisResult(
+            n=int(v["count"]),
+            log_evidence={name: evidence(k) for k, name in named},
+            probability={name: v[f"h{k}_probability"] for k, name in named},
+            parameters={name: parameters(k) for k, name in named},
+            bias_mean=v["bias_mean"],
+            bias_sd=v["bias_sd"],
+        )
+
+    @property
+    def adequacy(self) -> Adequacy | None:
+        """What the module says of its model on this axis; None if it does not judge, or not all of it arrived."""
+        needed = {"adequacy", "reason", "suspicion", "suspicion_score", "judged", "temperature_span"}
+        if not needed <= self.values.keys():
+            return None
+
+        def word(signal: str) -> str:
+            number = self.values[signal]
+            return choices(f"{AXES[0].upper()}_ADEQUACY", signal).get(int(number), f"{number:g}")
+
+        score, samples = self.values["suspicion_score"], int(self.values["judged"])
+        change = None
+        if {"change_count", "change", "change_size", "change_ago"} <= self.values.keys():
+            count, size, ago_s = (self.values[f"change_{name}"] for name in ("count", "size", "ago"))
+            change = Change(word("change"), size, ago_s, int(count))
+        span = self.values["temperature_span"]
+        moved = span if math.isfinite(span) else None
+        return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, moved, change)
+
+    def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
+        """Mean, sd and probability of use of each regressor column that was told."""
+        return {
+            name: (self.value(f"c{c}_mean"), self.value(f"c{c}_sd"), self.value(f"c{c}_probability"))
+            for c, (name, _) in enumerate(names.columns)
+            if f"c{c}_mean" in self.values
+        }
+
+
+@dataclass(frozen=True)
+class Change:
+    """The last change that a module found and handled on an axis (lib/changes.c), and how many there were.
+
+    `size`: of a step or a motion in the axis's unit, of a variance_change the noise over that before.
+    """
+
+    cause: str
+    size: float
+    ago_s: float
+    count: int
+
+    def __str__(self) -> str:
+        size = f"noise x{self.size:.2f}" if self.cause == "variance_change" else f"{self.cause} of {self.size:+.3g}"
+        return f"{size} {self.ago_s:.0f} s ago, handled"
+
+
+@dataclass(frozen=True)
+class Adequacy:
+    """What a module says of its model on an axis (lib/adequacy.c): words as in the DBC.
+
+    `state` is adequate, inadequate or not_judged, the last with a `reason`. `suspicion` is the strongest, `score` in
+    standard deviations of its null law, over `samples` bank samples. `temperature_moved` is in degC, None without one.
+    """
+
+    state: str
+    reason: str
+    suspicion: str
+    score: float
+    samples: int
+    temperature_moved: float | None = None
+    change: Change | None = None
+
+    def __str__(self) -> str:
+        changed = f"; {self.change}" if self.change is not None else ""
+        if self.state == "inadequate":
+            return f"not adequate: {self.suspicion} ({self.score:+.1f} sd){changed}"
+        judged = "adequate" if self.state == "adequate" else f"not judged: {self.reason.replace('_', ' ')}"
+        return f"{judged}{changed}"
+
+
+@dataclass
+class _Open:
+    """A report under way. `order`: of its last frame."""
+
+    axis: str
+    second: int
+    time_s: float
+    order: int
+    frames: int = 0
+    values: dict[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """A message of the DBC: its axis (or ""), what the names of its values begin with, and its place in a report."""
+
+    message: Message
+    axis: str
+    prefix: str
+    part: int
+
+
+#: Places in a report: opening, hypotheses, coefficients, adequacy, end.
+_COEFFICIENTS, _ADEQUACY, _END = HYPOTHESES + 1, HYPOTHESES + 2, HYPOTHESES + 3
+#: Item of an axis message that closes a report.
+_END_ITEM = 43
+
+
+@lru_cache(maxsize=1)
+def _kinds() -> dict[int, _Kind]:
+    """Messages that modules send, by their offset within a node's identifiers."""
+    kinds = {}
+    for message in load_dbc().messages:
+        axis, _, rest = message.name.lower().partition("_")
+        hypothesis = int(rest[1:]) if rest.startswith("h") else None
+        part = {"": 0, "coefficients": _COEFFICIENTS, "adequacy": _ADEQUACY}.get(rest)
+        if message.name in (STATUS, CORRECTED, ANSWER):
+            kinds[message.frame_id - BASE] = _Kind(message, "", "", 0)
+        elif hypothesis is not None:
+            kinds[message.frame_id - BASE] = _Kind(message, axis, f"h{hypothesis}_", 1 + hypothesis)
+        elif axis in AXES and part is not None:
+            kinds[message.frame_id - BASE] = _Kind(message, axis, "", part)
+    return kinds
+
+
+def node_of(identifier: int) -> int | None:
+    """Node that a frame with this identifier comes from; None: no module sends it."""
+    node, offset = divmod(identifier - BASE, NODE_IDS)
+    return node if 0 <= node < NODES and offset in _kinds() else None
+
+
+class Decoder:
+    """Turns the frames of one node into reports and keeps the count of what went wrong.
+
+    `from_start`: the stream is watched from the module's first frame, so frames lost before the first accepted one
+    count too.
+    """
+
+    def __init__(self, *, node: int = 0, from_start: bool = False) -> None:
+        self.node = node
+        self.statistics = Statistics()
+        #: Last value of each status signal.
+        self.status: dict[str, float] = {}
+        #: Signals of the last corrected sample, as far as they have come without a loss.
+        self.corrected: dict[str, float] = {}
+        self._corrects = False  # what comes belongs to that sample
+        #: Last value of each signal of the answers to commands.
+        self.answer: dict[str, float] = {}
+        #: The latest module time that a frame has told, unwrapped, ms. It goes back only if the module starts anew.
+        self.time_ms = 0
+        #: The module has said that no sample will follow, and this was its last status.
+        self.finished = False
+        #: Module time of the first status, ms, and of the last.
+        self.status_ms: tuple[int, int] | None = None
+        self._counter: int | None = COUNTER - 1 if from_start else None
+        self._origin: int | None = 0 if from_start else None  # frames_sent of the first frame watched
+        self._sent = 0  # frames sent since then, as far as known
+        self._run: list[int] = []  # counters of good frames refused in a row
+        self._open: _Open | None = None
+        self._other: float | None = None  # version that the status under way states, if it is another
+        self._others = 0  # whole statuses in a row that state it
+        self._ours = False  # a status has stated this tool's version
+
+    @property
+    def foreign(self) -> str:
+        """What is wrong if the module speaks another version of the wire; empty if it does not.
+
+        A module that has spoken this one has to state another in FOREIGN_STATUSES whole statuses in a row.
+        """
+        if self._other is None or self._ours:
+            return ""
+        older = (
+            "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
+        )
+        return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {older}"
+
+    @property
+    def surely_foreign(self) -> bool:
+        """Whole statuses in a row have stated so, no lone frame."""
+        return bool(self.foreign) and self._others >= FOREIGN_STATUSES
+
+    def feed(self, message: can.Message) -> list[AxisReport]:
+        """Take one frame; return the reports that it closes (none, one or two)."""
+        kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
+        if (
+            kind is None
+            or message.is_extended_id
+            or message.is_remote_frame
+            or message.is_error_frame
+            or message.is_fd
+            or message.dlc != 8
+            or len(message.data) != 8
+        ):
+            self.statistics.refused += 1
+            return []
+        data = bytes(message.data)
+        bits = int.from_bytes(data, "little")
+        if bits >> 52 != frame_crc(message.arbitration_id, data):
+            self.statistics.damaged += 1
+            return []
+        item, counter, second = bits >> 32 & 0x3F, bits >> 38 & 0x3F, bits >> 44 & 0xFF
+        try:
+            decoded: dict[str, Any] = dict(kind.message.decode(data, decode_choices=False))  # type: ignore[arg-type]
+        except Exception:  # cantools has a class of its own for an item that the DBC does not have
+            self.statistics.refused += 1
+            return []
+        values = {
+            name: float(value) for name, value in decoded.items() if name not in ("item", "counter", "time", "crc")
+        }
+        name = kind.message.name
+        if not all(_possible(kind, signal, value) for signal, value in values.items()):
+            self.statistics.refused += 1
+            return []
+        if "time_ms" in values and int(values["time_ms"]) // 1000 % 256 != second:
+            self.statistics.refused += 1
+            return []
+        if "frames_sent" in values and int(values["frames_sent"]) % COUNTER != counter:
+            self.statistics.refused += 1
+            return []
+        jump = self._accept(counter)
+        if jump == 0:
+            self.statistics.refused += 1
+            return []
+        self._corrects = self._corrects and jump == 1  # the frame that opens the next sample may be among the lost
+        self.statistics.received += 1
+        self.statistics.lost = self._sent - self.statistics.received
+        if "time_ms" in values:
+            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else BACK_MS)
+        else:
+            told_ms = self._begun(second)
+        if name == STATUS:
+            self._take_status(values)
+            return self.flush()
+        if self.foreign:
+            return []
+        if name == CORRECTED:
+            if "time_ms" in values:
+                self.corrected = {}  # an axis that is no longer sent has no part in it
+                self._corrects = True
+            if self._corrects:
+                self.corrected.update(values)
+            return self.flush()
+        if name == ANSWER:
+            self.answer.update(values)
+            return self.flush()
+        order = _order(kind, item)
+        named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
+        return self._assemble(kind.axis, order, jump, second, told_ms / 1000.0, named)
+
+    def _take_status(self, values: Mapping[str, float]) -> None:
+        """Take an item of the status. Of another version nothing is believed but the version."""
+        version = values.get("wire_version")
+        if version == VERSION:
+            self._other, self._others, self._ours = None, 0, True
+        elif version is not None:
+            self.statistics.foreign += 1
+            self._others = self._others if version == self._other else 0
+            self._other = version
+        if "frames_sent" in values:
+            self._exact(int(values["frames_sent"]))
+            self._others += self._other is not None
+            self._ours = self._ours and self._others < FOREIGN_STATUSES
+        if self.foreign:
+            self.status = {"wire_version": cast(float, self._other)}
+            self._open = None
+        elif version in (None, VERSION):
+            self.status.update(values)
+        if "frames_sent" in values:
+            self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
+            self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
+
+    def flush(self) -> list[AxisReport]:
+        """Close the report under way, incomplete, for the end of a stream."""
+        report, self._open = self._open, None
+        return [] if report is None else [self._report(report, complete=False)]
+
+    def _report(self, report: _Open, *, complete: bool) -> AxisReport:
+        return AxisReport(report.axis, report.time_s, complete, report.values, self.node)
+
+    def _accept(self, counter: int) -> int:
+        """How far the counter went ahead; 0 if the frame is to be refused."""
+        jump = COUNTER if self._counter is None else (counter - self._counter) % COUNTER
+        if self._counter is None:
+            self._sent = 1
+        elif 1 <= jump <= JUMP_MAX:
+            self._sent += jump
+        else:
+            if not self._run or counter != (self._run[-1] + 1) % COUNTER:
+                self._run = []
+            self._run.append(counter)
+            if len(self._run) < RESYNC:
+                return 0
+            self._sent += jump or COUNTER
+            jump = COUNTER  # continues no report
+        self._run = []
+        self._counter = counter
+        return jump
+
+    def _exact(self, frames_sent: int) -> None:
+        """Make the loss exact: `frames_sent` went before the frame just accepted."""
+        if self._origin is not None:
+            unseen = (frames_sent - self._origin + 1 - self._sent) % 2**32
+            if unseen < 2**31 and unseen % COUNTER == 0:
+                self._sent += unseen
+                self.statistics.lost = self._sent - self.statistics.received
+                return
+        self._origin = frames_sent + 1 - self._sent  # first of this stream, or the module has started anew
+
+    def _advance(self, time_ms: int, back_ms: int) -> int:
+        """Unwrapped module time of a frame, which may lie `back_ms` before others, else the module starts anew."""
+        ahead = _ahead(time_ms, self.time_ms, 2**32)
+        if ahead < -min(back_ms, self.time_ms):
+            self.time_ms = time_ms
+            return time_ms
+        self.time_ms += max(0, ahead)
+        return self.time_ms + min(0, ahead)
+
+    def _assemble(
+        self, axis: str, order: int, jump: int, second: int, begun_s: float, values: dict[str, float]
+    ) -> list[AxisReport]:
+        """Add a frame to its report. Frames of a report follow each other in ascending order, so a jump of the counter
+        must not exceed that of the order."""
+        closed: list[AxisReport] = []
+        report = self._open
+        if report is not None:
+            goes_on = axis == report.axis and second == report.second and jump <= order - report.order
+            if not goes_on:
+                closed = self.flush()
+                report = None
+        if report is None:
+            report = self._open = _Open(axis, second, begun_s, order)
+        report.order = order
+        report.frames += 1
+        report.values.update(values)
+        if "end_items" in values:
+            self._open = None
+            opened = report.values.get("time_ms")
+            if opened is None or int(opened) % 2**24 == int(values["end_time_ms"]):
+                complete = opened is not None and report.frames == int(values["end_items"]) and _whole(report.values)
+                closed.append(self._report(report, complete=complete))
+        return closed
+
+    def _begun(self, second: int) -> int:
+        """Module time of a frame that tells its second alone, modulo 256: the nearest to what is known."""
+        wrapped = self.time_ms % 2**32
+        ahead = _ahead(second, wrapped // 1000, 256)
+        return max(0, self.time_ms - wrapped % 1000 + 1000 * ahead)
+
+
+def _ahead(told: int, known: int, modulus: int) -> int:
+    """How far `told`, modulo `modulus`, lies before or behind what is known, by the shorter way."""
+    return (told - known + modulus // 2) % modulus - modulus // 2
+
+
+@lru_cache(maxsize=1)
+def _starts() -> tuple[int, ...]:
+    """Place of the first frame of each part of a report."""
+    items = dict.fromkeys(range(_END + 1), 1)
+    for kind in _kinds().values():
+        if kind.axis == AXES[0]:
+            ids = [signal.multiplexer_ids[0] for signal in kind.message.signals if signal.multiplexer_ids]
+            items[kind.part] = 1 + max(one for one in ids if one != _END_ITEM)
+    return tuple(sum(items[before] for before in range(part)) for part in range(_END + 1))
+
+
+def _order(kind: _Kind, item: int) -> int:
+    """Place of a frame among all that a report may have. No more frames lie between two than their places tell."""
+    return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
+
+
+def _possible(kind: _Kind, signal: str, value: float) -> bool:
+    """Whether a module can mean this value.
+
+    In an axis's messages a value that is not a number says that the module has none. A law without any evidence has
+    minus infinity; a hair beyond 1 is a probability's rounding in float32.
+    """
+    if math.isnan(value):
+        return kind.axis != ""
+    if signal.endswith("probability"):
+        return 0.0 <= value <= 1.0 + 1e-6
+    if signal == "hypotheses":
+        return 1.0 <= value <= HYPOTHESES
+    return math.isfinite(value) or (signal == "ln_evidence" and value < 0.0)
+
+
+def _whole(values: Mapping[str, float]) -> bool:
+    """Whether all hypotheses that the module has are there, and no other, with a place N each."""
+    there = {k for k in range(HYPOTHESES) if f"h{k}_probability" in values}
+    wanted = ("h{}_ln_evidence_diff", "h{}_N_flags", "h{}_N_mean")
+    all_there = there == set(range(int(values["hypotheses"])))
+    return all_there and all(name.format(k) in values for k in there for name in wanted)
+
+
+class Streams:
+    """The decoders of all nodes that are heard, one each.
+
+    A node is heard from its first good frame on: its form and its checksum are right. `node`: look at this one alone.
+    """
+
+    def __init__(self, *, node: int | None = None) -> None:
+        self.decoders: dict[int, Decoder] = {}
+        self.strangers = Statistics()  # what belongs to no node
+        self._node = node
+
+    @staticmethod
+    def of(decoder: Decoder) -> Streams:
+        """Those of one decoder that is there already."""
+        streams = Streams(node=decoder.node)
+        streams.decoders[decoder.node] = decoder
+        return streams
+
+    def feed(self, message: can.Message) -> list[AxisReport]:
+        """Take one frame of any node; return the reports that it closes."""
+        node = node_of(message.arbitration_id)
+        if node is None:
+            self.strangers.refused += 1
+            return []
+        if self._node is not None and node != self._node:
+            return []
+        decoder = self.decoders.get(node)
+        if decoder is not None:
+            return decoder.feed(message)
+        decoder = Decoder(node=node)
+        reports = decoder.feed(message)
+        if decoder.statistics.received > 0:
+            self.decoders[node] = decoder
+        else:
+            self.strangers.damaged += decoder.statistics.damaged
+            self.strangers.refused += decoder.statistics.refused
+        return reports
+
+    def flush(self) -> list[AxisReport]:
+        """Close the reports under way, incomplete, for the end of the streams."""
+        return [report for decoder in self.decoders.values() for report in decoder.flush()]
+
+    @property
+    def known(self) -> dict[int, Decoder]:
+        """The nodes that are no passing stranger, by number. Until there is one: whatever is heard."""
+        heard = dict(sorted(self.decoders.items()))  # the view asks from a thread of its own
+        sure = {node: one for node, one in heard.items() if one.statistics.received >= RESYNC or self._node == node}
+        return sure or heard
+
+    @property
+    def statistics(self) -> Statistics:
+        """Of all together. Frames of a passing stranger count as refused."""
+        known = self.known
+        total = Statistics(**vars(self.strangers))
+        for node, decoder in list(self.decoders.items()):
+            one = decoder.statistics
+            total.damaged += one.damaged
+            total.foreign += one.foreign
+            if node in known:
+                total.received, total.lost = total.received + one.received, total.lost + one.lost
+                total.refused += one.refused
+            else:
+                total.refused += one.refused + one.received
+        return total
+
+
+#: Bytes of a serial line without an end that are kept: a frame's line has 22.
+LINE_MAX = 4096
+
+
+class Link:
+    """A python-can bus whose `recv` survives what a damaged line does to it.
+
+    `malformed` counts what came and was no frame; `closed` is set once the other side has gone. `again` opens the bus
+    anew.
+    """
+
+    def __init__(self, bus: can.BusABC, again: Callable[[], can.BusABC] | None = None) -> None:
+        self.bus = bus
+        self.malformed = 0
+        self.closed = False
+        self._again = again
+
+    def recv(self, timeout: float) -> can.Message | None:
+        """The next frame, or None after `timeout` seconds or once closed."""
+        import can
+
+        end = time.monotonic() + timeout
+        while not self.closed:
+            try:
+                return self.bus.recv(max(0.0, end - time.monotonic()))
+            except (IndexError, ValueError):  # python-can slcan: a line cut short, a digit that is none
+                self.malformed += 1
+            except can.CanOperationError as error:
+                if error.__cause__ is None or isinstance(error.__cause__, OSError):
+                    self.closed = True
+                    break
+                self.malformed += 1
+                # python-can 4.6 keeps the line it cannot decode, so every later one would fail with it. Its flush()
+                # would throw away good frames that wait behind.
+                self._shorten(0)
+            except (OSError, can.CanError):
+                self.closed = True
+            finally:
+                self._shorten(LINE_MAX)
+            if time.monotonic() >= end:
+                break
+        return None
+
+    def _shorten(self, longest: int) -> None:
+        """Drop what a serial line has sent since its last end of line if that is longer than `longest` bytes."""
+        buffer = getattr(self.bus, "_buffer", None)
+        if isinstance(buffer, bytearray) and len(buffer) > longest:
+            self.malformed += 1 if longest else 0
+            buffer.clear()
+
+    def reconnect(self) -> bool:
+        """Open the bus anew; False if the other side is not back yet."""
+        if self._again is None:
+            return False
+        self.close()
+        try:
+            self.bus = self._again()
+        except UserError:
+            return False
+        self.closed = False
+        return True
+
+    def open_again(self) -> None:
+        """Open the channel of a serial line once more; on other buses nothing happens."""
+        self._order("open")
+
+    def close_channel(self) -> None:
+        """Close the channel of a serial line, not the line; on other buses nothing happens."""
+        self._order("close")
+
+    def _order(self, name: str) -> None:
+        import can
+        from can.interfaces.slcan import slcanBus
+
+        try:
+            if isinstance(self.bus, slcanBus):
+                getattr(self.bus, name)()
+        except (OSError, can.CanError):
+            self.closed = True
+
+    def close(self) -> None:
+        """Close channel and line; one that is gone already is no error."""
+        import can
+
+        try:
+            self.bus.shutdown()
+        except (OSError, can.CanError):
+            self.closed = True
+
+    def __enter__(self) -> Link:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+#: s that a write to a serial line may take: on a pseudo-terminal that nobody reads it would never end.
+WRITE_S = 1.0
+#: Frames that wait in a UDP socket while the host is busy: a report of six axes is 322, and a datagram takes 768 bytes.
+UDP_BUFFER = 4 << 20
+
+
+def open_bus(interface: str, channel: str, **options: Any) -> Link:
+    """Open a python-can interface, a serial line for this process alone: of two readers each would lose what the other
+    takes. Raises UserError when that fails."""
+    import can
+
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # what its drivers lack is told by their errors
+    if interface not in can.VALID_INTERFACES:
+        known = ", ".join(sorted(can.VALID_INTERFACES))
+        raise UserError(f"--interface {interface}: python-can has no such interface (there are {known})")
+    return Link(_bus(interface, channel, options), lambda: _bus(interface, channel, options))
+
+
+def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC:
+    import can
+    from can.interfaces.slcan import slcanBus
+    from can.interfaces.udp_multicast import UdpMulticastBus
+
+    if interface in ("slcan", "serial"):
+        _check_port(interface, channel)
+    try:
+        bus = can.Bus(interface=interface, channel=channel, **options)
+    except Exception as error:  # python-can's drivers raise what the libraries below them raise
+        raise UserError(f"{interface} {channel}: {_reason(interface, channel, error)}") from error
+    if isinstance(bus, slcanBus):
+        _leave_out_line_feeds(bus.serialPortOrig)
+        bus.serialPortOrig.write_timeout = WRITE_S
+        try:
+            bus.serialPortOrig.exclusive = True
+        except OSError as error:
+            bus.serialPortOrig.close()  # first: the order to close the channel would reach the other's module
+            Link(bus).close()
+            raise UserError(f"{interface} {channel}: another program has it open") from error
+    elif isinstance(bus, UdpMulticastBus):
+        import socket
+
+        with socket.socket(fileno=os.dup(bus.fileno())) as same:
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER)
+    return bus
+
+
+def _leave_out_line_feeds(port: Any) -> None:
+    """Lines end in CR. Some adapters send CR LF, and python-can takes the LF for the next line's first letter."""
+    read = port.read
+
+    def without(size: int = 1) -> bytes:
+        data: bytes = read(size)
+        return b"" if data == b"\n" else data
+
+    port.read = without
+
+
+def _check_port(interface: str, channel: str) -> None:
+    """Raises UserError if a channel can be no serial port, `PATH` or `PATH@BAUD`; a URL of pyserial's may be one."""
+    if "://" in channel:
+        return
+    name, _, baud = channel.partition("@")
+    path = Path(name)
+    if baud and not baud.isdecimal():
+        raise UserError(f"{interface} {channel}: after the @ stands the line's rate, bit/s: {name}@115200")
+    if not name or not path.exists():
+        raise UserError(f"{interface} {channel}: there is no such port ({serial_ports()})")
+    if not path.is_char_device():
+        kind = "a folder" if path.is_dir() else "a file"
+        more = f"; `{called()} monitor --read {shlex.quote(name)}` reads a log of frames" if path.is_file() else ""
+        raise UserError(f"{interface} {channel}: this is {kind}, no serial port ({serial_ports()}){more}")
+
+
+def serial_ports() -> str:
+    """The machine's serial ports, in words."""
+    from serial.tools.list_ports import comports
+
+    found = sorted(port.device for port in comports())
+    if not found:
+        return "this machine has none: is the module plugged in?"
+    return f"there are {', '.join(found[:8])}{' and more' if len(found) > 8 else ''}"
+
+
+def _can_devices() -> str:
+    """The machine's CAN devices, in words. ARPHRD_CAN of linux/if_arp.h is 280."""
+    found = []
+    for device in sorted(Path("/sys/class/net").glob("*")):
+        try:
+            found += [device.name] if (device / "type").read_text().strip() == "280" else []
+        except OSError:
+            continue
+    return f"there are {', '.join(found)}" if found else "this machine has none"
+
+
+def _reason(interface: str, channel: str, error: BaseException) -> str:
+    """Why a bus cannot be opened, and what to do about it."""
+    import can
+
+    below: BaseException | None = error
+    while below is not None and not (isinstance(below, OSError) and below.errno):
+        below = below.__cause__ or below.__context__
+    number = below.errno if isinstance(below, OSError) else None
+    said = " ".join(str(error).split()) or type(error).__name__
+    if interface == "socketcan":
+        if number in (errno.EAFNOSUPPORT, errno.EPROTONOSUPPORT) or isinstance(error, AttributeError):
+            return "this system has no SocketCAN: load it (`modprobe can-raw`), or take another --interface"
+        if number == errno.ENODEV:
+            return f"there is no such CAN device ({_can_devices()})"
+        if number == errno.ENETDOWN:
+            return f"the device is down: `ip link set {channel} up type can bitrate 500000`"
+    if interface == "udp_multicast":
+        if number in (errno.ENODEV, errno.ENETUNREACH):
+            return f"no network takes this group: `ip route add {channel} dev lo` keeps it on this machine"
+        if "msgpack" not in said:
+            return "this is no multicast group: take 239.74.163.2, python-can's own"
+    if "://" in channel and number is None:
+        return "pyserial opens no such address: socket://HOST:PORT and rfc2217://HOST:PORT are some that it does"
+    if number in (errno.EACCES, errno.EPERM):
+        return "no permission to open it: `sudo usermod -aG dialout $USER`, then log in anew"
+    if "Could not configure port" in said:
+        return f"this is no serial port ({serial_ports()})"
+    if number == errno.EBUSY:
+        return "another program has it open"
+    if number is not None:
+        return f"cannot open: {os.strerror(number)}"
+    missing = (NameError, ImportError, can.CanInterfaceNotImplementedError)
+    if isinstance(error, missing) or type(error) is OSError:  # PEAK's library is an OSError without a number
+        return "its driver is not installed on this machine, or is none for this system"
+    if isinstance(error, TypeError):
+        return "this interface wants more than a channel: put the rest in python-can's configuration file"
+    return "cannot open: is the device plugged in, and the channel right?"

@@ -1,0 +1,305 @@
+"""The frame format for standard tools, for C and for the docs, from its one source, `frames.dbc`.
+
+python -m selfcal.wire.frames_codegen    write lib/selfcal.dbc, lib/selfcal_frames.h and the lists of lib/WIRE.md
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import textwrap
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from cantools.database.can import Database, Message
+from cantools.database.can.signal import Signal
+
+from selfcal.base.errors import UserError
+from selfcal.base.units import parameter_unit
+from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, REASON, dbc
+from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc
+
+#: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
+COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
+#: Messages of one axis, by what follows its name, with what their items are called in C. Those of all axes are alike.
+OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
+#: Those that modules send.
+SENT = ("", "_H0", "_COEFFICIENTS", "_ADEQUACY")
+#: Headings of lib/WIRE.md, by what follows an axis's name or by message.
+HEADINGS = {
+    "": "Axis",
+    "_H0": "Hypothesis",
+    "_COEFFICIENTS": "Coefficients of regressors",
+    "_ADEQUACY": "Adequacy",
+    STATUS: "Status",
+    CORRECTED: "Corrected sample",
+    ANSWER: "Answer to a command",
+}
+#: The line of lib/WIRE.md that the lists follow.
+MARK = "<!-- The rest is generated: python -m selfcal.wire.frames_codegen -->\n"
+#: Signals of columns after the first, which C reaches by the number of the column.
+LATER = re.compile(r"c[1-9]_")
+
+
+@dataclass(frozen=True)
+class Field:
+    """One signal of one item: bits `start` to `start + length - 1` of the 32-bit value."""
+
+    name: str
+    item: int
+    start: int
+    length: int
+    kind: str  # uint, int or float
+    scale: float
+    unit: str
+    comment: str
+    choices: str
+
+    @property
+    def macro(self) -> str:
+        """Name in C, less the prefix."""
+        return self.name.upper()
+
+
+def _as_elsewhere(signal: Signal) -> bool:
+    """Its words are those of the judgement's reason: selfcal_reason_t."""
+    return signal.name.startswith(f"{REASON}_")
+
+
+def _words(signal: Signal) -> str:
+    return ", ".join(f"{number} {name}" for number, name in (signal.choices or {}).items())
+
+
+def _field(message: Message, signal: Signal) -> Field:
+    where = f"{message.name}.{signal.name}"
+    items = signal.multiplexer_ids
+    if signal.multiplexer_signal != "item" or items is None or len(items) != 1:
+        raise UserError(f"selfcal.dbc: {where}: must belong to one item")
+    if signal.byte_order != "little_endian" or signal.start + signal.length > 32:
+        raise UserError(f"selfcal.dbc: {where}: must be little-endian and within bits 0 to 31")
+    if signal.is_float and (signal.start, signal.length) != (0, 32):
+        raise UserError(f"selfcal.dbc: {where}: a float must fill bits 0 to 31")
+    if signal.conversion.offset != 0:
+        raise UserError(f"selfcal.dbc: {where}: an offset is not supported")
+    return Field(
+        name=signal.name,
+        item=items[0],
+        start=signal.start,
+        length=signal.length,
+        kind="float" if signal.is_float else "int" if signal.is_signed else "uint",
+        scale=float(signal.conversion.scale),
+        unit=signal.unit or "",
+        comment=(signal.comment or "").rstrip("."),
+        choices="" if _as_elsewhere(signal) else _words(signal),
+    )
+
+
+def fields(message: Message) -> list[Field]:
+    """The item fields of a message, by item and bit. Raises UserError where the DBC leaves the common layout."""
+    if message.length != 8 or message.is_extended_frame or message.frame_id > 0x7FF:
+        raise UserError(f"selfcal.dbc: {message.name}: must have 8 bytes and a standard id")
+    for name, bits in COMMON.items():
+        signal = message.get_signal_by_name(name)
+        if (signal.start, signal.length) != bits or signal.is_signed or signal.byte_order != "little_endian":
+            raise UserError(f"selfcal.dbc: {message.name}.{name}: must be bits {bits[0]} to {sum(bits) - 1}, unsigned")
+    found = [_field(message, signal) for signal in message.signals if signal.name not in COMMON]
+    return sorted(found, key=lambda field: (field.item, field.start))
+
+
+def _bits(field: Field) -> str:
+    """Where a field lies, if it does not fill the value."""
+    if field.length == 32:
+        return ""
+    if field.length == 1:
+        return f", bit {field.start}"
+    return f", bits {field.start} to {field.start + field.length - 1}"
+
+
+def _shape(field: Field) -> tuple[object, ...]:
+    """What must be alike in all axis messages: everything but unit and comment."""
+    return (field.name, field.item, field.start, field.length, field.kind, field.scale)
+
+
+def _first(database: Database, suffix: str) -> Message:
+    return database.get_message_by_name(AXES[0].upper() + suffix)
+
+
+def check(database: Database) -> None:
+    """Raise UserError unless the messages of all axes and hypotheses are alike, have the identifiers that C works out,
+    and are in the units of their axes."""
+    columns = [field.item for field in fields(_first(database, "_COEFFICIENTS"))]
+    if columns != list(range(3 * COLUMNS)):
+        raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
+    suffixes = [*OF_AXIS, *(f"_H{k}" for k in range(1, HYPOTHESES))]
+    for place, axis in enumerate(AXES):
+        for suffix in suffixes:
+            pattern = _first(database, "_H0" if suffix.startswith("_H") else suffix)
+            message = database.get_message_by_name(axis.upper() + suffix)
+            k = int(suffix[2:]) if suffix.startswith("_H") else None
+            if message.frame_id != pattern.frame_id + (place if k is None else HYPOTHESES * place + k):
+                raise UserError(f"selfcal.dbc: {message.name}: identifier {message.frame_id:#x} is out of line")
+            mine = fields(message)
+            if [_shape(field) for field in mine] != [_shape(field) for field in fields(pattern)]:
+                raise UserError(f"selfcal.dbc: {message.name}: differs from {pattern.name}")
+            for field in mine:
+                parameter = "bias" if field.name.startswith("bias_") else field.name.partition("_")[0]
+                if parameter not in ("bias", PLACE_NAMES[0]) or field.name.endswith("_flags"):
+                    continue
+                unit = parameter_unit(parameter, AXIS_UNITS[axis])
+                if field.unit != unit:
+                    raise UserError(f"selfcal.dbc: {message.name}.{field.name}: unit '{field.unit}', not '{unit}'")
+
+
+def _items(prefix: str, members: Iterable[Field]) -> list[str]:
+    lines: list[str] = []
+    by_item: dict[int, list[Field]] = {}
+    for field in members:
+        by_item.setdefault(field.item, []).append(field)
+    lines.append("enum {")
+    for item, group in by_item.items():
+        for field in group:
+            kind = f"{field.kind}{field.length}" + (f" x {field.scale:g}" if field.scale != 1.0 else "")
+            unit = f", {field.unit}" if field.unit else ""
+            lines.append(f"    {prefix}_{field.macro} = {item}, /* {kind}{_bits(field)}{unit} */")
+    lines += ["};", ""]
+    for group in by_item.values():
+        for field in group:
+            if field.length != 32:
+                lines.append(f"#define {prefix}_{field.macro}_SHIFT {field.start}U")
+                lines.append(f"#define {prefix}_{field.macro}_MASK 0x{(1 << field.length) - 1:X}U")
+            if field.scale != 1.0:
+                lines.append(f"#define {prefix}_{field.macro}_PER_UNIT {1.0 / field.scale:.1f}")
+    lines.append("")
+    return lines
+
+
+def header(database: Database) -> str:
+    """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
+    check(database)
+    lines = [
+        "/* The telemetry frame format in numbers. selfcal.dbc describes every item.",
+        " * Generated: python -m selfcal.wire.frames_codegen. Do not edit. */",
+        "#ifndef SELFCAL_FRAMES_H",
+        "#define SELFCAL_FRAMES_H",
+        "",
+        f"#define SELFCAL_FRAMES_VERSION {int(database.version or 0)}U",
+        "",
+        "/* First bit and width of what every frame carries, in its 8 bytes read as one little-endian number.",
+        " * The value of the item is in bits 0 to 31. */",
+    ]
+    for name, (start, length) in COMMON.items():
+        lines.append(f"#define SELFCAL_FRAME_{name.upper()}_SHIFT {start}U")
+        lines.append(f"#define SELFCAL_FRAME_{name.upper()}_MASK 0x{(1 << length) - 1:X}U")
+    lines += [
+        "",
+        "/* Identifiers of node 0. Those of node n are SELFCAL_FRAME_NODE_IDS n higher. */",
+        f"#define SELFCAL_FRAME_NODES {NODES}U",
+        f"#define SELFCAL_FRAME_NODE_IDS {NODE_IDS}U",
+    ]
+    for name in (STATUS, CORRECTED, COMMAND, ANSWER):
+        lines.append(f"#define SELFCAL_FRAME_{name}_ID 0x{database.get_message_by_name(name).frame_id:X}U")
+    lines += [
+        "",
+        "/* Those of the first axis. The next axis has the next one, or the next SELFCAL_FRAME_HYPOTHESES. */",
+    ]
+    for suffix in SENT:
+        lines.append(f"#define SELFCAL_FRAME_{OF_AXIS[suffix]}_ID 0x{_first(database, suffix).frame_id:X}U")
+    names = ", ".join(f'"{name}"' for name in AXES)
+    lines += [
+        "",
+        "/* Axes in the order of their messages. Room for hypotheses, parameters of each, and statistics of those. */",
+        f"#define SELFCAL_FRAME_AXES {len(AXES)}U",
+        f"#define SELFCAL_FRAME_AXIS_NAMES {{{names}}}",
+        f"#define SELFCAL_FRAME_HYPOTHESES {HYPOTHESES}U",
+        f"#define SELFCAL_FRAME_PLACES {PLACES}U",
+        f"#define SELFCAL_FRAME_STATISTICS {len(STATISTICS)}U",
+        "",
+        "/* Units are those of a gyro axis; an accelerometer's are alike in m/s^2. */",
+    ]
+    for suffix in SENT:
+        lines += _of_message(_first(database, suffix), OF_AXIS[suffix])
+    for name in (STATUS, CORRECTED, ANSWER):
+        lines += _of_message(database.get_message_by_name(name), name)
+    lines += ["#endif", ""]
+    return "\n".join(lines)
+
+
+def _of_message(message: Message, name: str) -> list[str]:
+    """Items of a message, and the numbers of their choices."""
+    members = [field for field in fields(message) if not LATER.match(field.name)]
+    more = "" if len(members) == len(fields(message)) else f" Each later column's are {len(members)} higher."
+    lines = [f"/* Items of the message {message.name}.{more} */", *_items(f"SELFCAL_{name}", members)]
+    for signal in message.signals:
+        for number, word in ({} if _as_elsewhere(signal) else signal.choices or {}).items():
+            lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
+    return lines if lines[-1] == "" else [*lines, ""]
+
+
+def _entry(head: str, text: str) -> str:
+    """An item of a list, as long lines as the documents have."""
+    return textwrap.fill(
+        f"- {head}: {text}", 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
+    )
+
+
+def table(database: Database) -> str:
+    """Every signal of every message for lib/WIRE.md, as Markdown lists."""
+    check(database)
+    lines = ["Every frame:", "", _entry("bits 0 to 31, `value`", "as the item says")]
+    status = database.get_message_by_name(STATUS)
+    for name, (start, length) in COMMON.items():
+        comment = (status.get_signal_by_name(name).comment or "").rstrip(".")
+        lines.append(_entry(f"bits {start} to {start + length - 1}, `{name}`", comment))
+    titles = {}
+    for suffix in OF_AXIS:
+        ids = [database.get_message_by_name(a.upper() + suffix).frame_id for a in AXES]
+        said = ", ".join(f"`0x{id_:X}` {a.upper()}{suffix}" for id_, a in zip(ids, AXES, strict=True))
+        more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
+        titles[AXES[0].upper() + suffix] = said + more
+    titles |= {
+        name: f"`0x{database.get_message_by_name(name).frame_id:X}` {name}" for name in (STATUS, CORRECTED, ANSWER)
+    }
+    for name, title in titles.items():
+        lines += ["", f"### {HEADINGS[name.removeprefix(AXES[0].upper())]}", "", *textwrap.wrap(title, 120), ""]
+        suffix = name.removeprefix(AXES[0].upper())
+        theirs = [database.get_message_by_name(AXES[-1].upper() + suffix)] if suffix in OF_AXIS else []
+        accel = {field.name: field.unit for message in theirs for field in fields(message)}
+        for field in fields(database.get_message_by_name(name)):
+            kind = f"{field.kind}{field.length}" + (f" × {field.scale:g}" if field.scale != 1.0 else "")
+            unit = f", {field.unit}" if field.unit else ""
+            if accel.get(field.name, field.unit) != field.unit:
+                unit += f" (accelerometers: {accel[field.name]})"
+            meaning = field.comment + (f": {field.choices}" if field.choices else "")
+            lines.append(_entry(f"{field.item} `{field.name}`, {kind}{_bits(field)}{unit}", meaning))
+    command = database.get_message_by_name(COMMAND)
+    lines += ["", "### Command, from the host", "", f"`0x{command.frame_id:X}` COMMAND", ""]
+    for signal in command.signals:
+        choices = _words(signal)
+        meaning = (signal.comment or "").rstrip(".") + (f": {choices}" if choices else "")
+        lines.append(_entry(f"bits {signal.start} to {signal.start + signal.length - 1}, `{signal.name}`", meaning))
+    return "\n".join(lines) + "\n"
+
+
+def page(text: str, database: Database) -> str:
+    """lib/WIRE.md, its lists made anew. Raises UserError if it has no place for them."""
+    head, mark, _ = text.partition(MARK)
+    if not mark:
+        raise UserError(f"lib/WIRE.md: no line '{MARK.strip()}'")
+    return head + mark + "\n" + table(database)
+
+
+def main() -> None:
+    """Write DBC file, header and page."""
+    parser = argparse.ArgumentParser(prog="python -m selfcal.wire.frames_codegen", description=__doc__)
+    parser.parse_args()
+    try:
+        wire = ROOT / "lib" / "WIRE.md"
+        (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")  # first: the others are made from it
+        wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
+        (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
+    except UserError as error:
+        parser.exit(2, f"selfcal: error: {error}\n")
+
+
+if __name__ == "__main__":
+    main()

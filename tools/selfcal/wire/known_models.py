@@ -1,0 +1,84 @@
+"""Which model a module runs: the one whose tables have the `model_id` that its status tells."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import lru_cache
+from itertools import combinations
+from pathlib import Path
+
+from selfcal.base.errors import UserError
+from selfcal.diagnosis.warm import Start, warmed
+from selfcal.diagnosis.warm import load as load_start
+from selfcal.model.file import Model
+from selfcal.model.tables import Tables, make_tables
+from selfcal.wire.dbc_file import BY_PLACE, Names
+from selfcal.wire.frames import AXES, names_of
+
+
+class KnownModels:
+    """The default model, and that of the file `path`, with the diagnosis `start` that its module was built from. Raises
+    UserError for a file that is no model, or a start that is not of it."""
+
+    def __init__(self, path: Path | str | None = None, start: Path | str | None = None) -> None:
+        if start is not None and path is None:
+            raise UserError("--from goes with --model: it is of one model")
+        self.models = [*([] if path is None else [Model.load(path)]), Model.load()]
+        self._start = None if start is None else load_start(start, self.models[0])
+        self._named = lru_cache(maxsize=32)(self._find)
+
+    def names(self, status: Mapping[str, float]) -> Names:
+        """Names of the model that a module with this status runs; BY_PLACE if it is none of these, or not told yet."""
+        told = tuple(status.get(key, math.nan) for key in ("model_id", "bank_interval", "bank_block"))
+        return BY_PLACE if any(math.isnan(value) for value in told) else self._named(*told)
+
+    def advice(self, status: Mapping[str, float]) -> str:
+        """What to do where the names are places; empty if nothing is."""
+        if "model_id" not in status or "bank_block" not in status or self.names(status).known:
+            return ""
+        return f"names are places: give the model {int(status['model_id']):08x} that it was built with, --model FILE"
+
+    def _find(self, model_id: float, interval_s: float, block: float) -> Names:
+        for model in self.models:
+            start = self._start if model is self.models[0] else None
+            if int(model_id) in _ids(model, start, interval_s, int(block)):
+                return names_of(model)
+        return BY_PLACE
+
+
+def _ids(model: Model, start: Start | None, interval_s: float, block: int) -> Iterator[int]:
+    """Of the model's tables for each target and each choice of axes that telemetry can carry, in the model's order."""
+    if not 0.0 < interval_s < math.inf or block < 1:
+        return
+    sent = [axis for axis in model.axes if axis in AXES]
+    for target in model.nodes:
+        try:
+            tables = make_tables(model, block / interval_s, tuple(sent), target, 1.0 / interval_s)
+            tables = warmed(tables, start)
+        except UserError:  # an interval that the model has no tables for
+            continue
+        for count in range(len(sent), 0, -1):
+            for chosen in combinations(range(len(sent)), count):
+                yield _chosen(tables, chosen).id
+
+
+def _chosen(tables: Tables, axes: tuple[int, ...]) -> Tables:
+    """The tables of some of the axes."""
+    return replace(
+        tables,
+        axes=tuple(tables.axes[at] for at in axes),
+        hypotheses=tuple(
+            replace(h, priors=tuple(h.priors[at] for at in axes)) if h.priors else h for h in tables.hypotheses
+        ),
+        regressors=tuple(
+            replace(
+                one,
+                coefficient_sd=tuple(one.coefficient_sd[at] for at in axes),
+                ln_odds=tuple(one.ln_odds[at] for at in axes),
+                coefficient_mean=tuple(one.coefficient_mean[at] for at in axes if one.coefficient_mean),
+            )
+            for one in tables.regressors
+        ),
+    )

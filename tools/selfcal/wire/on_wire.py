@@ -1,0 +1,60 @@
+"""Axes of any name and unit on the wire of the host's module: each takes the message of an axis that it does not have.
+
+Telemetry has messages for six axes in fixed units. A number in it has no unit of its own, so any axis fits. Axes of one
+group take messages of one unit, those of the accelerometer first: the gate watches a gyro in its own way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from selfcal.base.errors import UserError
+from selfcal.logs.recording import Recording
+from selfcal.model.file import Group, Model
+from selfcal.wire.dbc_file import AXIS_UNITS
+
+
+def places(model: Model, axes: Sequence[str]) -> dict[str, str]:
+    """By axis the one whose message it takes: itself where it has one. Raises UserError for a standard axis in another
+    unit, and where there is no room."""
+    for name in axes:
+        unit = model.group_of(name).unit
+        if name in AXIS_UNITS and AXIS_UNITS[name] != unit:
+            raise UserError(
+                f"{model.path}: axis {name} is in {unit}; telemetry carries it in {AXIS_UNITS[name]}, so the model "
+                "must be in that unit"
+            )
+    found = {name: name for name in axes if name in AXIS_UNITS}
+    for group in model.groups:
+        foreign = [name for name in group.axes if name in axes and name not in AXIS_UNITS]
+        free = [name for name in AXIS_UNITS if name not in found.values()]
+        rooms = [[name for name in free if AXIS_UNITS[name] == unit] for unit in ("m/s^2", "deg/s")]
+        room = next((one for one in rooms if len(one) >= len(foreign)), None)
+        if room is None:
+            raise UserError(
+                f"telemetry has no room for {', '.join(foreign)}: it carries six axes, three of one unit; choose fewer "
+                "with --axis"
+            )
+        found |= zip(foreign, room, strict=False)
+    return {name: found[name] for name in axes}
+
+
+def sent(model: Model, recording: Recording, taken: Mapping[str, str]) -> tuple[Model, Recording]:
+    """The model and the recording with each axis under the name and unit of its message."""
+    groups = []
+    for group in model.groups:
+        names = [name for name in group.axes if name in taken]
+        if names:
+            groups.append(_renamed(group, {name: taken[name] for name in names}))
+    columns = dict(recording.columns)
+    for name, place in taken.items():
+        values = recording.in_unit(name, model.group_of(name).unit)
+        columns[place] = replace(recording.columns[name], name=place, unit=AXIS_UNITS[place], values=values)
+    regressors = tuple(replace(one, column=taken.get(one.column, one.column)) for one in model.regressors)
+    return replace(model, groups=tuple(groups), regressors=regressors), replace(recording, columns=columns)
+
+
+def _renamed(group: Group, taken: Mapping[str, str]) -> Group:
+    own = {taken[name]: priors for name, priors in group.own_priors.items() if name in taken}
+    return replace(group, axes=tuple(taken.values()), unit=AXIS_UNITS[next(iter(taken.values()))], own_priors=own)

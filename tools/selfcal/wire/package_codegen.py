@@ -1,0 +1,57 @@
+"""What `lib/` has as a package, from its sources: default tables, the version in each manifest, the licence.
+
+python -m selfcal.wire.package_codegen    write lib/default/, the versions in lib/'s manifests, and lib/LICENSE
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shutil
+from pathlib import Path
+
+from selfcal.base.errors import UserError
+from selfcal.verbs.codegen import codegen
+from selfcal.wire.frames import ROOT
+
+#: Core that the default tables are for: a package goes into firmware.
+TARGET = "cortex-m4f"
+#: Manifests that must state the version themselves, and how. CMake and pkg-config read it from lib/selfcal.h.
+VERSIONS = {
+    "library.json": re.compile(r'(?<="version": ")[^"]*'),
+    "library.properties": re.compile(r"(?<=^version=).*$", re.MULTILINE),
+    "idf_component.yml": re.compile(r'(?<=^version: ")[^"]*', re.MULTILINE),
+}
+
+
+def version(library: Path) -> str:
+    """SELFCAL_VERSION. Raises UserError where lib/selfcal.h has none."""
+    found = re.search(r'^#define SELFCAL_VERSION "([^"]+)"', (library / "selfcal.h").read_text("utf-8"), re.MULTILINE)
+    if found is None:
+        raise UserError(f"{library / 'selfcal.h'}: no SELFCAL_VERSION")
+    return found[1]
+
+
+def write(library: Path) -> None:
+    """Write all into `library`, a folder like lib/. Raises UserError for a manifest without a version."""
+    codegen(None, library / "default", target=TARGET)
+    for name, place in VERSIONS.items():
+        text, count = place.subn(version(library), (library / name).read_text("utf-8"))
+        if count != 1:
+            raise UserError(f"{library / name}: {count} lines with a version, not one")
+        (library / name).write_text(text, encoding="utf-8")
+    shutil.copyfile(ROOT / "LICENSE", library / "LICENSE")
+
+
+def main() -> None:
+    """Write the files of lib/."""
+    parser = argparse.ArgumentParser(prog="python -m selfcal.wire.package_codegen", description=__doc__)
+    parser.parse_args()
+    try:
+        write(ROOT / "lib")
+    except UserError as error:
+        parser.exit(2, f"selfcal: error: {error}\n")
+
+
+if __name__ == "__main__":
+    main()

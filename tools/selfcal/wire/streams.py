@@ -1,0 +1,259 @@
+"""Reports of modules for other programs, as they come: JSON by UDP, by lines, by Foxglove's websocket, in MCAP files.
+
+Each report is one JSON object. PlotJuggler takes the form of UDP and lines: its curves are node0/gx/bias/mean and so
+on, and `timestamp` is the host's clock when the report came, s since 1970. Foxglove and MCAP have a topic an axis,
+/selfcal/node0/gx, and the same numbers in it.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
+
+from selfcal.adequacy.document import finite
+from selfcal.base.errors import UserError, install
+from selfcal.base.units import parameter_unit
+from selfcal.wire.dbc_file import PLACE_NAMES, Names
+from selfcal.wire.frames import AXES, AxisReport, axis_unit
+from selfcal.wire.live import told_of
+
+if TYPE_CHECKING:
+    import can
+
+#: Where the programs listen, or look, unless they are told otherwise: PlotJuggler's UDP server, Foxglove's websocket.
+PORTS = {"udp-json": 9870, "foxglove": 8765}
+KINDS = (*PORTS, "jsonl")
+HOST = "127.0.0.1"
+#: Statistics of a parameter that are told.
+TOLD = ("mean", "median", "sd", "q05", "q95")
+#: Topic and schema of raw frames in an MCAP file, and the size of one record there at most.
+FRAMES = "/selfcal/frames"
+LARGEST = 1 << 16
+
+
+class Stream(Protocol):
+    """Where reports go."""
+
+    def send(self, report: Mapping[str, Any], at_s: float) -> None:
+        """Take what `content` made of a report, that came at `at_s`, s since 1970."""
+
+    def close(self) -> None:
+        """No more will come."""
+
+
+def content(report: AxisReport, names: Names) -> dict[str, Any]:
+    """A report as JSON has it, by the module's `names`; what did not arrive is not there, what is no number null."""
+    v, unit = report.values, axis_unit(report.axis)
+    found: dict[str, Any] = {
+        "node": report.node,
+        "axis": report.axis,
+        "time_s": report.time_s,
+        "complete": report.complete,
+        "unit": unit,
+        "bias": {key: v[f"bias_{key}"] for key in ("mean", "sd") if f"bias_{key}" in v},
+    }
+    if "count" in v:
+        found["averages"] = int(v["count"])
+    laws: dict[str, Any] = {}
+    for k in range(report.hypotheses or told_of(report)):
+        known = k < len(names.hypotheses)
+        law: dict[str, Any] = {}
+        if f"h{k}_probability" in v:
+            law["probability"] = v[f"h{k}_probability"]
+        for place, parameter in zip(PLACE_NAMES, names.parameters[k] if known else PLACE_NAMES, strict=False):
+            told = {key: v[f"h{k}_{place}_{key}"] for key in TOLD if f"h{k}_{place}_{key}" in v}
+            if told:
+                law[parameter] = {**told, "unit": parameter_unit(parameter, unit)}
+        laws[names.hypotheses[k] if known else f"h{k}"] = law
+    found["laws"] = laws
+    if report.adequacy is not None:
+        found["adequacy"] = {"state": report.adequacy.state, "suspicion": report.adequacy.suspicion}
+    coefficients = report.coefficients(names)
+    if coefficients:
+        found["coefficients"] = {
+            column: {"mean": mean, "sd": sd, "probability": p} for column, (mean, sd, p) in coefficients.items()
+        }
+    plain: dict[str, Any] = finite(found)
+    return plain
+
+
+def topic(report: Mapping[str, Any]) -> str:
+    """Of a report's content."""
+    return f"/selfcal/node{report['node']}/{report['axis']}"
+
+
+def line_of(report: Mapping[str, Any], at_s: float) -> str:
+    """A report for PlotJuggler."""
+    numbers = {key: value for key, value in report.items() if key not in ("node", "axis")}
+    return json.dumps({"timestamp": at_s, f"node{report['node']}": {report["axis"]: numbers}}, allow_nan=False)
+
+
+class _Udp:
+    """A datagram each; nobody has to listen."""
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            family, kind, _, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
+        except OSError as error:
+            raise UserError(f"--stream udp-json: {host}: {error.strerror or error}") from error
+        self._address, self._socket = address, socket.socket(family, kind)
+
+    def send(self, report: Mapping[str, Any], at_s: float) -> None:
+        try:
+            self._socket.sendto(line_of(report, at_s).encode(), self._address)
+        except ConnectionRefusedError:
+            pass  # of an earlier datagram that nobody took
+        except OSError as error:
+            raise UserError(f"--stream udp-json: {error.strerror or error}") from error
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+class _Lines:
+    """A line each on stdout, at once."""
+
+    def send(self, report: Mapping[str, Any], at_s: float) -> None:
+        print(line_of(report, at_s), flush=True)
+
+    def close(self) -> None:
+        sys.stdout.flush()
+
+
+class _Foxglove:
+    """A channel an axis, by Foxglove's SDK."""
+
+    def __init__(self, host: str, port: int) -> None:
+        try:
+            import foxglove
+        except ImportError as error:
+            typed = install("selfcal[foxglove]")
+            raise UserError(f"--stream foxglove: foxglove-sdk is not installed: {typed}") from error
+        self._context = foxglove.Context()
+        self._channels: dict[str, foxglove.Channel] = {}
+        try:
+            self._server = foxglove.start_server(name="selfcal", host=host, port=port, context=self._context)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise UserError(f"--stream foxglove: {host}:{port}: {error}") from error
+
+    def send(self, report: Mapping[str, Any], at_s: float) -> None:
+        import foxglove
+
+        name = topic(report)
+        if name not in self._channels:  # all of a module, so that a viewer misses the first report at most
+            names = [topic({**report, "axis": axis}) for axis in AXES]
+            schema = {"type": "object"}
+            self._channels |= {one: foxglove.Channel(one, schema=schema, context=self._context) for one in names}
+        self._channels[name].log(dict(report), log_time=round(at_s * 1e9))
+
+    def close(self) -> None:
+        self._server.stop()
+
+
+def check(wanted: str) -> tuple[str, str, int]:
+    """Kind, host and port of an option `KIND[:HOST:PORT]`. Raises UserError."""
+    kind, *where = wanted.split(":")
+    if kind not in KINDS:
+        raise UserError(f"--stream {wanted}: there is no such stream ({', '.join(KINDS)})")
+    if not where:
+        return kind, HOST, PORTS.get(kind, 0)
+    if kind == "jsonl" or len(where) != 2 or not where[0] or not where[1].isdecimal() or not 0 < int(where[1]) < 65536:
+        raise UserError(f"--stream {wanted}: write {' or '.join(f'{one}:HOST:PORT' for one in PORTS)}, or jsonl")
+    return kind, where[0], int(where[1])
+
+
+def open_streams(wanted: Sequence[str], stack: ExitStack) -> list[Stream]:
+    """The streams of `--stream`, closed with the `stack`. Raises UserError."""
+    found: list[Stream] = []
+    for one in wanted:
+        kind, host, port = check(one)
+        if kind == "jsonl":
+            found.append(_Lines())
+        else:
+            found.append(_Udp(host, port) if kind == "udp-json" else _Foxglove(host, port))
+        stack.callback(found[-1].close)
+    return found
+
+
+class McapLog:
+    """A new MCAP file: the raw frames, and the reports, a topic an axis. Not chunked: a kill leaves all but the last
+    second, and the summary at its end."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        from mcap.writer import CompressionType, Writer
+
+        self.file = stream
+        self._writer = Writer(stream, compression=CompressionType.NONE, use_chunking=False)
+        self._writer.start(profile="", library="selfcal")
+        schema = json.dumps({"type": "object"}).encode()
+        self._schemas = {
+            name: self._writer.register_schema(name=f"selfcal.{name}", encoding="jsonschema", data=schema)
+            for name in ("Frame", "Report")
+        }
+        self._channels: dict[str, int] = {}
+
+    def __call__(self, frame: can.Message) -> None:
+        """Add a frame, as python-can's loggers do."""
+        told = {
+            "id": frame.arbitration_id,
+            "extended": frame.is_extended_id,
+            "data": base64.b64encode(bytes(frame.data)).decode(),
+        }
+        self._add(FRAMES, "Frame", told, frame.timestamp or time.time())
+
+    def send(self, report: Mapping[str, Any], at_s: float) -> None:
+        """Add a report's content."""
+        self._add(topic(report), "Report", report, at_s)
+
+    def _add(self, name: str, schema: str, told: Mapping[str, Any], at_s: float) -> None:
+        if name not in self._channels:
+            self._channels[name] = self._writer.register_channel(name, "json", self._schemas[schema])
+        at_ns = max(0, round(at_s * 1e9))
+        data = json.dumps(told, allow_nan=False).encode()
+        self._writer.add_message(self._channels[name], log_time=at_ns, publish_time=at_ns, data=data)
+
+    def stop(self) -> None:
+        """Write the summary and close."""
+        finish: Callable[[], None] = self._writer.finish  # mcap does not type it
+        finish()
+        self.file.close()
+
+
+class McapFrames:
+    """The frames of a file that McapLog wrote, as python-can's readers give them. A record of more than LARGEST bytes
+    ends it."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+
+    def __iter__(self) -> Iterator[can.Message]:
+        import can
+        from mcap.records import Channel, Message
+        from mcap.stream_reader import StreamReader
+
+        frames: set[int] = set()
+        for record in StreamReader(self._file, emit_chunks=True, record_size_limit=LARGEST).records:
+            if isinstance(record, Channel) and record.topic == FRAMES:
+                frames.add(record.id)
+            elif isinstance(record, Message) and record.channel_id in frames:
+                told = json.loads(record.data)
+                data = base64.b64decode(told["data"], validate=True)
+                yield can.Message(
+                    timestamp=record.log_time * 1e-9,
+                    arbitration_id=int(told["id"]),
+                    is_extended_id=bool(told["extended"]),
+                    dlc=len(data),
+                    data=data,
+                    check=True,
+                )
+
+    def stop(self) -> None:
+        """Close the file."""
+        self._file.close()
