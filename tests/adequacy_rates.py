@@ -25,10 +25,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.model.file import Handling, Model
 from selfcal.model.tables import Tables, make_tables
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.wire.frames import choices
 
 AXES = ("gx", "gy", "gz", "ax", "ay", "az")

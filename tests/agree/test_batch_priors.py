@@ -19,6 +19,7 @@ import yaml
 from scipy import integrate, stats
 from test_docs import assert_alike
 
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.bank.reference import identify_axis
 from selfcal.bank.result import HALF_90
@@ -26,7 +27,6 @@ from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
 from selfcal.model.file import DEFAULT, Model, Prior
 from selfcal.model.tables import make_tables
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.fleet import fleet
 from selfcal.verbs.identify import identify
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model, Regressor
 from selfcal.model.tables import Tables, make_tables
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.identify import identify
 
 from agreement import MODEL, Filter, faded, fading

@@ -15,11 +15,11 @@ import yaml
 from scipy import stats
 
 from selfcal import _reference
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.laws import NAMED
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 
 from agreement import (
     REPORT_LIMIT,

@@ -17,7 +17,7 @@ from selfcal import _reference
 from selfcal.bank.library import Bank
 from selfcal.model.file import Model
 from selfcal.model.tables import make_tables
-from selfcal.verbs.codegen import coarsest_exponent
+from selfcal.wire.c_tables import coarsest_exponent
 
 from conftest import worst_difference
 

@@ -11,7 +11,8 @@ import pytest
 
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model
-from selfcal.studies.montecarlo import montecarlo, show
+from selfcal.studies.montecarlo import show
+from selfcal.verbs.montecarlo import montecarlo
 
 #: 400 records a law, one hour at 1 Hz, as the issue asks.
 RECORDS = 400

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.model.file import Model
 from selfcal.model.laws import NAMED, PLAIN
 from selfcal.model.tables import Tables, make_tables
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 
 from agreement import REGRESSORS, columns_of, push, tables_of
 

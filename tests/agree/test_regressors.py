@@ -15,6 +15,7 @@ import pytest
 from scipy import stats
 
 from selfcal import _library32
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank import reference
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
@@ -22,7 +23,6 @@ from selfcal.logs.recording import save
 from selfcal.model.file import MOST_COLUMNS, Model
 from selfcal.model.laws import PLAIN
 from selfcal.model.tables import make_tables
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 

@@ -18,13 +18,13 @@ import pytest
 from scipy.interpolate import BSpline
 from scipy.stats import binom
 
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.bank.reference import identify_axis
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import load
 from selfcal.model.laws import PLACES
 from selfcal.model.tables import AxisTable, Tables, make_grid, make_tables
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.verbs.simulate import simulate
 
 from agreement import (

@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.bank.reference import identify_axis
 from selfcal.bank.result import in_unit
@@ -24,7 +25,6 @@ from selfcal.base.errors import UserError
 from selfcal.model.file import Model
 from selfcal.model.laws import PLACES, SUMS
 from selfcal.model.tables import make_tables
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.codegen import codegen
 
 from agreement import (

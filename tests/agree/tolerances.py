@@ -27,13 +27,14 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank import reference
 from selfcal.bank.library import Bank
 from selfcal.bank.result import AxisResult
 from selfcal.logs.recording import load
 from selfcal.model.laws import NAMED, PLAIN, SUMS
 from selfcal.model.tables import make_tables
-from selfcal.studies.montecarlo import draw, montecarlo, simulate_bank_samples
+from selfcal.verbs.montecarlo import montecarlo
 
 sys.path[:0] = [str(Path(__file__).resolve().parents[1] / folder) for folder in ("common", ".")]
 from agreement import (  # noqa: E402

@@ -25,11 +25,11 @@ from selfcal.batch.spread import Row, spread
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.studies.methods.problem import Problem
-from selfcal.studies.montecarlo import montecarlo
-from selfcal.studies.navigate import navigate
-from selfcal.studies.paper import paper
 from selfcal.studies.rivals import ensemble, measured
-from selfcal.studies.worth import worth
+from selfcal.verbs.montecarlo import montecarlo
+from selfcal.verbs.navigate import navigate
+from selfcal.verbs.paper import paper
+from selfcal.verbs.worth import worth
 
 from conftest import COMMAND, case_records
 

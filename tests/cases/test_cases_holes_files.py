@@ -28,9 +28,10 @@ from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import make_tables
 from selfcal.show.export import FORMS, write_export
-from selfcal.verbs.codegen import bank_bytes, codegen, write_tables
+from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
+from selfcal.wire.c_tables import bank_bytes, write_tables
 from selfcal.wire.dbc_file import Names, dbc
 
 from conftest import ROOT, case_records
@@ -233,7 +234,7 @@ def test_a_recording_with_a_line_feed_in_its_name(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 import numpy as np
-from selfcal.recording import save
+from selfcal.logs.recording import save
 at, calls = int(sys.argv[2]), 0
 def until(name):
     real = getattr(os, name)

@@ -18,6 +18,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
+from selfcal.adequacy.identify import identify_axis
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
@@ -28,7 +29,6 @@ from selfcal.readings.held import held as held_rows
 from selfcal.readings.lost_words import recurring_of
 from selfcal.readings.readings import evened, look
 from selfcal.verbs.diagnose import diagnose
-from selfcal.verbs.identify import identify_axis
 
 from conftest import case_records, run, shared_case, shared_recording
 

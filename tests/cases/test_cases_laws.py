@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.model.laws import PLACES
 from selfcal.model.tables import Tables, make_tables
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.wire.frames import choices
 
 from agreement import LIMITS, MODEL, REPORT_LIMIT, Floats, a_record, exact_report, model_of, push, tables_of

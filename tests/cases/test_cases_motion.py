@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from selfcal.adequacy.identify import identify_axis
 from selfcal.base.errors import UserError
 from selfcal.diagnosis import integrity, words
 from selfcal.diagnosis.finding import Diagnosed
@@ -25,7 +26,7 @@ from selfcal.model.file import Model
 from selfcal.readings.motion import loud
 from selfcal.readings.readings import look
 from selfcal.verbs.diagnose import diagnose
-from selfcal.verbs.identify import identify, identify_axis
+from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 
 from conftest import case_records, shared_case, shared_recording

@@ -20,6 +20,7 @@ import pytest
 from gated import Gated
 from numpy.typing import NDArray
 
+from selfcal.adequacy.identify import identify_axis
 from selfcal.base import ending
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
@@ -34,7 +35,7 @@ from selfcal.readings.rest import rest_of
 from selfcal.verbs import diagnose as diagnose_module
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
-from selfcal.verbs.identify import identify, identify_axis
+from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
 
 from conftest import COMMAND, case_records, run, shared_case

@@ -22,8 +22,8 @@ from pathlib import Path
 import pytest
 
 import selfcal
-from selfcal.verbs.demo import SHIPPED
 from selfcal.wire import package_codegen
+from selfcal.wire.demo import SHIPPED
 
 from conftest import CASE_RECORDS, ROOT
 
@@ -91,7 +91,7 @@ import numpy as np
 import selfcal
 selfcal._fma = lambda: sys.argv[1] == "fma"
 from selfcal import _library32
-from selfcal.engines.library import Bank
+from selfcal.bank.library import Bank
 from selfcal.model import DEFAULT, Model
 from selfcal.tables import make_tables
 for name in ("default", "sums"):

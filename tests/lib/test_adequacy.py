@@ -17,10 +17,10 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.model.file import Model
 from selfcal.model.tables import Tables, make_tables
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate

@@ -17,11 +17,11 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.model.file import DEFAULT, Handling, Model
 from selfcal.model.tables import Tables, make_tables
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate

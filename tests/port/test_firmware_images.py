@@ -22,9 +22,9 @@ from selfcal.logs import recording as recording_module
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.verbs.codegen import codegen
-from selfcal.verbs.command import build_flag
-from selfcal.verbs.replay import TARGETS, build, emulator, write_rows
+from selfcal.wire.command import build_flag
 from selfcal.wire.frames import load_dbc
+from selfcal.wire.replay import TARGETS, build, emulator, write_rows
 
 #: Frames of a status: the items that the DBC has.
 STATUS = len({s.multiplexer_ids[0] for s in load_dbc().get_message_by_name("STATUS").signals if s.multiplexer_ids})

@@ -20,14 +20,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from selfcal.adequacy.identify import identify_axis
 from selfcal.base.errors import UserError
 from selfcal.logs import recording as recording_module
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Model
-from selfcal.verbs.identify import identify_axis
-from selfcal.verbs.replay import ROOT, TARGETS, build, emulator, replay, run, write_rows
+from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
-from selfcal.wire.frames import AxisReport, axis_unit, load_dbc, names_of
+from selfcal.wire.frames import ROOT, AxisReport, axis_unit, load_dbc, names_of
+from selfcal.wire.replay import TARGETS, build, emulator, run, write_rows
 
 from conftest import shared_recording
 
@@ -216,7 +217,7 @@ def test_the_firmware_says_what_is_wrong_with_its_rows(  # type: ignore[no-untyp
         written(recording, model, axes, path)
         path.write_bytes(damage(path.read_bytes()))
 
-    monkeypatch.setattr("selfcal.verbs.replay.write_rows", damaged)
+    monkeypatch.setattr("selfcal.wire.replay.write_rows", damaged)
     with pytest.raises(UserError, match=complaint):
         run(build(model, recording.rate_hz, axes, "cortex-m4f"), recording, model, axes, 10.0, "cortex-m4f")
 

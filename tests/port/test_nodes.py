@@ -26,10 +26,11 @@ from selfcal.model.tables import make_tables
 from selfcal.verbs import monitor as monitor_module
 from selfcal.verbs.dbc import dbc
 from selfcal.verbs.monitor import monitor
-from selfcal.verbs.replay import build, can_bus, replay, write_rows
+from selfcal.verbs.replay import replay
 from selfcal.wire import frames as wire
 from selfcal.wire.frames import ROOT, Decoder
 from selfcal.wire.known_models import KnownModels
+from selfcal.wire.replay import build, can_bus, write_rows
 
 from conftest import needs_multicast, run
 from wire_stream import lines, message, serial_line, stream

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from selfcal.logs import recording as recording_module
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
-from selfcal.verbs.replay import build, replay, run
+from selfcal.verbs.replay import replay
 from selfcal.wire.dbc_file import AXIS_UNITS
 from selfcal.wire.frames import AXES, REASONS, choices, reasons
+from selfcal.wire.replay import build, run
 
 RATE_HZ = 10.0
 #: White noise of 0.04 deg/s/sqrt(Hz) and 1e-3 m/s^2/sqrt(Hz), within the default model's priors; sd of a reading.

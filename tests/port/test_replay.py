@@ -28,7 +28,8 @@ from selfcal.model.file import Model
 from selfcal.model.tables import make_tables
 from selfcal.verbs import replay as replay_module
 from selfcal.verbs.identify import identify
-from selfcal.verbs.replay import build, replay, run, write_rows
+from selfcal.verbs.replay import replay
+from selfcal.wire.replay import build, run, write_rows
 
 from conftest import run as started
 from conftest import shared_recording

@@ -28,7 +28,8 @@ from selfcal.show import table
 from selfcal.show.table import show
 from selfcal.verbs.demo import demo
 from selfcal.verbs.monitor import monitor
-from selfcal.verbs.replay import build, can_bus, replay, write_rows
+from selfcal.verbs.replay import replay
+from selfcal.wire.replay import build, can_bus, write_rows
 
 from conftest import needs_multicast
 

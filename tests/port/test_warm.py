@@ -1,4 +1,4 @@
-"""The warm start (tools/selfcal/diagnosis/warm.py): the prior that a diagnosis gives, in the library and in the firmware.
+"""The warm start (tools/selfcal/diagnosis/warm.py): the prior of a diagnosis, in the library and in the firmware.
 
 Truth: the dense Gaussian density of a record under the stated prior; records whose truth is drawn from that prior; and
 a simulated part. The figures of tests/ACCURACY.md come from tests/warm_start.py, whose campaign is run here with few

@@ -30,6 +30,7 @@ from selfcal.adequacy.allan import (
     terms_of,
 )
 from selfcal.adequacy.checks import CHECK_LIMIT, judge
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.blocks import block_means
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
@@ -38,7 +39,6 @@ from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN, named
 from selfcal.model.tables import make_tables
 from selfcal.show.table import show
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.identify import identify
 
 from conftest import shared_recording

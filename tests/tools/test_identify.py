@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from selfcal import _library32
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank import reference
 from selfcal.bank.blocks import REPORT_MIN, block_means
 from selfcal.bank.library import Bank
@@ -23,7 +24,6 @@ from selfcal.model.file import NODES, Model, Prior
 from selfcal.model.laws import PLAIN
 from selfcal.model.tables import make_tables
 from selfcal.show.table import show
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 

@@ -18,8 +18,8 @@ import pytest
 from selfcal.logs import recording
 from selfcal.model.file import Model
 from selfcal.verbs import replay as verb
-from selfcal.verbs.command import build_flag
-from selfcal.verbs.replay import build
+from selfcal.wire.command import build_flag
+from selfcal.wire.replay import build
 
 from conftest import ROOT
 

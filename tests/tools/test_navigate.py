@@ -19,17 +19,7 @@ from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.model.file import Model
 from selfcal.model.parts import AXES, LAWS, Floats
 from selfcal.model.tables import make_tables
-from selfcal.studies.navigate import (
-    FIGURES,
-    HORIZONS_S,
-    TIMES,
-    TITLES,
-    identified_noise,
-    matched,
-    navigate,
-    sheet_noise,
-    show,
-)
+from selfcal.studies.navigate import FIGURES, HORIZONS_S, TIMES, TITLES, identified_noise, matched, sheet_noise, show
 from selfcal.studies.navigation import (
     GPS_S,
     JUDGED,
@@ -44,6 +34,7 @@ from selfcal.studies.navigation import (
     nees,
     true_noise,
 )
+from selfcal.verbs.navigate import navigate
 
 from conftest import run
 

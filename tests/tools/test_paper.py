@@ -16,14 +16,15 @@ import pytest
 from scipy import signal
 
 from selfcal.adequacy.allan import overlapping
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model
 from selfcal.show.chart import Figure, Panel
-from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.studies.paper import paper, show
+from selfcal.studies.paper import show
 from selfcal.studies.paper_figures import section3, section4, survey
 from selfcal.studies.paper_figures.told import Told
 from selfcal.verbs.identify import identify
+from selfcal.verbs.paper import paper
 from selfcal.verbs.part import part
 
 from conftest import SHARED_DATA, run

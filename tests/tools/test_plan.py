@@ -15,8 +15,9 @@ import pytest
 import yaml
 
 from selfcal.base.errors import UserError
+from selfcal.batch.plan import LEAST, Wish, _half_interval, coefficient_rows, rows_of
 from selfcal.model.file import DEFAULT, Model
-from selfcal.verbs.plan import LEAST, Wish, _half_interval, coefficient_rows, plan, rows_of
+from selfcal.verbs.plan import plan
 
 from conftest import case_records, run
 

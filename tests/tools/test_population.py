@@ -18,6 +18,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.bank.result import HALF_90
 from selfcal.base.units import factor
@@ -27,7 +28,6 @@ from selfcal.batch.summary import apart_words
 from selfcal.logs.recording import save
 from selfcal.model.file import DEFAULT, Model, read_yaml
 from selfcal.model.tables import make_tables
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.verbs.fleet import fleet
 
 from conftest import CASE_RECORDS, case_records, run

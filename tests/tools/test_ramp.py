@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from selfcal.bank.library import Bank
+from selfcal.bank.subsets import combine
 from selfcal.logs.recording import as_float
 from selfcal.model.file import DEFAULT, Model
-from selfcal.model.regressors import choices_of, combine, mask_of
+from selfcal.model.regressors import choices_of, mask_of
 from selfcal.model.tables import make_tables
 
 from conftest import case_records

@@ -14,6 +14,7 @@ from scipy import fft, signal
 from scipy.stats import multivariate_normal
 
 from selfcal.adequacy.allan import relative_variance
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model
 from selfcal.model.laws import NAMED
@@ -26,8 +27,8 @@ from selfcal.studies.methods.problem import Floats, Problem, weights
 from selfcal.studies.methods.recursive import update
 from selfcal.studies.methods.steady_state import ln_likelihood
 from selfcal.studies.methods.wavelets import covariance
-from selfcal.studies.montecarlo import simulate_bank_samples
-from selfcal.studies.rivals import longest_stretch, problem_of, rivals, show
+from selfcal.studies.rivals import longest_stretch, problem_of, show
+from selfcal.verbs.rivals import rivals
 
 from conftest import ROOT, run, shared_recording
 

@@ -17,10 +17,11 @@ from scipy import stats
 from selfcal import _reference
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.simulate import show
 from selfcal.logs import recording
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.laws import NAMED
-from selfcal.verbs.simulate import show, simulate
+from selfcal.verbs.simulate import simulate
 
 from conftest import run
 

@@ -19,7 +19,7 @@ import pytest
 from selfcal.base.errors import UserError
 from selfcal.batch import spread as module
 from selfcal.batch.spread import Row, spread
-from selfcal.studies.montecarlo import montecarlo
+from selfcal.verbs.montecarlo import montecarlo
 
 CLUSTER = all(importlib.util.find_spec(name) for name in ("distributed", "pyarrow"))
 needs_cluster = pytest.mark.skipif(not CLUSTER, reason="DASK OR PYARROW ABSENT: make setup-cluster")

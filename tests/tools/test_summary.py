@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.adequacy.summary import Number, halved_after, summarize
 from selfcal.bank.library import Bank
 from selfcal.bank.result import AxisResult, Estimate
@@ -23,7 +24,6 @@ from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN
 from selfcal.model.tables import make_tables
 from selfcal.show import table
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.verbs.identify import identify
 
 from conftest import case_records

@@ -15,15 +15,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.bank.result import AxisResult
 from selfcal.base import units
 from selfcal.base.errors import UserError
-from selfcal.batch.verdicts import CHANCE, FAIL, OPEN, PASS, UNJUDGED, Limits, duration_words, judge
+from selfcal.base.units import duration_words
+from selfcal.batch.verdicts import CHANCE, FAIL, OPEN, PASS, UNJUDGED, Limits, judge
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.model.tables import Tables, make_tables
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.verbs.fleet import fleet
 
 from conftest import case_records, run

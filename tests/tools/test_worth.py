@@ -23,8 +23,8 @@ from selfcal.studies.worth import (
     position_error,
     predictions,
     show,
-    worth,
 )
+from selfcal.verbs.worth import worth
 
 from conftest import ROOT, run
 

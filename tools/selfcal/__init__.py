@@ -8,12 +8,8 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-#: Folder of each verb: a verb is a file there with a function of its name.
-VERBS = {
-    path.stem: path.parent.name
-    for path in sorted(Path(__file__).parent.glob("*/[a-z]*.py"))
-    if path.parent.name in ("verbs", "studies")
-}
+#: File of each verb; it has a function of its name.
+VERBS = {path.stem: path for path in sorted((Path(__file__).parent / "verbs").glob("[a-z]*.py"))}
 
 #: Lines of /proc/cpuinfo that tell of the first core.
 MOST_LINES = 100
@@ -22,7 +18,7 @@ MOST_LINES = 100
 def __getattr__(name: str) -> Any:
     """The verb called `name`, imported when it is first asked for so that the command starts at once."""
     if name in VERBS:
-        return getattr(import_module(f"selfcal.{VERBS[name]}.{name}"), name)
+        return getattr(import_module(f"selfcal.verbs.{name}"), name)
     if name == "_library32":
         globals()[name] = import_module(f"selfcal._library32{'_fma' if _fma() else ''}")
         return globals()[name]

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 import shlex
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -16,11 +14,11 @@ from selfcal.adequacy.allan import Sampled
 from selfcal.adequacy.checks import Judged, against, allan_limit
 from selfcal.adequacy.summary import Number
 from selfcal.bank.result import AxisResult, Estimate
+from selfcal.bank.subsets import Scored
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, short
-from selfcal.base.output import check_place, write_text
+from selfcal.base.output import write_json
 from selfcal.logs.recording import Recording
-from selfcal.model.regressors import Scored
 
 SCHEMA = "selfcal.identify/1"
 #: Where metadata have the device's serial number and the date.
@@ -248,31 +246,7 @@ def regressors_entry(scored: Scored | None) -> dict[str, Any]:
     }
 
 
-def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
-    """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
-    or that is there twice. None and '-' are none."""
-    taken = {Path(one).resolve() for one in inputs if one is not None}
-    for file in files:
-        if file is not None and str(file) != "-":
-            check_place(file)
-            if Path(file).resolve() in taken:
-                raise UserError(f"{file}: is read, or written as another output: give it a name of its own")
-            taken.add(Path(file).resolve())
-
-
-def write_json(document: Mapping[str, Any], path: Path | str) -> None:
-    """Write a document to a file, or to stdout for '-'. What JSON cannot say (infinity, not a number) becomes null."""
-    text = json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
-    if str(path) == "-":
-        sys.stdout.write(text)
-        return
-    write_text(path, text)
-
-
-def finite(value: Any) -> Any:
-    """`value` with None in place of every number that JSON does not have."""
-    if isinstance(value, Mapping):
-        return {key: finite(entry) for key, entry in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(entry) for entry in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def since(recording: Mapping[str, Any]) -> str:
+    """Where a stretch of a recording begins, for its heading."""
+    start_s = recording.get("start_s", 0.0)
+    return f" from {start_s:g} s on" if start_s else ""

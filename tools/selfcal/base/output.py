@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import secrets
 import stat
-from collections.abc import Iterator
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from selfcal.base.errors import UserError
 
@@ -103,3 +107,56 @@ def write_text(path: Path | str, text: str) -> None:
     """Write `text` in UTF-8, as `whole` does. A file's name may have bytes that are no text: they become `\\udc80`."""
     with whole(path) as temporary:
         temporary.write_text(text, encoding="utf-8", errors="backslashreplace")
+
+
+def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
+    """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
+    or that is there twice. None and '-' are none."""
+    taken = {Path(one).resolve() for one in inputs if one is not None}
+    for file in files:
+        if file is not None and str(file) != "-":
+            check_place(file)
+            if Path(file).resolve() in taken:
+                raise UserError(f"{file}: is read, or written as another output: give it a name of its own")
+            taken.add(Path(file).resolve())
+
+
+def write_json(document: Mapping[str, Any], path: Path | str) -> None:
+    """Write a document to a file, or to stdout for '-'. What JSON cannot say (infinity, not a number) becomes null."""
+    text = json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
+    if str(path) == "-":
+        sys.stdout.write(text)
+        return
+    write_text(path, text)
+
+
+def finite(value: Any) -> Any:
+    """`value` with None in place of every number that JSON does not have."""
+    if isinstance(value, Mapping):
+        return {key: finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(entry) for entry in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+#: What a picture's name may end in.
+PICTURES = (".png", ".pdf", ".svg", ".jpg")
+
+
+def check_picture(path: Path | str) -> None:
+    """Raise UserError for a file name that is no picture's."""
+    if Path(path).suffix not in PICTURES:
+        raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
+
+
+def save_picture(figure: Any, path: Path | str, dpi: int) -> None:
+    """Write a figure whole or not at all, and close it. Raises UserError where it cannot be saved."""
+    from matplotlib import pyplot
+
+    try:
+        with whole(path) as temporary:
+            figure.savefig(temporary, dpi=dpi)
+    except ValueError as error:
+        raise UserError(f"{path}: cannot save the plot: {error}") from error
+    finally:
+        pyplot.close(figure)

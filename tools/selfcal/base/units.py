@@ -305,3 +305,15 @@ def typeset(unit: str) -> str:
     for plain, print_ in (("deg", "°"), ("ug", "µg"), ("^2", "²"), ("^3", "³"), ("°C", "°C")):
         text = text.replace(plain, print_)
     return text
+
+
+def duration_words(seconds: float) -> str:
+    """About: `40 s`, `12 minutes`, `5 hours`, `3 days`."""
+    for size, name, most in ((1.0, "s", 120.0), (60.0, "minutes", 120.0), (3600.0, "hours", 48.0)):
+        if seconds < most * size:
+            return f"{math.ceil(seconds / size)} {name}"
+    return f"{math.ceil(seconds / 86400.0)} days"
+
+
+#: Axes of an inertial unit: sensor columns unless a model names others.
+SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")

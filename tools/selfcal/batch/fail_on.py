@@ -6,7 +6,9 @@ from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from selfcal.base.errors import UserError
+from selfcal.base.ending import Held
+from selfcal.base.errors import UserError, note
+from selfcal.batch.verdicts import PASS, Verdict, code_of
 
 #: Anything that the model does not explain; and, of two recordings, any change.
 INADEQUATE, CHANGED = "inadequate", "changed"
@@ -82,3 +84,23 @@ def _of_identify(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
     if axis.get("suspicion") == wanted:
         return True, ""
     return False, f"{wanted} cannot be judged: identify looks for no single cause, diagnose --fail-on {wanted} does"
+
+
+def exit_code(document: Mapping[str, Any], wanted: str | None) -> int:
+    """Exit code of what `--fail-on` and the limits make of a verb's answer, each reason on stderr. A signal that came
+    ends the command here."""
+    Held().check()
+    codes = [0]
+    if wanted is not None:
+        found = outcome(document, wanted)
+        for line in found.lines:
+            note(line)
+        codes.append(found.code)
+    if "limits" in document:
+        known = ("recording", "device")
+        verdicts = [Verdict.of({k: v for k, v in one.items() if k not in known}) for one in document["limits"]]
+        for one, entry in zip(verdicts, document["limits"], strict=True):
+            if one.verdict != PASS:
+                note(f"{entry['recording']}: {one.words}" if "recording" in entry else one.words)
+        codes.append(code_of(verdicts))
+    return 1 if 1 in codes else 2 if 2 in codes else 0

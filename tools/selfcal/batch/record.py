@@ -7,11 +7,11 @@ import hashlib
 import io
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.base.errors import UserError, first_line, printable
@@ -35,6 +35,13 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 KILLED = "its worker process was killed each time, maybe for want of memory"
 
 
+class Verbs(NamedTuple):
+    """The functions `identify` and `diagnose`: verbs know the batch, which knows no verb."""
+
+    identify: Callable[..., Mapping[str, Any]]
+    diagnose: Callable[..., Mapping[str, Any]]
+
+
 @dataclass(frozen=True)
 class Options:
     """How each recording is looked at. `reading` and `stretch`: keywords of `identify` and `diagnose` alike."""
@@ -46,12 +53,12 @@ class Options:
     stretch: Mapping[str, Any] = field(default_factory=dict)
 
 
-def examined(options: Options, job: Job) -> list[Row]:
+def examined(verbs: Verbs, options: Options, job: Job) -> list[Row]:
     """One row: the record, or {"error": reason}. `job`: absolute path, content. A broken file never raises."""
     path = str(job[0])
     with contextlib.redirect_stderr(io.StringIO()):
         try:
-            return [_record(options, path)]
+            return [_record(verbs, options, path)]
         except UserError as error:
             return [{"error": str(error).removeprefix(f"{path}: ")}]
         except MemoryError:
@@ -65,25 +72,21 @@ def killed(_: Job) -> list[Row]:
     return [{"error": KILLED}]
 
 
-def _record(options: Options, path: str) -> Row:
-    from selfcal.verbs.identify import identify
-
+def _record(verbs: Verbs, options: Options, path: str) -> Row:
     given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
-    document = identify(path, suspicion=False, **given)
+    document = verbs.identify(path, suspicion=False, **given)
     row: Row = {
         "recording": document["recording"],
         "axes": {name: _of(axis, IDENTIFIED) | _looks(axis) for name, axis in document["axes"].items()},
     }
     if options.diagnose:
-        row["diagnosis"] = _diagnosis(path, list(document["axes"]), given)
+        row["diagnosis"] = _diagnosis(verbs, path, list(document["axes"]), given)
     return row
 
 
-def _diagnosis(path: str, names: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
-    from selfcal.verbs.diagnose import diagnose
-
+def _diagnosis(verbs: Verbs, path: str, names: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
     try:
-        axes = diagnose(path, **given)["axes"]
+        axes = verbs.diagnose(path, **given)["axes"]
     except UserError as error:
         return {name: {"error": str(error).removeprefix(f"{path}: ")} for name in names}
     return {
@@ -96,6 +99,7 @@ def own_pages(
     folder: Path | str,
     names: Sequence[str],
     devices: Mapping[str, Sequence[Unit]],
+    verbs: Verbs,
     options: Options,
     keeper: ByContent,
     count: int | None,
@@ -112,17 +116,15 @@ def own_pages(
         known = keeper.place((source.path, source.content)).stem[:12]
         jobs[name] = (str(Path(source.path).absolute()), str(place / f"{_UNSAFE.sub('_', name)[:60]}-{known}.html"))
     todo = [job for job in jobs.values() if not Path(job[1]).exists()]
-    spread(partial(_paged, options), todo, settings={}, piece=1, count=count, lost=lambda _: [{}], verb="pages")
+    spread(partial(_paged, verbs, options), todo, settings={}, piece=1, count=count, lost=lambda _: [{}], verb="pages")
     return {name: f"{place.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
 
 
-def _paged(options: Options, job: Job) -> list[Row]:
+def _paged(verbs: Verbs, options: Options, job: Job) -> list[Row]:
     """Write the page of one recording. `job`: its absolute path, the page's place."""
-    from selfcal.verbs.diagnose import diagnose
-
     with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(UserError, MemoryError):
         given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
-        diagnose(job[0], report=job[1], **given)
+        verbs.diagnose(job[0], report=job[1], **given)
     return [{}]
 
 

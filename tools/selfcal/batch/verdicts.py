@@ -13,18 +13,16 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import wraps
 from pathlib import Path
 from typing import Any, ParamSpec
 
-from selfcal.adequacy.document import check_writable
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, shown
-from selfcal.base.output import whole
+from selfcal.base.output import check_writable, whole
+from selfcal.base.units import duration_words
 from selfcal.logs.recording import list_of
 from selfcal.model.file import Model, read_yaml
 from selfcal.model.laws import PLACES, RATIOS
@@ -255,14 +253,6 @@ def _normal(x: float) -> float:
     return 0.5 * math.erfc(-x / math.sqrt(2.0))
 
 
-def duration_words(seconds: float) -> str:
-    """About: `40 s`, `12 minutes`, `5 hours`, `3 days`."""
-    for size, name, most in ((1.0, "s", 120.0), (60.0, "minutes", 120.0), (3600.0, "hours", 48.0)):
-        if seconds < most * size:
-            return f"{math.ceil(seconds / size)} {name}"
-    return f"{math.ceil(seconds / 86400.0)} days"
-
-
 def code_of(verdicts: Iterable[Verdict]) -> int:
     """Exit code: 0 all pass, 1 one fails, 2 one cannot be told or judged."""
     there = {one.verdict for one in verdicts}
@@ -326,28 +316,15 @@ def _clean(text: str) -> str:
 P = ParamSpec("P")
 
 
-def on_a_line(verb: Callable[P, dict[str, Any]]) -> Callable[P, dict[str, Any]]:
-    """`identify` or `diagnose`, whose JUnit and CSV are written even where it raises UserError.
-
-    A file of the unit before must not stay in its place."""
-
-    @wraps(verb)
-    def run(*arguments: P.args, **options: P.kwargs) -> dict[str, Any]:
-        try:
-            return verb(*arguments, **options)
-        except UserError as error:
-            with suppress(UserError):  # of the limits file itself
-                given: dict[str, Any] = dict(options)
-                if given.get("limits") is not None:
-                    logs = list_of(arguments[0] if arguments else given["log"])  # type: ignore[arg-type]
-                    files = given.get("junit"), given.get("verdicts")
-                    check_writable(*files, inputs=(*logs, given["limits"], given.get("model")))
-                    model = Model.load(given.get("model"))
-                    limits = Limits.load(given["limits"], model).of(given.get("axes") or model.axes)
-                    write([("", " ".join(map(str, logs)), unjudged(limits, str(error)))], *files)
-            raise
-
-    return run
+def write_unjudged(given: Mapping[str, Any], reason: str) -> None:
+    """Write the JUnit and CSV of a verb that was `given` these options and has no result. Raises UserError for a limits
+    file that cannot be read."""
+    logs = list_of(given["log"])
+    files = given.get("junit"), given.get("verdicts")
+    check_writable(*files, inputs=(*logs, given["limits"], given.get("model")))
+    model = Model.load(given.get("model"))
+    limits = Limits.load(given["limits"], model).of(given.get("axes") or model.axes)
+    write([("", " ".join(map(str, logs)), unjudged(limits, reason))], *files)
 
 
 def check_options(limits: Path | str | None, junit: Path | str | None, verdicts: Path | str | None) -> None:

@@ -2,16 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import yaml
+
+from selfcal.adequacy.checks import FEWEST
+from selfcal.adequacy.document import to_document
+from selfcal.adequacy.identify import identify_axis
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.integrity import masked
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import of_recording
 from selfcal.likelihood.fit import ROUGH_FTOL
 from selfcal.likelihood.state import NET_LEAST, Look
-from selfcal.logs.recording import Recording
-from selfcal.model.file import Model
+from selfcal.logs.recording import Recording, as_float
+from selfcal.model.file import DEFAULT, Model
+from selfcal.model.tables import bank_block, make_tables
+from selfcal.readings.priors import add_sources, for_record
+
+if TYPE_CHECKING:
+    from selfcal.likelihood.state import Look
 
 #: Rate of the means that are looked at, Hz, and how many of them at most: a longer record has longer ones.
 RATE_HZ, MOST = 1.0, 20_000
@@ -35,3 +48,79 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
         if best is not None and best.net >= NET_LEAST:
             found[name] = best
     return found
+
+
+#: Intervals at most that the laws of `models/sums.yaml` are weighed on: their filters cost twenty times the others'.
+#: Half as many as runs 1 and 2 have at 1 Hz move no probability there by more than 0.08.
+MORE_LAWS_MOST = 5000
+
+
+def with_added_laws(
+    document: dict[str, Any],
+    recording: Recording,
+    suspected: Mapping[str, Look],
+    engine: str,
+    decimate: float | None,
+    *,
+    draw: bool,
+) -> list[str]:
+    """Identify axes anew whose suspicion is noise of another kind than white: N of the default laws is wrong there.
+
+    The law of that noise joins the default ones. Where it is the likeliest, its answer takes the place of the first
+    one, with `added_law` and the suspicion. Returns those axes."""
+    from selfcal.diagnosis.causes import CAUSES
+
+    again = []
+    for name, shown in suspected.items():
+        add_law = CAUSES[shown.cause].law
+        if add_law is None or document["axes"][name]["suspicion"] != shown.cause:
+            continue
+        tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+        before = set(tree["hypotheses"])
+        add_law(tree, shown)
+        with suppress(UserError):  # too long for the law's filters
+            of_file = Model.of_tree(tree, DEFAULT)
+            whole = _whole_means(recording.along(name), decimate or of_file.bank_rate_hz)
+            model = for_record(of_file, whole, (name,))
+            axis = identify_axis(whole, name, model, engine, decimate, draw=draw)
+            if axis.result.best not in before:
+                own = to_document(recording, {name: axis})
+                add_sources(own, of_file, model)
+                document["axes"][name] = own["axes"][name] | {"suspicion": shown.cause, "added_law": axis.result.best}
+                again.append(name)
+    return again
+
+
+def _whole_means(recording: Recording, bank_rate_hz: float) -> Recording:
+    """The recording without the bank intervals that lost readings: what a counter gained there is in no other reading.
+    Raises UserError where none is left."""
+    if not recording.missing_before.any():
+        return recording
+    block = bank_block(recording.rate_hz, bank_rate_hz)
+    place = np.arange(recording.samples) + np.cumsum(recording.missing_before).astype(np.int64)
+    cell = (place - place[0]) // block
+    whole = np.bincount(cell) == block
+    if np.count_nonzero(whole) < FEWEST:
+        raise UserError("too few bank intervals have all of their readings")
+    return recording.with_rows(whole[cell])
+
+
+def weigh_more_laws(document: dict[str, Any], recording: Recording, names: Sequence[str]) -> None:
+    """What the laws of `models/sums.yaml` say of the axes whose drift the default ones do not describe, beside them.
+
+    At the model's own bank rate; of a longer record than MORE_LAWS_MOST such intervals at a lower one."""
+    from selfcal.bank.library import Bank
+    from selfcal.diagnosis.causes import CAUSES
+
+    more = Model.load(DEFAULT.parent / "sums.yaml")
+    rate_hz = min(more.bank_rate_hz, MORE_LAWS_MOST / recording.duration_s)
+    for name in names:
+        axis = document["axes"][name]
+        if "suspicion" not in axis or CAUSES[axis["suspicion"]].slow:
+            with suppress(UserError):  # a record too long for these laws
+                more = for_record(more, recording, (name,))
+                tables = make_tables(more, recording.rate_hz, (name,), bank_rate_hz=rate_hz)
+                bank = Bank(tables)
+                samples = as_float(recording.in_unit(name, more.group_of(name).unit))
+                bank.push(samples[:, None], recording.missing_before)
+                axis["more_laws"] = bank.report(0).probability

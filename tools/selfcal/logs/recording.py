@@ -37,7 +37,8 @@ from selfcal.base.limits import (
     reading,
 )
 from selfcal.base.output import together, whole
-from selfcal.logs.loaders import WRITTEN, check_library, format_of
+from selfcal.base.units import SENSORS
+from selfcal.logs.loaders import WRITTEN, Scale, check_library, format_of, parse_pairs
 from selfcal.logs.loaders.child import tables_of
 from selfcal.logs.loaders.headings import Meaning, Sensor, number_of, sensors_of, sides_of, split
 from selfcal.logs.loaders.sources import Part, chosen
@@ -45,7 +46,6 @@ from selfcal.logs.loaders.table import Hints, Member, Table, parse_meta
 from selfcal.logs.loaders.text_table import TextTable, is_clock, is_date, is_row
 from selfcal.logs.loaders.texts import Text, texts_in
 from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, damaged_stamps, few, has_own_clock, unwrapped
-from selfcal.model.file import SENSORS
 
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
@@ -64,8 +64,6 @@ _GRAVITY_OFF, _AT_REST, _GRAVITY_S = 0.05, 0.9, 1.0
 #: Columns without a unit that begin with a whole number, from which on they may be counts.
 _COUNTS_FROM = 3
 
-#: Size of one LSB, with its unit unless the column's usual one is meant.
-Scale = tuple[float, str | None]
 #: Raises UserError for a row (from 0), a field (by its place; None: the whole row) and what is wrong there.
 _Fail = Callable[[int, int | None, str], NoReturn]
 
@@ -582,19 +580,6 @@ def _save_npz(
             arrays[f"{name}[{unit}]"] = np.asarray(values, np.float64)
     with whole(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)
-
-
-def parse_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
-    """`NAME=VALUE` texts of a repeated command line option as a dict. Raises UserError naming the option."""
-    found: dict[str, str] = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not (name and equals and value):
-            raise UserError(f"{option} takes NAME=VALUE, not '{pair}'")
-        if name in found:
-            raise UserError(f"{option}: '{name}' is given twice")
-        found[name] = value
-    return found
 
 
 def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:

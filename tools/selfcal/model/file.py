@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
+from selfcal.base.units import SENSORS
 from selfcal.model.forms import FORMS, INPUTS, NUMBER, POWER
 from selfcal.model.laws import (
     DAMPING_LIMITS,
@@ -33,8 +34,6 @@ from selfcal.model.laws import (
 )
 
 SCHEMA = "selfcal.model.file/1"
-#: Axes of an inertial unit: sensor columns unless a model names others.
-SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 #: Model files of common parts, one a part; the default model is that of the ADIS16405.
 PARTS = DEFAULT.parent / "parts"
@@ -786,3 +785,8 @@ class _Reader:
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
             handling=self.handling({} if tree.get("handle") is None else tree["handle"], bool(tree.get("regressors"))),
         )
+
+
+def settings_of(model: Model) -> str:
+    """The model without the place of its file."""
+    return repr(replace(model, path=Path(), name=""))

@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
-from selfcal.show.plot import save_picture
+from selfcal.base.output import save_picture
 
 #: The model's colour, and that of what does not fit.
 MODEL, OUTSIDE = "tab:blue", "tab:red"

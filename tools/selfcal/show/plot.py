@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.base.errors import UserError, printable
-from selfcal.base.output import whole
+from selfcal.base.errors import printable
+from selfcal.base.output import save_picture
 from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import AxisReport, axis_unit
@@ -24,27 +24,6 @@ FAINT = 0.01
 LARGEST = 1e30
 #: Share of the reports, from the first on, whose intervals do not count for the scales: they are the prior's.
 SETTLING = 0.2
-#: What a picture's name may end in.
-PICTURES = (".png", ".pdf", ".svg", ".jpg")
-
-
-def check_picture(path: Path | str) -> None:
-    """Raise UserError for a file name that is no picture's."""
-    if Path(path).suffix not in PICTURES:
-        raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
-
-
-def save_picture(figure: Any, path: Path | str, dpi: int) -> None:
-    """Write a figure whole or not at all, and close it. Raises UserError where it cannot be saved."""
-    from matplotlib import pyplot
-
-    try:
-        with whole(path) as temporary:
-            figure.savefig(temporary, dpi=dpi)
-    except ValueError as error:
-        raise UserError(f"{path}: cannot save the plot: {error}") from error
-    finally:
-        pyplot.close(figure)
 
 
 def plot_run(

@@ -11,11 +11,11 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from selfcal.adequacy.document import as_typed
+from selfcal.adequacy.document import as_typed, since
 from selfcal.adequacy.summary import MOST_REST
 from selfcal.base import units
 from selfcal.base.errors import called, printable
-from selfcal.batch.verdicts import duration_words
+from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.priors import OF_RECORD
 
@@ -120,12 +120,6 @@ def _unidentified(axes: Mapping[str, Any]) -> list[str]:
             how = times if rest_s is None else f"another {duration_words(rest_s)} would about halve"
             lines.append(f"{name}: {how} the interval of {parameter}")
     return lines
-
-
-def since(recording: Mapping[str, Any]) -> str:
-    """Where a stretch of a recording begins, for its heading."""
-    start_s = recording.get("start_s", 0.0)
-    return f" from {start_s:g} s on" if start_s else ""
 
 
 def _why(check: str, outcome: Mapping[str, Any], unit: str) -> str:

@@ -9,24 +9,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from selfcal.adequacy.allan import terms_of
-from selfcal.adequacy.document import check_writable, write_json
-from selfcal.base.errors import UserError
-from selfcal.batch.spread import Row, record_seeds, spread
-from selfcal.model.file import Group, Model
-from selfcal.model.laws import Law, named
-from selfcal.model.tables import Tables, bank_block, make_tables
+from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
+from selfcal.batch.spread import Row
+from selfcal.model.file import Model
+from selfcal.model.tables import bank_block, make_tables
 from selfcal.show.table import TABLE_WIDTH
 
 SCHEMA = "selfcal.montecarlo/1"
@@ -43,93 +36,6 @@ BLOCK = 10
 
 #: What of each estimate of the true law a row has.
 ESTIMATE = ("mean", "sd", "q05", "median", "q95")
-
-
-def montecarlo(
-    model: Path | str | None = None,
-    *,
-    records: int = 400,
-    duration_s: float = 3600.0,
-    axis: str = "gx",
-    seed: int = 1,
-    json: Path | str | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    results: Path | str | None = None,
-) -> dict[str, Any]:
-    """Simulate `records` records per law, at most BLOCK samples a bank interval, identify each with the library, and
-    compare with the truth.
-
-    Parameters that no node of the grid has are drawn again: `without_nodes` is their share by law.
-
-    `workers`: processes here, one for each processor by default; `scheduler`: address of a Dask scheduler instead. The
-    numbers are the same. `results`: a folder that keeps finished records: a run that was stopped continues from them,
-    and one of more records adds to them.
-    Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
-    records the calculated and actual probability of false identification, with the sd of their difference.
-    """
-    check_writable(json)
-    loaded = Model.load(model)
-    seeds = record_seeds(records, seed)
-    if not duration_s * loaded.bank_rate_hz >= MIN_SAMPLES:
-        raise UserError(f"--duration must be at least {MIN_SAMPLES / loaded.bank_rate_hz:g} s")
-    if not duration_s * loaded.bank_rate_hz <= MOST_SAMPLES:
-        raise UserError(f"--duration must be at most {MOST_SAMPLES / loaded.bank_rate_hz:g} s")
-    if loaded.regressors:
-        raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
-    loaded.group_of(axis)
-    jobs = [(law, one) for one in seeds for law in loaded.hypotheses]
-    found = spread(
-        partial(rows_of, loaded, axis, duration_s),
-        jobs,
-        settings={"schema": SCHEMA, "model": settings_of(loaded), "axis": axis, "duration_s": duration_s, "seed": seed},
-        scheduler=scheduler,
-        results=results,
-        count=workers,
-    )
-    document = _summary(found, records, duration_s, axis)
-    if json is not None:
-        write_json(document, json)
-    return document
-
-
-def settings_of(model: Model) -> str:
-    """The model without the place of its file."""
-    return repr(replace(model, path=Path(), name=""))
-
-
-def draw(group: Group, law: str, rng: np.random.Generator) -> dict[str, float]:
-    """Parameters of a law and the bias, drawn from the group's priors."""
-    truth = {name: group.priors[name].at(float(rng.random())) for name in group.laws[law].parameters}
-    return {**truth, "bias": group.priors["bias"].sd * float(rng.standard_normal())}
-
-
-def has_nodes(law: Law, truth: Mapping[str, float], tables: Tables) -> bool:
-    """Whether the grid can have a node for the law. Averages of a faster drift have less white noise than none."""
-    terms = terms_of(law, truth, tables.dt_s, tables.block)
-    return terms.lacking < terms.variance * (1.0 - 2.0 * abs(terms.lag1))
-
-
-def simulate_bank_samples(
-    law: str | Law, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int, bank_block: int = 1
-) -> tuple[NDArray[np.float64], float]:
-    """One simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample.
-
-    Of `bank_block` samples a bank interval coloured noise is a moving average.
-
-    A law by its name takes a stated correlation time from the truth's `correlation_time_s`.
-    """
-    from selfcal import _reference
-
-    scene = _reference.Scene()
-    scene.seed, scene.rate_hz, scene.samples, scene.block, scene.filter_taps = seed, rate_hz, samples, 1, 1
-    scene.bank_block = bank_block
-    axis = _reference.Axis()
-    of = named(law, truth.get("correlation_time_s", math.nan)) if isinstance(law, str) else law
-    axis.law, axis.N, axis.bias = of.as_tuple, truth["N"], truth.get("bias", 0.0)
-    axis.drift, axis.second = of.node(truth)
-    values, _, _, _, bias_now = _reference.simulate(scene, [axis])
-    return values[0], float(bias_now[0])
 
 
 def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) -> list[Row]:
@@ -166,7 +72,8 @@ def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) ->
     return [row]
 
 
-def _summary(rows: Sequence[Row], records: int, duration_s: float, axis: str) -> dict[str, Any]:
+def summary(rows: Sequence[Row], records: int, duration_s: float, axis: str) -> dict[str, Any]:
+    """The document: calculated against actual errors, by law and parameter."""
     laws: dict[str, Any] = {}
     for law in dict.fromkeys(str(row["law"]) for row in rows):
         mine = [row for row in rows if row["law"] == law]

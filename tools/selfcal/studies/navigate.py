@@ -5,22 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from rich import box
 from rich.console import Console
 from rich.table import Table
-from scipy import optimize, stats
+from scipy import optimize
 
-from selfcal.adequacy.document import check_writable, write_json
-from selfcal.batch.spread import Row, record_seeds, spread
+from selfcal.batch.spread import Row
 from selfcal.model.file import Model
-from selfcal.model.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
+from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
 from selfcal.model.tables import make_tables
 from selfcal.show.table import TABLE_WIDTH
-from selfcal.studies.navigation import GPS_S, JUDGED, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
+from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 
 SCHEMA = "selfcal.navigate/1"
 #: What filter designers multiply a data sheet's noise by.
@@ -55,38 +53,6 @@ class Job:
 
     law: str
     seeds: tuple[int, ...]
-
-
-def navigate(
-    *,
-    records: int = 200,
-    seed: int = 1,
-    json: Path | str | None = None,
-    scheduler: str | None = None,
-    results: Path | str | None = None,
-) -> dict[str, Any]:
-    """Fly `records` simulated parts of each law after a rest, each with the four filters of `TITLES`, which differ in
-    the noise that they are told (navigation.py).
-
-    Returns the document `selfcal.navigate/1`: rms errors and the mean NEES by law, filter and time, and the 95 % band
-    of the NEES of filters that are consistent. A bias has the rms of its three axes.
-    """
-    check_writable(json)
-    seeds = record_seeds(records, seed)
-    jobs = [Job(law, tuple(seeds[k : k + TOGETHER])) for law in LAWS for k in range(0, records, TOGETHER)]
-    settings = {"schema": SCHEMA, "seed": seed, "records": str(records)}  # the jobs have it
-    rows = spread(rows_of, jobs, settings=settings, piece=1, scheduler=scheduler, results=results)
-    band = stats.chi2.ppf([0.025, 0.975], JUDGED * records) / records
-    document = {
-        "schema": SCHEMA,
-        "parts": records,
-        "nees_expected": JUDGED,
-        "nees_band_95": band.tolist(),
-        "laws": {law: _summary([row for row in rows if row["law"] == law]) for law in LAWS},
-    }
-    if json is not None:
-        write_json(document, json)
-    return document
 
 
 def sheet_noise(factor: float = 1.0) -> list[Mapping[str, float]]:
@@ -162,7 +128,7 @@ def rows_of(job: Job) -> list[Row]:
     return rows
 
 
-def _summary(rows: Sequence[Row]) -> dict[str, Any]:
+def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """By filter and time: the rms of each error, the mean of the NEES."""
     found: dict[str, Any] = {}
     for name in TITLES:

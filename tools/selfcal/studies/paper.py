@@ -3,24 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
+from typing import Any
 
 from rich import box
 from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
-from selfcal.adequacy.document import check_writable
-from selfcal.base.errors import UserError, note, printable
-from selfcal.base.output import write_text
-from selfcal.batch.spread import record_seeds
-from selfcal.model.file import Model
+from selfcal.base.errors import printable
 from selfcal.show.chart import Figure, draw
 from selfcal.show.page import STYLE
-from selfcal.studies.paper_figures import section3, section4, survey
+from selfcal.studies.paper_figures import section4
 from selfcal.studies.paper_figures.told import Told
 
 #: Where the real recordings are looked for, beside the repository.
@@ -31,72 +27,8 @@ MOST_CAUSES = 5
 EXPLAINED = "adis16405_run1.npz"
 
 
-def paper(
-    output: Path | str,
-    *,
-    data: Path | str | None = None,
-    records: int = 500,
-    seed: int = 1,
-    scheduler: str | None = None,
-    results: Path | str | None = None,
-    tracks: Path | str | None = None,
-) -> list[Told]:
-    """Write the page to `output`; returns its figures.
-
-    `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
-    so and a line says so too. `records`: of each law in Figs 1 and 2, 500 in the paper. `scheduler`, `results`: as for
-    `montecarlo`. `tracks`: a folder for the map errors of Section 4.2, a recording a track. All seeds follow from
-    `seed`.
-    """
-    check_writable(output)
-    seeds = record_seeds(records, seed)
-    folder = DATA if data is None else Path(data)
-    if data is not None and not folder.is_dir():
-        raise UserError(f"--data {folder}: there is no such folder")
-    areas = survey.surveys(seed)
-    if tracks is not None:
-        survey.write_tracks(Path(tracks), areas)
-    priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
-    rows = section3.ensemble(priors, seeds, seed, scheduler, results)
-    told = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("Figs 5 to 8", total=5)
-        simulated = section4.simulated(seed)
-        told += section4.figures_5_and_6(default, simulated, False, seed)
-        progress.advance(task)
-        real = section4.real(folder, default)
-        progress.advance(task)
-        if len(real) == len(section4.STRETCHES):
-            told += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED)
-        else:
-            missing = sorted({name for name, _ in section4.STRETCHES if not (folder / name).exists()})
-            note(
-                f"REAL DATA ABSENT: {', '.join(missing)} not in {folder}: Figs 5 and 6 are of simulated records alone;"
-                " name their folder with --data DIR"
-            )
-            told.append(
-                Told(
-                    "Figs 5, 6, real",
-                    (),
-                    "P(random walk) goes to 1 on four accelerometer records.",
-                    "Not made: the real recordings are absent. The README says where they are; --data names a folder.",
-                    "skipped",
-                )
-            )
-        progress.advance(task)
-        told += section4.figures_7(default, simulated | real, seed)
-        progress.advance(task)
-        told += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
-        progress.advance(task)
-    write_text(output, page(told, records, seed))
-    return told
-
-
-def with_reason(told: Sequence[Told], log: Path) -> list[Told]:
+def with_reason(told: Sequence[Told], log: Path, diagnose: Callable[..., Mapping[str, Any]]) -> list[Told]:
     """The figures of the real records, Fig. 5 with what the diagnosis finds in one of them."""
-    from selfcal.verbs.diagnose import diagnose
-
     entry = diagnose(log, axes=[section4.AXIS], decimate=1.0)["axes"][section4.AXIS]
     causes = [
         f"{finding['cause'].replace('_', ' ')} ({finding['evidence_gain_nats']:.0f} nats)"

@@ -23,21 +23,21 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from selfcal.adequacy.document import check_writable, recording_entry, write_json
+from selfcal.adequacy.document import recording_entry
+from selfcal.adequacy.identify import chosen_axes
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
+from selfcal.base.output import check_writable, write_json
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
 from selfcal.logs.recording import Recording, as_float, load
-from selfcal.model.file import DEFAULT, Model
+from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
 from selfcal.model.tables import make_tables
 from selfcal.readings.priors import for_record
 from selfcal.studies.methods import RIVALS, Rival
 from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.studies.methods.problem import Answer, Problem
-from selfcal.studies.montecarlo import settings_of
-from selfcal.verbs.identify import chosen_axes
 
 SCHEMA = "selfcal.rivals/1"
 ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
@@ -54,7 +54,7 @@ LOOSE = 1e4
 WHOLE_WIDTH, BRIEF_WIDTH = 190, 110
 
 
-def rivals(
+def of_recording(
     log: Path | str,
     *,
     axes: Sequence[str] = (),

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,12 @@ from rich.console import Console
 from rich.table import Table
 from scipy import signal
 
-from selfcal.adequacy.document import check_writable, write_json
 from selfcal.base.errors import UserError, printable
 from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
-from selfcal.batch.spread import Row, record_seeds, spread
+from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, as_float, load
 from selfcal.model.file import Group, Model
-from selfcal.model.parts import AXES, LAWS, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
+from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
 from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"
@@ -60,46 +58,6 @@ class Job:
     law: str
     rest_s: int
     seed: int
-
-
-def worth(
-    logs: Sequence[Path | str] = (),
-    *,
-    axes: Sequence[str] = (),
-    model: Path | str | None = None,
-    records: int = 200,
-    seed: int = 1,
-    json: Path | str | None = None,
-    scheduler: str | None = None,
-    results: Path | str | None = None,
-) -> dict[str, Any]:
-    """Predict the bias 1 to 1000 s after rests of 1, 5 and 30 min.
-
-    With `logs`: rests that do not overlap, from each recording's axes; the mean of the 30 s that follow stands for the
-    truth. Without: `records` simulated parts of each law and rest, whose bias is known. The samples are means of 1 s.
-    Returns the document `selfcal.worth/1`: rms errors by case, rest, method and horizon, and of the minute of dead
-    reckoning that follows (heading_error(), position_error()).
-    """
-    check_writable(json)
-    loaded = replace(Model.load(model), regressors=(), half_life_s=0.0)
-    seeds = record_seeds(records, seed)
-    if logs:
-        rows = [row for log in logs for row in _recorded(log, loaded, axes)]
-        if not rows:
-            span = RESTS_S[0] + HORIZONS_S[-1] + REFERENCE_S
-            raise UserError(f"the recordings are too short: {span} s without a gap are needed; record longer")
-    else:
-        jobs = [Job(law, rest, one) for law in LAWS for rest in RESTS_S for one in seeds]
-        settings = {"schema": SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
-        settings["records"] = str(records)  # the jobs' order has it
-        rows = spread(
-            partial(_simulated, loaded), jobs, settings=settings, piece=32, scheduler=scheduler, results=results
-        )
-    cases = _summary(rows)
-    document = {"schema": SCHEMA, "recordings": [str(log) for log in logs], "cases": cases, "regret": regret(cases)}
-    if json is not None:
-        write_json(document, json)
-    return document
 
 
 def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], Floats]:
@@ -195,7 +153,7 @@ def _position(gyro: After, accelerometer: After) -> Row:
     }
 
 
-def _simulated(model: Model, job: Job) -> list[Row]:
+def simulated(model: Model, job: Job) -> list[Row]:
     """One gyro stands for the upright one and for the one across: no figure has both."""
     after, truth, noise = {}, {}, {}
     for axis in ("gx", "ax"):
@@ -223,9 +181,10 @@ def _means(recording: Recording, model: Model, name: str) -> Floats:
     return usable_blocks(samples, recording.missing_before, tables, group).mean
 
 
-def _recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
+def recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
+    """The errors of every method after the rests of a recording. Raises UserError as `load` does."""
+    from selfcal.adequacy.identify import chosen_axes
     from selfcal.studies.rivals import longest_stretch
-    from selfcal.verbs.identify import chosen_axes
 
     recording = load(log)
     means = {name: _means(recording, model, name) for name in chosen_axes(recording, model, wanted)}
@@ -251,7 +210,8 @@ def _recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]
     return rows
 
 
-def _summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """The document: rms errors by case and length of the rest."""
     found = []
     for case, rest in dict.fromkeys((row["case"], row["rest_s"]) for row in rows):
         mine = [row for row in rows if (row["case"], row["rest_s"]) == (case, rest)]

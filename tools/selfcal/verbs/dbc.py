@@ -1,25 +1,36 @@
-"""`selfcal dbc`: the DBC file of one module, with its model's names."""
+"""Write the DBC file of one module, with its model's names and units."""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Annotated, Any
 
-from selfcal.adequacy.document import check_writable
 from selfcal.base.errors import UserError
-from selfcal.base.output import write_text
-from selfcal.model.file import Model
-from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, NODES
-from selfcal.wire.dbc_file import dbc as text_of
-from selfcal.wire.frames import AXES, axis_unit, carries, names_of
+from selfcal.base.options import option
+from selfcal.verbs._shared import ModelArgument
 
 
-def dbc(model: Path | str, *, node: int = 0, output: Path | str | None = None) -> str:
+def dbc(
+    model: ModelArgument,
+    *,
+    node: Annotated[int, option("The module's number on its bus, 0 to 11", metavar="N")] = 0,
+    output: Annotated[
+        Path | str | None, option("File to write; default: stdout", "-o", "--output", metavar="FILE")
+    ] = None,
+) -> str:
     """The DBC file of node `node` that runs the model file `model`, written to `output` or stdout.
 
     Its messages and signals have the model's names of hypotheses, parameters and regressor columns, with their units.
     Raises UserError for a node that there is not, or a model that telemetry has no room or no messages for.
     """
+    from selfcal.base.output import check_writable, write_text
+    from selfcal.model.file import Model
+    from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, NODES
+    from selfcal.wire.dbc_file import dbc as text_of
+    from selfcal.wire.frames import AXES, axis_unit, carries, names_of
+
     if not 0 <= node < NODES:
         raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     check_writable(output)
@@ -37,3 +48,8 @@ def dbc(model: Path | str, *, node: int = 0, output: Path | str | None = None) -
     else:
         write_text(output, text)
     return text
+
+
+def show(_: str, given: Mapping[str, Any]) -> int:
+    """The text is written already."""
+    return 0

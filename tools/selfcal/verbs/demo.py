@@ -1,39 +1,23 @@
-"""`selfcal demo`: a module without hardware, for `selfcal monitor` to watch."""
+"""A module without hardware: the firmware over a recording, for `selfcal monitor` to watch."""
 
 from __future__ import annotations
 
-import subprocess
-import tempfile
-import time
+from collections.abc import Mapping
 from pathlib import Path
-
-from rich.console import Console
+from typing import Annotated, Any, Literal
 
 from selfcal.base.errors import UserError, called
-from selfcal.logs.recording import load
-from selfcal.model.file import Model
-from selfcal.verbs.identify import chosen_axes
-from selfcal.verbs.replay import build, running, write_rows
-from selfcal.wire.dbc_file import NODES
-from selfcal.wire.frames import ROOT
-
-SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
-#: s of module time between reports, at least. A host takes one a second.
-REPORT_S = 10.0
-FASTEST = 1000.0
-#: python-can's own group and port, so that its tools listen there without more.
-GROUP, PORT = "239.74.163.2", 43113
-#: s that the firmware waits for a host: longer than anybody does.
-FOREVER_S = 999_999.0
+from selfcal.base.options import argument, option
+from selfcal.logs.loaders import READ
 
 
 def demo(
-    log: Path | str | None = None,
+    log: Annotated[Path | str | None, argument(f"Recording: {READ}; default: the shipped one", "[LOG]")] = None,
     *,
-    speed: float = 10.0,
-    transport: str = "slcan",
-    channel: str = "",
-    node: int = 0,
+    speed: Annotated[float, option("Times real time", metavar="X")] = 10.0,
+    transport: Annotated[Literal["slcan", "can"], option("How its frames travel")] = "slcan",
+    channel: Annotated[str, option("With --transport can: a CAN device; default: UDP", metavar="NAME")] = "",
+    node: Annotated[int, option("The module's number on its bus, 0 to 11", metavar="N")] = 0,
 ) -> None:
     """Play a recording through the firmware, `speed` times as fast as it was taken, until its end or Ctrl-C; prints
     how to watch.
@@ -42,6 +26,17 @@ def demo(
     `node`: its number on its bus.
     With `transport` can it goes on by itself, on the CAN device `channel` or over UDP within this machine.
     """
+    import tempfile
+
+    from rich.console import Console
+
+    from selfcal.adequacy.identify import chosen_axes
+    from selfcal.logs.recording import load
+    from selfcal.model.file import Model
+    from selfcal.wire.dbc_file import NODES
+    from selfcal.wire.demo import FASTEST, FOREVER_S, GROUP, PORT, REPORT_S, SHIPPED, wait
+    from selfcal.wire.replay import build, running, write_rows
+
     if not 0.0 < speed <= FASTEST:
         raise UserError(f"--speed must be above 0 and at most {FASTEST:g}, not {speed:g}")
     if channel and transport != "can":
@@ -75,15 +70,13 @@ def demo(
                     flush=True,
                 )
             try:
-                complaint = (said + _wait(module)).strip()
+                complaint = (said + wait(module)).strip()
             except KeyboardInterrupt:
                 return
             if module.returncode != 0:
                 raise UserError(complaint or f"the firmware stopped (exit code {module.returncode})")
 
 
-def _wait(module: subprocess.Popen[str]) -> str:
-    """What the firmware says until it ends."""
-    while module.poll() is None:
-        time.sleep(0.2)
-    return module.communicate()[0]
+def show(_: None, given: Mapping[str, Any]) -> int:
+    """Nothing is left to print."""
+    return 0

@@ -1,77 +1,64 @@
-"""`selfcal diagnose`: what the simulation gets wrong in a recording, why, and what mending it gains."""
+"""What the model gets wrong in a recording at rest, why, and what mending it gains."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import suppress
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
-from threading import Event
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-from rich.console import Console
-
-from selfcal.adequacy.document import (
-    check_writable,
-    of_errors,
-    parameters_entry,
-    recording_entry,
-    regressors_entry,
-    write_json,
-)
-from selfcal.base.ending import Held, Stopped, abandon, held
-from selfcal.base.errors import UserError, note, printable
-from selfcal.base.output import write_text
-from selfcal.base.progress import Doing
-from selfcal.base.results import Diagnosis
-from selfcal.batch.fail_on import check
-from selfcal.batch.verdicts import Limits, add_verdicts, check_options, on_a_line
-from selfcal.diagnosis import words
-from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
-from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
-from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
-from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
-from selfcal.diagnosis.record import Record, carried, of_recording, why_left_out
-from selfcal.diagnosis.verdict import joined, of_checks
-from selfcal.likelihood import work
+from selfcal.base.errors import UserError, note
+from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.logs.recording import Recording, list_of, load
-from selfcal.model.file import Model
-from selfcal.readings.priors import add_sources, for_record
-from selfcal.readings.readings import look
-from selfcal.show.table import since
-from selfcal.verbs.identify import chosen_axes, identify_axis, moved_beside, stretch_of
+from selfcal.verbs._shared import (
+    Axes,
+    End,
+    FailOn,
+    Gate,
+    Json,
+    Junit,
+    LimitsFile,
+    Logs,
+    ModelFile,
+    Report,
+    SincePowerOn,
+    Start,
+    Verdicts,
+    on_a_line,
+    to_stderr,
+)
 
-#: Why an axis has no result.
-BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
-OF_COUNTER = "its readings are increments of a counter, coarse against their noise: give a lower --decimate HZ"
-#: The first look is at means at this rate, Hz. A recording of fewer samples, or slower than LEAST_HZ, needs none.
-FIRST_HZ, FIRST_FROM, LEAST_HZ = 1.0, 20_000, 4.0
-#: How long the work of an axis may go on after a signal, s: it ends at its next pass of the filter.
-PATIENCE_S = 0.3
+if TYPE_CHECKING:
+    from selfcal.base.results import Diagnosis
 
 
 @on_a_line
 def diagnose(
-    log: Path | str | Sequence[Path | str],
+    log: Logs,
     *,
-    axes: Sequence[str] = (),
-    model: Path | str | None = None,
-    decimate: float | None = None,
-    full_rate: bool = False,
-    json: Path | str | None = None,
-    report: Path | str | None = None,
-    write_model: Path | str | None = None,
-    on: Path | str | None = None,
-    fail_on: str | None = None,
-    limits: Path | str | None = None,
-    junit: Path | str | None = None,
-    verdicts: Path | str | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
-    since_power_on_s: float = 0.0,
-    gate: bool = False,
+    axes: Axes = (),
+    model: ModelFile = None,
+    decimate: Annotated[
+        float | None, option("Look at means at this rate alone; default: means of 1 s, then every sample", metavar="HZ")
+    ] = None,
+    full_rate: Annotated[
+        bool, option("Look at every sample at once, not at means of 1 s first", "--full-rate")
+    ] = False,
+    json: Json = None,
+    report: Report = None,
+    write_model: Annotated[
+        Path | str | None, option("Write the model file with what was found in it", metavar="MODEL.yaml")
+    ] = None,
+    on: Annotated[
+        Path | str | None, option("Measure each finding's gain on a second recording of the part", metavar="LOG")
+    ] = None,
+    fail_on: FailOn = None,
+    limits: LimitsFile = None,
+    junit: Junit = None,
+    verdicts: Verdicts = None,
+    start_s: Start = None,
+    end_s: End = None,
+    since_power_on_s: SincePowerOn = 0.0,
+    gate: Gate = False,
     **reading: Unpack[Reading],
 ) -> Diagnosis:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
@@ -91,6 +78,38 @@ def diagnose(
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
     yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.
     """
+    from selfcal.adequacy.document import of_errors
+    from selfcal.adequacy.identify import chosen_axes, stretch_of
+    from selfcal.base.ending import held
+    from selfcal.base.output import check_writable, write_json, write_text
+    from selfcal.base.progress import Doing
+    from selfcal.base.results import Diagnosis
+    from selfcal.batch.fail_on import check
+    from selfcal.batch.verdicts import Limits, add_verdicts, check_options
+    from selfcal.diagnosis.diagnose import (
+        FIRST_FROM,
+        FIRST_HZ,
+        LEAST_HZ,
+        add_carried,
+        add_posteriors,
+        below_lattice,
+        by_identify,
+        looked_at,
+        options_given,
+        show_first,
+        why_not,
+    )
+    from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
+    from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
+    from selfcal.diagnosis.finding import Diagnosed
+    from selfcal.diagnosis.loop import INTERRUPTED
+    from selfcal.diagnosis.record import of_recording
+    from selfcal.diagnosis.verdict import joined
+    from selfcal.likelihood import work
+    from selfcal.logs.recording import list_of, load
+    from selfcal.model.file import Model
+    from selfcal.readings.priors import add_sources, for_record
+
     check(fail_on)
     check_options(limits, junit, verdicts)
     if full_rate and decimate is not None:
@@ -112,21 +131,21 @@ def diagnose(
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)
         if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
-            first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
-            _show_first(recording, first, [name for name in names if name in record.axes], ending)
-        seen = _look(record, names, ending, doing) if not ending.asked else {}
+            first = looked_at(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
+            show_first(recording, first, [name for name in names if name in record.axes], ending)
+        seen = looked_at(record, names, ending, doing) if not ending.asked else {}
         looked = {
             name: first.get(name)
-            if name not in seen and _below_lattice(record, name)
+            if name not in seen and below_lattice(record, name)
             else joined(seen.get(name), first.get(name), INTERRUPTED)
             for name in names
         }
         found = {name: one for name, one in looked.items() if one is not None}
         if not ending.asked:
             doing.now("checks")
-            _by_identify(found, recording, loaded)
+            by_identify(found, recording, loaded)
         errors = {
-            name: seen[name].unfinished if name in seen else _why_not(recording, loaded, record, name)
+            name: seen[name].unfinished if name in seen else why_not(recording, loaded, record, name)
             for name in names
             if name not in found
         }
@@ -150,9 +169,9 @@ def diagnose(
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
-                _add_carried(document, loaded, tree, record, found, second)
+                add_carried(document, loaded, tree, record, found, second)
             doing.now("posterior")
-            _add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
+            add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
             if write_model is not None:
                 write_text(write_model, as_text(tree, recording.path))
                 if out:
@@ -162,7 +181,7 @@ def diagnose(
                 from selfcal.show.page import write_page
 
                 doing.now("pictures")
-                given = _given(axes, model, decimate, recording)
+                given = options_given(axes, model, decimate, recording)
                 write_page(report, document, record, found, given)
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
@@ -171,181 +190,10 @@ def diagnose(
     return Diagnosis(document)
 
 
-def _add_carried(
-    document: dict[str, Any],
-    model: Model,
-    tree: Mapping[str, Any],
-    record: Record,
-    found: Mapping[str, Diagnosed],
-    second: Recording,
-) -> None:
-    """The gain of each finding on a second recording, and of all on an axis together."""
-    from selfcal.diagnosis.carried import gains
+def show(document: Diagnosis, given: Mapping[str, Any]) -> int:
+    """Print each finding in words; the exit code of `--fail-on` and the limits."""
+    from selfcal.batch.fail_on import exit_code
+    from selfcal.diagnosis.diagnose import show as table
 
-    document["on"] = recording_entry(second)
-    for name, (each, together) in gains(model, tree, record, found, second).items():
-        axis = document["axes"][name]
-        pairs = zip(axis["findings"], each, strict=True)
-        for entry, one in [*pairs, *([(axis, together)] if each else [])]:
-            entry["gain_on"] = one.gain
-            if one.gain is None:
-                entry["gain_on_reason"] = one.reason
-
-
-def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> dict[str, Diagnosed]:
-    """The loop in a thread, so that a signal is answered while the compiled filter runs. What a signal left undone is
-    `unfinished`, and the threads are then left behind."""
-    found: dict[str, Diagnosed] = {}
-    stopped = Event()
-    judged = [name for name in names if name in record.axes]
-
-    def loop() -> None:
-        with work.within(work.Work(lambda: stopped.is_set() or ending.asked)):
-            diagnose_record(record, judged, doing.now, found)
-
-    pool = ThreadPoolExecutor(1)
-    future = pool.submit(loop)
-    try:
-        while not future.done() and not ending.asked:
-            wait([future], timeout=0.1)
-            doing.tick()
-        wait([future], timeout=PATIENCE_S if ending.asked else None)
-        if future.done():
-            with suppress(Stopped):
-                future.result()
-        else:
-            abandon()
-    finally:
-        stopped.set()
-        pool.shutdown(wait=False)
-    return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
-
-
-def _by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
-    """Axes without a cause must pass the checks of `identify`."""
-    for name, one in found.items():
-        if one.findings or one.state.below_lattice:
-            continue
-        with suppress(UserError):  # no report, no checks
-            look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)
-            if look is not None:
-                one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))
-
-
-def _show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequence[str], ending: Held) -> None:
-    """The findings of the first look on stderr, as soon as they are there, and the axes `names` that it did not end."""
-    with work.within(work.Work(lambda: True)):  # in words: nothing is measured for them
-        axes = to_document(recording, first, {}, {})["axes"]
-    told = [f"{name}: {finding['cause']}: {finding['words']}" for name in axes for finding in axes[name]["findings"]]
-    reasons = {name: first[name].unfinished if name in first else INTERRUPTED * ending.asked for name in names}
-    told += [f"{name}: not finished: {reason}" for name, reason in reasons.items() if reason]
-    note(f"means of {1.0 / FIRST_HZ:g} s, before every sample is looked at: {'' if told else 'nothing found'}")
-    for line in told:
-        note(line)
-
-
-def _why_not(recording: Recording, model: Model, record: Record, name: str) -> str:
-    """Why an axis has no result."""
-    if name not in record.axes:
-        return why_left_out(recording, model, name)
-    if not _below_lattice(record, name):
-        return INTERRUPTED
-    return OF_COUNTER if carried(record, name) else BELOW_LATTICE
-
-
-def _below_lattice(record: Record, name: str) -> bool:
-    return name in record.axes and record.axes[name].below_lattice
-
-
-def _add_posteriors(document: dict[str, Any], recording: Recording, model: Model, ending: Held) -> None:
-    """What the extended model knows of each axis at rest, as `identify` tells it; null where the record bears no
-    report, and after a signal."""
-    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
-    findings = [finding for axis in axes.values() for finding in axis["findings"]]
-    moved = [one for finding in findings if finding["cause"] == "motion" for one in finding["estimate"]["intervals"]]
-    for name in axes if moved else ():
-        own = recording.along(name)
-        moved += moved_beside(own, model, name, look(own, name, model.group_of(name)))
-    rest = recording.without(moved)
-    for name, axis in axes.items():
-        axis["posterior"] = None if ending.asked else _posterior(rest, name, model)
-
-
-def _posterior(recording: Recording, name: str, model: Model) -> dict[str, Any] | None:
-    try:
-        known = identify_axis(recording, name, model, "library", None)
-    except UserError:
-        return None
-    return {
-        "hypotheses": dict(known.result.probability),
-        "parameters": parameters_entry(known),
-        "regressors": regressors_entry(known.scored).get("regressors", {}),
-    }
-
-
-def _given(
-    axes: Sequence[str], model: Path | str | None, decimate: float | None, recording: Recording
-) -> list[tuple[str, str]]:
-    """The command line's options that decide what is found, as they were given."""
-    given = [("--axis", name) for name in axes]
-    given += [] if model is None else [("--model", str(model))]
-    given += [] if decimate is None else [("--decimate", f"{decimate:.15g}")]
-    given += [("--since-power-on", f"{recording.since_power_on_s:.15g}")] if recording.since_power_on_s else []
-    return [*given, *recording.options]
-
-
-def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
-    recording = document["recording"]
-    console = Console(stderr=to_stderr)
-    console.print(
-        f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s{since(recording)}\n",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
-    for name, axis in document["axes"].items():
-        if "error" in axis:
-            console.print(f"{name}: no result: {axis['error']}", highlight=False, markup=False, soft_wrap=True)
-            continue
-        reason = f": {axis['unfinished']}" if axis.get("unfinished") else ""
-        colour = "bold red" if axis["verdict"] != "adequate" else "yellow" if reason else "green"
-        heading = f"{name} [{axis['unit']}]: {words.verdict(axis)}{reason}"
-        console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
-        for finding in axis["findings"]:
-            for line in _lines(finding):
-                console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
-        if len(axis["findings"]) > 1:
-            for line in words.carried(axis):
-                console.print(f"  all causes together: {line}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _lines(finding: Mapping[str, Any]) -> list[str]:
-    """One finding in a few lines."""
-    gain = finding["gain"]
-    lines = [f"{finding['cause']}: {finding['words']}"]
-    evidence = f"  evidence {words.evidence(finding)}"
-    if finding["when"]:
-        evidence += f"; at {finding['when'][0]:.6g} s"
-        evidence += "" if finding["when"][0] == finding["when"][1] else f" to {finding['when'][1]:.6g} s"
-    lines.append(evidence)
-    if gain is not None:
-        score = gain["log_score_per_sample"]
-        errors = ", ".join(
-            f"{horizon} s {row['before']:.3g} -> {row['after']:.3g}"
-            for horizon, row in gain["bias_rmse"]["horizon_s"].items()
-        )
-        lines.append(f"  held-out gain {score['after'] - score['before']:+.4f} ± {score['sd']:.2g} nats a sample")
-        lines[-1] += f"; bias error ahead, {gain['bias_rmse']['unit']}: {errors}" if errors else ""
-    elif finding.get("gain_reason"):
-        lines.append(f"  no held-out gain: {finding['gain_reason']}")
-    lines += [f"  {line}" for line in words.carried(finding)]
-    if finding["inflation_words"]:
-        lines.append(f"  {finding['inflation_words']}")
-    if finding["shared_with"]:
-        lines.append(f"  also on {', '.join(finding['shared_with'])}")
-    if finding["also_possible"]:
-        lines.append(f"  this record cannot tell it from: {', '.join(finding['also_possible'])}")
-    lines.append(f"  next: {finding['record_next']}")
-    return lines
+    table(document, to_stderr=to_stderr(given))
+    return exit_code(document, given.get("fail_on"))

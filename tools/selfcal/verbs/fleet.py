@@ -1,57 +1,72 @@
-"""`selfcal fleet`: many recordings at once, and the table of the units."""
+"""Identify many recordings, and write one table of the units."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
-from rich.console import Console
-
-from selfcal.adequacy.document import check_writable, write_json
-from selfcal.base.errors import UserError, note, printable, short
-from selfcal.batch.fail_on import check, outcome
-from selfcal.batch.files import DATE_FORM, sources_of
-from selfcal.batch.prior_file import lines_of as lines_of_priors
-from selfcal.batch.prior_file import write_model as write_priors
-from selfcal.batch.record import ByContent, Options, examined, killed, own_pages, settings_of
-from selfcal.batch.spread import spread
-from selfcal.batch.summary import document_of, lines_of, summed_up
-from selfcal.batch.table import Unit, check_table, rows_of, write_table
-from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, check_options, judge, unjudged, write
+from selfcal.base.errors import UserError, note, short
+from selfcal.base.options import argument, option
 from selfcal.logs.loaders import Reading
-from selfcal.model.file import Model
-from selfcal.studies import montecarlo
-
-SCHEMA = "selfcal.fleet/1"
-#: Names that are printed of a kind at most.
-MOST_NAMES = 40
+from selfcal.verbs._shared import (
+    Axes,
+    End,
+    FailOn,
+    Gate,
+    Json,
+    Junit,
+    LimitsFile,
+    ModelFile,
+    Scheduler,
+    SincePowerOn,
+    Start,
+    Verdicts,
+    Workers,
+    to_stderr,
+)
 
 
 def fleet(
-    patterns: Sequence[Path | str],
-    output: Path | str,
+    patterns: Annotated[
+        Sequence[Path | str],
+        argument("Recordings: files, or patterns as 'logs/**/*.ulg'", "PATTERN...", kind=list[str]),
+    ],
+    output: Annotated[
+        Path | str, option("Table to write: .csv or .parquet", "-o", "--output", metavar="FILE", show_default=False)
+    ],
     *,
-    serial_from: str | None = None,
-    units_table: Path | str | None = None,
-    diagnose: bool = False,
-    fail_on: str | None = None,
-    limits: Path | str | None = None,
-    junit: Path | str | None = None,
-    verdicts: Path | str | None = None,
-    json: Path | str | None = None,
-    report: Path | str | None = None,
-    write_model: Path | str | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    results: Path | str | None = None,
-    axes: Sequence[str] = (),
-    model: Path | str | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
-    since_power_on_s: float = 0.0,
-    gate: bool = False,
+    serial_from: Annotated[
+        str | None,
+        option(
+            "Device by the file's name (name:REGEX: by what it finds in the path), or by the metadata",
+            metavar="name|field",
+        ),
+    ] = None,
+    units_table: Annotated[
+        Path | str | None, option("Columns file, device, and station, lot, date", metavar="UNITS.csv")
+    ] = None,
+    diagnose: Annotated[bool, option("Look for causes too; slower", "--diagnose")] = False,
+    fail_on: FailOn = None,
+    limits: LimitsFile = None,
+    junit: Junit = None,
+    verdicts: Verdicts = None,
+    json: Json = None,
+    report: Annotated[Path | str | None, option("Write a page of the batch", metavar="FILE.html")] = None,
+    write_model: Annotated[
+        Path | str | None, option("Write the model with the batch as a new unit's priors", metavar="FILE.yaml")
+    ] = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    results: Annotated[
+        Path | str | None, option("Folder of finished recordings; default: FILE.parts", metavar="DIR")
+    ] = None,
+    axes: Axes = (),
+    model: ModelFile = None,
+    start_s: Start = None,
+    end_s: End = None,
+    since_power_on_s: SincePowerOn = 0.0,
+    gate: Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Identify every recording of the batch and write the table `output`, .csv or .parquet.
@@ -69,6 +84,24 @@ def fleet(
     `write_model`: the model file with the batch's priors (batch/prior_file.py).
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
+    from functools import partial
+
+    from selfcal.base.output import check_writable, write_json
+    from selfcal.batch.fail_on import check
+    from selfcal.batch.files import DATE_FORM, sources_of
+    from selfcal.batch.fleet import document_with, judged_units, version_of_package
+    from selfcal.batch.prior_file import lines_of as lines_of_priors
+    from selfcal.batch.prior_file import write_model as write_priors
+    from selfcal.batch.record import ByContent, Options, Verbs, examined, killed, own_pages, settings_of
+    from selfcal.batch.spread import spread
+    from selfcal.batch.summary import document_of, lines_of, summed_up
+    from selfcal.batch.table import Unit, check_table, rows_of, write_table
+    from selfcal.batch.verdicts import Limits, check_options, write
+    from selfcal.model.file import Model
+    from selfcal.model.file import settings_of as model_settings_of
+    from selfcal.verbs.diagnose import diagnose as run_diagnose
+    from selfcal.verbs.identify import identify
+
     check_table(output)
     dbc = reading.get("dbc")
     check_options(limits, junit, verdicts)
@@ -95,6 +128,7 @@ def fleet(
     named = sources_of([str(one) for one in patterns], units_table, serial_from, own_files)
     for copy, other in named.copies.items():
         note(f"{copy}: the same recording as {other}: counted once")
+    verbs = Verbs(identify, run_diagnose)
     options = Options(
         None if model is None else str(Path(model).absolute()),
         tuple(axes),
@@ -102,11 +136,11 @@ def fleet(
         {**reading, **({} if dbc is None else {"dbc": str(Path(dbc).absolute())})},
         {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
     )
-    version = _version()
-    keeper = ByContent(folder, settings_of(options, montecarlo.settings_of(loaded), version))
+    version = version_of_package()
+    keeper = ByContent(folder, settings_of(options, model_settings_of(loaded), version))
     own = [one for one in named.sources if not one.copy_of]
     found = spread(
-        partial(examined, options),
+        partial(examined, verbs, options),
         [(str(Path(one.path).absolute()), one.content) for one in own],
         settings={},
         piece=1,
@@ -127,11 +161,11 @@ def fleet(
             note(f"{unit.source.path}: leaves out the date '{short(unit.undated)}': write it as {DATE_FORM}")
     batch.sort(key=lambda unit: unit.place)
     write_table(output, (row for unit in batch for row in rows_of(unit, version)))
-    judged = [] if bounds is None else _judged(batch, bounds)
+    judged = [] if bounds is None else judged_units(batch, bounds)
     if bounds is not None:
         write(judged, junit, verdicts)
     summary = summed_up(batch, loaded)
-    document = {**_document(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
+    document = {**document_with(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
     if write_model is not None:
         document["words"] += lines_of_priors(write_priors(write_model, loaded, summary), loaded)
     if json is not None:
@@ -140,96 +174,16 @@ def fleet(
         from selfcal.batch.page import write_page
 
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
-        pages = own_pages(f"{report}.units", flagged, summary.devices, options, keeper, workers) if diagnose else {}
+        pages = (
+            own_pages(f"{report}.units", flagged, summary.devices, verbs, options, keeper, workers) if diagnose else {}
+        )
         write_page(report, document, summary, pages)
     return document
 
 
-def _version() -> str:
-    import selfcal
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+    """Print the devices that need a look; the exit code of the batch."""
+    from selfcal.batch.fleet import show as table
 
-    return str(selfcal.__version__)
-
-
-def _judged(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
-    """The verdicts of each recording. A group's limit holds for the axes that any recording of the batch has."""
-    stated = limits.of({name for unit in batch for name in unit.axes})
-    return [
-        (
-            unit.device,
-            unit.source.path,
-            judge(stated, unit.axes, unit.record["recording"]["duration_s"])
-            if unit.error is None
-            else unjudged(stated, unit.error),
-        )
-        for unit in batch
-    ]
-
-
-def _document(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[Judged]) -> dict[str, Any]:
-    """What the batch comes to, by device."""
-    failed: dict[str, list[str]] = {}
-    open_: dict[str, list[str]] = {}
-    for unit in batch:
-        for axis, reason in unit.errors.items():
-            open_.setdefault(unit.device, []).append(f"{axis}: {reason}" if axis else reason)
-        if fail_on is not None and unit.error is None:
-            shown, lines = _by_cause(unit, fail_on)
-            if shown:
-                failed.setdefault(unit.device, []).append(f"{fail_on}: {', '.join(shown)}")
-            elif lines:
-                open_.setdefault(unit.device, []).extend(lines)
-    broken = {unit.source.path for unit in batch if unit.error is not None}  # listed with their errors
-    for device, path, verdicts in judged:
-        for one in verdicts:
-            if one.verdict != PASS and path not in broken:
-                (failed if one.verdict == FAIL else open_).setdefault(device, []).append(one.words)
-    devices = dict.fromkeys(unit.device for unit in batch)
-    return {
-        "schema": SCHEMA,
-        "devices": len(devices),
-        "recordings": len(batch),
-        "failed": failed,
-        "not_judged": {device: list(dict.fromkeys(lines)) for device, lines in open_.items()},
-        "limits": [
-            {"device": device, "recording": path, **one.entry()}
-            for device, path, verdicts in judged
-            for one in verdicts
-        ],
-        "code": 1 if failed else 2 if open_ else 0,
-    }
-
-
-def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
-    """The axes that show it, and why others cannot be judged."""
-    shown, lines = [], []
-    diagnosis = unit.record.get("diagnosis", {})
-    for name, axis in unit.axes.items():
-        if "error" not in axis:
-            found = outcome({"axes": {name: diagnosis.get(name, axis)}}, fail_on)
-            shown += [name] if found.code == 1 else []
-            lines += found.lines
-    return shown, lines
-
-
-def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """What a person reads: how many, and by name the devices that need a look."""
-    console = Console(stderr=to_stderr)
-    for line in _lines(document):
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
-
-
-def _lines(document: Mapping[str, Any]) -> Iterator[str]:
-    yield f"{document['recordings']} recordings of {document['devices']} devices"
-    yield from document["words"]
-    yield from _listed("unlike the batch", document["unlike"])
-    yield from _listed("drifting", document["drifting"])
-    yield from _listed("failed", document["failed"])
-    yield from _listed("not judged", document["not_judged"])
-
-
-def _listed(what: str, devices: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    for device, reasons in list(devices.items())[:MOST_NAMES]:
-        yield f"{what}: {device}: {'; '.join(reasons)}"
-    if len(devices) > MOST_NAMES:
-        yield f"{what}: {len(devices) - MOST_NAMES} more: the table names them"
+    table(document, to_stderr=to_stderr(given))
+    return int(document["code"])

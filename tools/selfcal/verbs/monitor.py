@@ -1,4 +1,4 @@
-"""`selfcal monitor`: live view of the telemetry of one module or several on any python-can interface, or of a log."""
+"""Live view of modules' telemetry; exit code 1 if a module was out of reach when the time was up."""
 
 from __future__ import annotations
 
@@ -6,79 +6,42 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
-from rich.console import Console
-
-from selfcal.adequacy.checks import Judged
-from selfcal.adequacy.document import Identified, Telemetry, check_writable, to_document, write_json
-from selfcal.base.ending import held
 from selfcal.base.errors import UserError
-from selfcal.show.plot import check_picture, plot_run
-from selfcal.wire.dbc_file import NODES, Names
-from selfcal.wire.framelog import FrameLog, FrameWriter, check_suffix
-from selfcal.wire.frames import (
-    AXES,
-    REASONS,
-    AxisReport,
-    Decoder,
-    Link,
-    Statistics,
-    Streams,
-    axis_unit,
-    node_of,
-    open_bus,
-    reasons,
-    serial_ports,
-)
-from selfcal.wire.known_models import KnownModels
-from selfcal.wire.live import SILENT_S, Contact, View
-from selfcal.wire.streams import check as check_stream
-from selfcal.wire.streams import content, open_streams
+from selfcal.base.options import option
+from selfcal.verbs._shared import Axes, From, Json
 
 if TYPE_CHECKING:
-    import can
-
-#: s without a frame after which a serial line is opened again: a module that saves hears nothing for 1 to 2 s, and one
-#: that has restarted says nothing until then.
-REOPEN_S = 3.0
-#: s between looks for a port that has gone.
-LOOK_S = 0.5
-#: Schema of the document of several modules.
-MODULES = "selfcal.modules/1"
-#: Reports of an axis that are kept for the plot: beyond it every other one goes.
-KEPT = 2000
-
-
-@dataclass
-class Outcome(Statistics):
-    """The frames, and whether the module was out of reach when the time was up or its port went.
-
-    An end that the user asked for is none of these.
-    """
-
-    contact_lost: bool = False
+    from selfcal.wire.monitor import Outcome
 
 
 def monitor(
     *,
-    interface: str = "slcan",
-    channel: str | None = None,
-    read: Path | str | None = None,
-    speed: float | None = None,
-    axes: Sequence[str] = (),
-    node: int | None = None,
-    model: Path | str | None = None,
-    start: Path | str | None = None,
-    log: Path | str | None = None,
-    stream: Sequence[str] = (),
-    duration: float | None = None,
-    bitrate: int | None = None,
-    once: bool = False,
-    json: Path | str | None = None,
-    plot: Path | str | None = None,
+    interface: Annotated[str, option("python-can interface", metavar="NAME")] = "slcan",
+    channel: Annotated[str | None, option("Channel: a serial port for slcan", metavar="NAME")] = None,
+    read: Annotated[Path | str | None, option("Read a log of frames instead of a channel", metavar="FILE")] = None,
+    speed: Annotated[float | None, option("Of --read, 1 as it came; default: at once", metavar="X")] = None,
+    axes: Axes = (),
+    node: Annotated[int | None, option("Show this module alone, 0 to 11", metavar="N")] = None,
+    model: Annotated[
+        Path | str | None, option("Model of a module, for names; default: the default one", metavar="MODEL.yaml")
+    ] = None,
+    start: From = None,
+    log: Annotated[
+        Path | str | None,
+        option("Keep the raw frames (.asc .blf .csv .log .trc), with the reports (.mcap)", metavar="FILE"),
+    ] = None,
+    stream: Annotated[
+        Sequence[str],
+        option("Reports for other programs: udp-json, jsonl, foxglove (repeat for more)", metavar="KIND[:HOST:PORT]"),
+    ] = (),
+    duration: Annotated[float | None, option("Stop after this long; default: Ctrl-C", metavar="S")] = None,
+    bitrate: Annotated[int | None, option("Of the CAN bus, if it needs one", metavar="BIT/S")] = None,
+    once: Annotated[bool, option("End when the port vanishes instead of waiting for it", "--once")] = False,
+    json: Json = None,
+    plot: Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")] = None,
 ) -> Outcome:
     """Show what arrives by `channel`, or what the log `read` holds, until Ctrl-C, its end, or until `duration` (s) is
     over.
@@ -95,6 +58,20 @@ def monitor(
     picture of the run; of several modules one each, whose name ends in the node. Raises UserError for what the user
     can put right.
     """
+    from rich.console import Console
+
+    from selfcal.base.ending import held
+    from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.show.plot import plot_run
+    from selfcal.wire.dbc_file import NODES
+    from selfcal.wire.framelog import FrameLog, FrameWriter, check_suffix
+    from selfcal.wire.frames import AXES, REASONS, AxisReport, Link, Streams, axis_unit, open_bus, reasons, serial_ports
+    from selfcal.wire.known_models import KnownModels
+    from selfcal.wire.live import Contact, View
+    from selfcal.wire.monitor import LOOK_S, MODULES, REOPEN_S, Outcome, document, farewell, feed, keep
+    from selfcal.wire.streams import check as check_stream
+    from selfcal.wire.streams import content, open_streams
+
     if (channel is None) == (read is None):
         raise UserError(
             f"which module? --channel names its port ({serial_ports()}), or --read a log of its frames: one of the two"
@@ -167,7 +144,7 @@ def monitor(
                         continue
                     malformed = source.malformed
                     frame = source.recv(min(0.25, left))
-                    reports = [] if frame is None else _feed(streams, frame, contacts if contact is not None else None)
+                    reports = [] if frame is None else feed(streams, frame, contacts if contact is not None else None)
                     if contact is not None and (frame is not None or source.malformed > malformed):
                         contact.heard(in_a_row=False, paced=any(one.paced for one in contacts.values()))
                     if frame is None:
@@ -184,7 +161,7 @@ def monitor(
                     pass_on(reports, came_s)
                     for report in reports:
                         if report.axis in (axes or AXES):
-                            _keep(histories.setdefault(report.node, {}), [report])
+                            keep(histories.setdefault(report.node, {}), [report])
             wanted = ending.asked
         except KeyboardInterrupt:
             wanted = True
@@ -194,7 +171,7 @@ def monitor(
         view.print_last()
         outcome = Outcome(**vars(streams.statistics))
         console = Console(stderr=True)
-        for line in _farewell(source, contact, contacts, streams, name):
+        for line in farewell(source, contact, contacts, streams, name):
             outcome.contact_lost = not wanted
             console.print(line, highlight=False, markup=False, soft_wrap=True)
     known = streams.known
@@ -213,7 +190,7 @@ def monitor(
     names = {number: models.names(known[number].status) for number in reported}
     if json is not None:
         documents = {
-            number: _document(history, known[number], name, names[number], number)
+            number: document(history, known[number], name, names[number], number)
             for number, history in reported.items()
         }
         several = {"schema": MODULES, "modules": {str(number): one for number, one in documents.items()}}
@@ -227,90 +204,6 @@ def monitor(
     return outcome
 
 
-def _feed(streams: Streams, frame: can.Message, contacts: dict[int, Contact] | None) -> list[AxisReport]:
-    """Take a frame, and note by the host's clock that its module was heard."""
-    node = node_of(frame.arbitration_id)
-    before = streams.decoders.get(node) if node is not None else None
-    received, lost = (before.statistics.received, before.statistics.lost) if before is not None else (0, 0)
-    reports = streams.feed(frame)
-    decoder = streams.decoders.get(node) if node is not None else None
-    if contacts is not None and decoder is not None and decoder.statistics.received > received:
-        in_a_row = (decoder.statistics.received, decoder.statistics.lost) == (received + 1, lost)
-        first, last = decoder.status_ms or (0, 0)
-        contacts.setdefault(decoder.node, Contact()).heard(
-            in_a_row=in_a_row, paced=abs(last - first) > 1000.0 * SILENT_S
-        )
-    return reports
-
-
-def _keep(history: dict[str, list[AxisReport]], reports: Sequence[AxisReport]) -> None:
-    """Add the complete reports. One from before the last of its axis comes from a module that has started anew."""
-    for report in reports:
-        if not report.complete:
-            continue
-        if report.axis in history and report.time_s < history[report.axis][-1].time_s:
-            history.clear()
-        kept = history.setdefault(report.axis, [])
-        kept.append(report)
-        if len(kept) > KEPT:
-            del kept[1:-1:2]
-
-
-def _farewell(
-    source: Link | FrameLog, contact: Contact | None, contacts: Mapping[int, Contact], streams: Streams, name: str
-) -> list[str]:
-    """What went wrong at the end, if anything did."""
-    if isinstance(source, FrameLog):
-        return [f"{name}: the log is damaged and ends early: {source.damage}"] if source.damage else []
-    assert contact is not None
-    known = streams.known
-    if known and all(decoder.finished for decoder in known.values()):
-        return []
-    if source.closed:
-        return [f"{name}: the other side has gone"]
-    if not contact.ever:
-        return [f"{name}: no word from a module"]
-    lost = {node: contacts[node] for node, one in known.items() if not one.finished and contacts[node].lost}
-    said = [
-        f"{name}: {f'node {node}: ' if set(known) != {0} else ''}contact lost, no word for {one.silent_s:.0f} s"
-        for node, one in lost.items()
-    ]
-    if not known and contact.lost:
-        said.append(f"{name}: contact lost, no word for {contact.silent_s:.0f} s")
-    return said
-
-
-def _document(
-    history: Mapping[str, Sequence[AxisReport]], decoder: Decoder, name: str, names: Names, node: int
-) -> dict[str, Any]:
-    """The last complete reports as `identify` gives its results. Checks need the samples, which are not here."""
-    status, why = decoder.status, reasons(decoder.status, decoder.corrected)
-    interval, block = status.get("bank_interval", math.nan), status.get("bank_block", math.nan)
-    run = Telemetry(
-        path=name,
-        rate_hz=block / interval if interval > 0.0 else math.nan,
-        samples=int(status["samples"]) if "samples" in status else None,
-        duration_s=max(reports[-1].time_s for reports in history.values()),
-    )
-    found = {
-        axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(names), Judged({}, None), {})
-        for axis, reports in history.items()
-    }
-    document = to_document(run, found)
-    document["node"] = node
-    for axis, entry in document["axes"].items():
-        entry["adequate"] = None
-        entry["module_reason"] = why.get(axis)
-        told = history[axis][-1].coefficients(names)
-        if told:
-            units = dict(names.columns)
-            entry["coefficients"] = {
-                column: {
-                    "mean": mean,
-                    "sd": sd,
-                    "probability": probability,
-                    "unit": f"{axis_unit(axis)}/{units[column]}" if units[column] else None,
-                }
-                for column, (mean, sd, probability) in told.items()
-            }
-    return document
+def show(outcome: Outcome, given: Mapping[str, Any]) -> int:
+    """Exit code 1 if a module was out of reach when the time was up."""
+    return 1 if outcome.contact_lost else 0

@@ -1,69 +1,38 @@
-"""`selfcal part`: the model file of another part, from a recording at rest, its data sheet, or both."""
+"""Write the model file of another part, from a recording at rest or its data sheet."""
 
 from __future__ import annotations
 
-import copy
-import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
-import numpy as np
-import yaml
+from selfcal.base.errors import UserError
+from selfcal.base.options import argument, option
+from selfcal.logs.loaders import READ, Reading
+from selfcal.verbs._shared import End, Start
 
-from selfcal.adequacy.document import check_writable
-from selfcal.base import units as unit_module
-from selfcal.base.errors import UserError, note, remark, short
-from selfcal.base.output import write_text
-from selfcal.base.units import factor, parameter_unit
-from selfcal.logs.loaders import Reading
-from selfcal.logs.recording import Recording, list_of, load
-from selfcal.model.file import DEFAULT, LONGEST_TEXT, SENSORS, Group, Model, Prior
-from selfcal.readings.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
-from selfcal.readings.readings import Readings, look
-from selfcal.readings.rest import rest_of
-
-#: What a data sheet may state of a group or an axis, and what it states of the part. `density` is one-sided, as data
-#: sheets have it; an angle or velocity random walk is N.
-STATED, OF_PART = ("N", "density", "K", "B", "bias", "range", "lsb"), ("rate",)
-#: Kinds of axes by a unit of each: their group's name, and its unit where the recording does not decide it.
-KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "degC": "temperature", "V": "voltage"}
-#: A stated K or B has so many decades of prior, as the default model has of K.
-DECADES_STATED = 3.0
-#: Axes of one group whose N differ by more have priors of their own.
-ALIKE = 10.0
-#: A recording's N so many times off the data sheet's is told of.
-DIFFERENT = 2.0
-#: Equal readings in a row that are stuck, as the default model has it; none on a lattice coarser than the noise.
-STUCK = 1000
-#: Rates of `simulate` at most, Hz.
-SIMULATED_HZ = 10.0
-#: A bias prior of an axis of another kind is no narrower than so many times N.
-LEAST_BIAS = 1000.0
-
-
-@dataclass(frozen=True)
-class Stated:
-    """One number of a data sheet: `of` a group or an axis, "" for all that it fits, with its `unit`."""
-
-    of: str
-    key: str
-    value: float
-    unit: str
-    text: str
+if TYPE_CHECKING:
+    from selfcal.model.file import Model
 
 
 def part(
-    log: Sequence[Path | str] = (),
-    output: Path | str = "part.yaml",
+    log: Annotated[
+        Sequence[Path | str], argument(f"Recording at rest: {READ}; or --datasheet alone", "[LOG...]", kind=list[Path])
+    ] = (),
+    output: Annotated[
+        Path | str, option("Model file to write", "-o", "--output", metavar="MODEL.yaml", show_default=False)
+    ] = "part.yaml",
     *,
-    name: str | None = None,
-    datasheet: Sequence[str] = (),
-    axes: Sequence[str] = (),
-    start_s: float | None = None,
-    end_s: float | None = None,
+    name: Annotated[str | None, option("Of the part; default: the recording's", metavar="NAME")] = None,
+    datasheet: Annotated[
+        Sequence[str], option("Number of its data sheet, or gx.N=... (repeat for more)", metavar="N=0.012deg/sqrt(h)")
+    ] = (),
+    axes: Annotated[
+        Sequence[str],
+        option("Column that is an axis, beside gx to az (repeat for more)", "--axis", metavar="NAME"),
+    ] = (),
+    start_s: Start = None,
+    end_s: End = None,
     **reading: Unpack[Reading],
 ) -> Model:
     """Write the model file of a part into `output`, and return the model.
@@ -73,6 +42,14 @@ def part(
     are axes, where they are not gx to az. The other options are `load`'s.
     Raises UserError for a recording that moved, a text that is none of these, and a file that cannot be written.
     """
+    import yaml
+
+    from selfcal.base.output import check_writable, write_text
+    from selfcal.base.units import SENSORS
+    from selfcal.logs.recording import list_of, load
+    from selfcal.model.file import DEFAULT, Model
+    from selfcal.readings.part import as_text, finish, groups, of_recording, of_sheet, parse
+
     if not log and not datasheet:
         raise UserError("give a recording at rest, or numbers of a data sheet: --datasheet 'N=0.012deg/sqrt(h)'")
     check_writable(output, inputs=tuple(list_of(log)) if log else ())
@@ -88,9 +65,9 @@ def part(
     base = Model.load()
     said: list[str] = []
     if recording is not None:
-        tree["groups"] = _groups(tree["groups"], recording, axes)
+        tree["groups"] = groups(tree["groups"], recording, axes)
         tree["gate"]["N"] = dict.fromkeys(tree["groups"], 1.0)  # until N is known
-        said += _of_recording(tree, recording)
+        said += of_recording(tree, recording)
     else:
         rate = reading.get("rate")
         if rate is None and not any(one.key == "rate" for one in stated):
@@ -98,229 +75,16 @@ def part(
         tree["sensor"] = {"name": "", "rate_hz": rate, "filter_taps": 1}
         for group in tree["groups"].values():
             group |= {"range": 0.0, "lsb": 0.0}
-    said += _of_sheet(tree, stated, recording is not None)
-    _finish(tree, name or (recording.path.name.partition(".")[0] if recording is not None else "part"), base)
+    said += of_sheet(tree, stated, recording is not None)
+    finish(tree, name or (recording.path.name.partition(".")[0] if recording is not None else "part"), base)
     model = Model.of_tree(tree, Path(output))
     write_text(output, as_text(tree, recording, said))
     return model
 
 
-def parse(text: str) -> Stated:
-    """`gx.N=0.012deg/sqrt(h)`: an axis or a group and a dot, if it is of one alone; the key; the number; its unit."""
-    match = re.fullmatch(r"\s*(?:(?P<of>[\w-]+)\.)?(?P<key>\w+)\s*=(?P<quantity>.*)", text)
-    wanted = "write KEY=NUMBER and its unit, as N=0.012deg/sqrt(h), accel.N=70ug/sqrt(Hz) or rate=200Hz"
-    if match is None:
-        raise UserError(f"--datasheet {short(text)}: {wanted}")
-    key = match["key"]
-    if key not in (*STATED, *OF_PART):
-        known = ", ".join((*STATED, *OF_PART))
-        raise UserError(f"--datasheet {short(text)}: there is no key '{short(key)}' (there are {known})")
-    try:
-        value, unit = unit_module.quantity(match["quantity"])
-    except ValueError:
-        raise UserError(f"--datasheet {short(text)}: {wanted}") from None
-    if key == "density":
-        key, value = "N", value * unit_module.ONE_SIDED_TO_TWO_SIDED
-    if not math.isfinite(value) or not value > 0.0 or not unit_module.known(unit):
-        raise UserError(f"--datasheet {short(text)}: {wanted}")
-    return Stated(match["of"] or "", key, value, unit, text.strip())
+def show(model: Model, given: Mapping[str, Any]) -> int:
+    """Print what was written."""
+    from selfcal.readings.part import show as lines
 
-
-def _groups(default: Mapping[str, Any], recording: Recording, axes: Sequence[str]) -> dict[str, Any]:
-    """The trees of the groups that the recording's axes make: those of the default model where it has them, else one
-    for each kind and unit, whose priors are laid later."""
-    found: dict[str, Any] = {}
-    for axis in (one for one in recording.columns if one in SENSORS or one in axes):
-        unit = recording.columns[axis].unit
-        home = next((name for name, group in default.items() if axis in group["axes"]), None)
-        if home is not None:
-            unit, name = default[home]["unit"], home
-        else:
-            kind = next((kind for one, kind in KINDS.items() if unit_module.same_kind(unit, one)), axis)
-            name = kind if kind not in default else axis
-            unit = found.get(name, {"unit": unit})["unit"]
-        group = found.setdefault(name, copy.deepcopy(default[home or "gyro"]) | {"unit": unit, "axes": []})
-        group["axes"].append(axis)
-    if not found:
-        raise UserError(
-            f"{recording.path}: no column is an axis ({', '.join(SENSORS)}); name yours with --axis "
-            f"{next(iter(recording.columns))}"
-        )
-    for group in found.values():
-        group |= {"range": 0.0, "lsb": 0.0, "stuck_limit": STUCK}
-    return found
-
-
-def _of_recording(tree: dict[str, Any], recording: Recording) -> list[str]:
-    """Put the rate, the read-out and the priors that a recording shows into `tree`; a line for each."""
-    model = Model.of_tree(tree, recording.path)
-    own = {axis: recording.along(axis) for axis in model.axes}
-    for axis, one in own.items():
-        rest = rest_of(one, [axis])
-        if rest.moved:
-            longest = f": --start {rest.longest[0]:.10g} --end {rest.longest[1]:.10g}" if rest.longest else ""
-            raise UserError(f"{recording.path}: {axis} moved; take a stretch at rest{longest}")
-    readings = {axis: look(one, axis, model.group_of(axis)) for axis, one in own.items()}
-    rate_hz = max(one.recording.rate_hz for one in readings.values())
-    tree["sensor"] = {"name": tree["sensor"]["name"], "rate_hz": float(f"{rate_hz:.6g}"), "filter_taps": 1}
-    said = [f"rate: {rate_hz:.6g} Hz"]
-    for group in model.groups:
-        seen = {axis: _seen(own[axis], axis, model) for axis in group.axes}
-        fields = tree["groups"][group.name]
-        read_out, lines = _read_out(group, [readings[axis] for axis in group.axes])
-        fields |= read_out
-        said += lines
-        typical = math.exp(float(np.mean([math.log(one.N) for one in seen.values()])))
-        level = max(seen.values(), key=lambda one: abs(one.level)).level
-        about_it = group
-        if not any(axis in SENSORS for axis in group.axes):
-            wide = rounded(max(LEVEL_SD * abs(level), LEAST_BIAS * typical))
-            about_it = replace(group, priors={**group.priors, "bias": Prior("normal", sd=wide)})
-        widest = replace(max(seen.values(), key=lambda one: float(one.deviation.max())), level=level)
-        priors = about(about_it, _at(widest, typical))
-        fields["priors"] = {key: prior_tree(prior) for key, prior in priors.items()}
-        listed = ", ".join(f"{axis} {one.N:.3g}" for axis, one in seen.items())
-        said.append(f"{group.name}: N about {listed} {parameter_unit('N', group.unit)} (Allan deviation)")
-        far = {axis: one for axis, one in seen.items() if not 1.0 / ALIKE < one.N / typical < ALIKE}
-        if far:
-            fields["own_priors"] = {
-                axis: {key: prior_tree(prior) for key, prior in about(about_it, one).items() if prior != priors[key]}
-                for axis, one in far.items()
-            }
-    return said
-
-
-def _at(seen: Seen, N: float) -> Seen:
-    """The same axis with another N, whose deviation is the largest of a group's."""
-    return replace(seen, deviation=np.concatenate([[N / math.sqrt(seen.tau_s[0])], seen.deviation[1:]]))
-
-
-def _seen(recording: Recording, axis: str, model: Model) -> Seen:
-    found = seen_of(recording, axis, model)
-    if found is None:
-        raise UserError(
-            f"{recording.path}: {axis} is too short for a part's noise, or all its readings are alike: record a minute "
-            "and more at rest"
-        )
-    return found
-
-
-def _read_out(group: Group, readings: Sequence[Readings]) -> tuple[dict[str, Any], list[str]]:
-    """Lattice, range and stuck limit that the readings of a group's axes show, in its unit."""
-    steps = [one.lattice for one in readings if one.lattice is not None]
-    limits = [abs(one.clipped.limit) for one in readings if one.clipped is not None]
-    found: dict[str, Any] = {}
-    said = []
-    if steps:
-        found["lsb"] = float(f"{min(one.step for one in steps):.6g}")
-        said.append(f"{group.name}: lattice {found['lsb']:.6g} {group.unit}")
-        if any(one.too_coarse for one in steps):
-            found["stuck_limit"] = 0
-    if limits:
-        found["range"] = float(f"{min(limits):.6g}")
-        said.append(f"{group.name}: range {found['range']:.6g} {group.unit}, where its readings end")
-    return found, said
-
-
-def _of_sheet(tree: dict[str, Any], stated: Sequence[Stated], measured: bool) -> list[str]:
-    """Put the numbers of a data sheet into `tree`; a line for each. N goes first: the others are beside it."""
-    for one in sorted(stated, key=lambda one: (one.key != "N", bool(one.of))):
-        if one.key == "rate":
-            if one.of or not unit_module.same_kind(one.unit, "Hz"):
-                raise UserError(f"--datasheet {one.text}: the rate is one of the part, in Hz: rate=200Hz")
-            tree["sensor"]["rate_hz"] = one.value * factor(one.unit, "Hz")
-            continue
-        fits = {name: group for name, group in tree["groups"].items() if _fits(one, group)}
-        meant = [name for name, group in fits.items() if one.of in ("", name) or one.of in group["axes"]]
-        if not meant:
-            raise UserError(f"--datasheet {one.text}: {_not_meant(one, tree['groups'])}")
-        for name in meant:
-            _put(tree["groups"][name], one, one.of if one.of != name else "", measured)
-    return [f"data sheet: {one.text}" for one in stated]
-
-
-def _fits(one: Stated, group: Mapping[str, Any]) -> bool:
-    """Whether its unit is one of this group's."""
-    return unit_module.same_kind(one.unit, _unit_of(one.key, group["unit"]))
-
-
-def _not_meant(one: Stated, groups: Mapping[str, Any]) -> str:
-    """Why a number goes nowhere."""
-    names = [*groups, *(axis for group in groups.values() for axis in group["axes"])]
-    if one.of and one.of not in names:
-        return f"there is no group or axis '{short(one.of)}' (there are {', '.join(names)})"
-    wanted = ", ".join(dict.fromkeys(_unit_of(one.key, group["unit"]) for group in groups.values()))
-    return f"'{short(one.unit)}' is no unit of {one.key} here (as {wanted})"
-
-
-def _unit_of(key: str, unit: str) -> str:
-    """Unit of a number of a data sheet, of a group in `unit`."""
-    return unit if key in ("range", "lsb") else parameter_unit(key, unit)
-
-
-def _put(group: dict[str, Any], one: Stated, axis: str, measured: bool) -> None:
-    """One number into a group's tree, of one `axis` of it where that is not "". `measured`: a recording laid N."""
-    value = one.value * factor(one.unit, _unit_of(one.key, group["unit"]))
-    if one.key in ("range", "lsb"):
-        if axis:
-            raise UserError(f"--datasheet {one.text}: range and lsb are of a group: leave '{axis}.' out")
-        group[one.key] = float(f"{value:.6g}")
-        return
-    held = group["priors"] if not axis else group.setdefault("own_priors", {}).setdefault(axis, {})
-    before = {key: Prior(**prior) for key, prior in {**group["priors"], **held}.items()}
-    if one.key == "N":
-        N = _noise(group)
-        if measured and not 1.0 / DIFFERENT < value / N < DIFFERENT:
-            note(f"{one.text}: the recording has {N:.3g} {parameter_unit('N', group['unit'])}")
-        of_group = group["priors"] if axis else {}
-        about_it = {key: prior_tree(prior) for key, prior in laid(before, value).items()}
-        held |= {key: prior for key, prior in about_it.items() if prior != of_group.get(key)}
-    elif one.key == "bias":
-        held["bias"] = {"law": "normal", "sd": rounded(value)}
-    else:
-        # A data sheet's bias instability is the size of the slow drift: the deviation of a Gauss-Markov one.
-        name = "sigma_m" if one.key == "B" else one.key
-        half = math.sqrt(10.0**DECADES_STATED)
-        held[name] = prior_tree(Prior("log_uniform", min=rounded(value / half), max=rounded(value * half)))
-
-
-def _noise(group: Mapping[str, Any]) -> float:
-    """The N that a group's priors are laid about: its least may have given way to the bias."""
-    prior = group["priors"]["N"]
-    return float(min(max(prior["max"] / DECADES, prior["min"]), math.sqrt(prior["min"] * prior["max"])))
-
-
-def _finish(tree: dict[str, Any], name: str, base: Model) -> None:
-    """The name, the gate's bounds and `simulate` about each N."""
-    plain = remark(name)[:LONGEST_TEXT]
-    tree["name"] = plain
-    tree["sensor"]["name"] = plain
-    middle = {key: _noise(group) for key, group in tree["groups"].items()}
-    tree["gate"]["N"] = {key: rounded(GATE_NOISE * N) for key, N in middle.items()}
-    # The drift is drawn from its priors; the noise is known.
-    noise = {axis: {"N": rounded(middle[key])} for key, group in tree["groups"].items() for axis in group["axes"]}
-    tree["simulate"] = {
-        "rate_hz": min(SIMULATED_HZ, tree["sensor"]["rate_hz"]),
-        "duration_s": base.simulate["duration_s"],
-        "axes": noise,
-    }
-
-
-def as_text(tree: Mapping[str, Any], recording: Recording | None, said: Sequence[str]) -> str:
-    """The file: where its numbers are from, then the tree."""
-    source = f" from {remark(recording.path.name)}, {recording.duration_s:.6g} s at rest" if recording else ""
-    head = [f"# Written by `selfcal part`{source}.", *(f"# {remark(line)}" for line in said)]
-    return "\n".join(head) + "\n" + str(yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True, width=110))
-
-
-def show(model: Model) -> None:
-    """What was written, on stdout."""
-    print(f"{model.path}: model '{model.name}', {model.sensor_rate_hz:g} Hz")
-    for group in model.groups:
-        N = group.priors["N"]
-        lattice = f", lattice {group.lsb:.6g}" if group.lsb else ""
-        reach = f", range {group.range:.6g}" if group.range else ""
-        print(
-            f"  {group.name} [{group.unit}]: {', '.join(group.axes)}; N {N.min:.3g} to {N.max:.3g} "
-            f"{parameter_unit('N', group.unit)}{lattice}{reach}"
-        )
+    lines(model)
+    return 0

@@ -1,116 +1,35 @@
-"""`selfcal plan`: how long must a part be recorded, and at what rate, until what is wanted of it is known?
-
-An ensemble answers: parts as the model file's `simulate` entry states them, what it leaves open drawn from the priors.
-Each is recorded for longer and longer, by readings at the bank's rate, and
-identified. The length is the one at which SHARE of the records have what is
-wanted. The Fisher information of the spectrum says how that length changes with the rate.
-
-A wish of a regressor's coefficient asks for a swing of its channel in a record of that length. The channel follows a
-cosine of half a cycle (one sweep) or more. A cosine of amplitude A over n readings says n A^2 / (2 S) of the
-coefficient, with S the spectrum at its frequency: that gives the swing, and the ensemble corrects it.
-"""
+"""How long a part must be recorded, and at what rate, until what is wanted is known."""
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import Annotated, Any
 
-import numpy as np
-from numpy.typing import NDArray
-from rich.console import Console
-
-from selfcal.adequacy.allan import information_of, terms_of
-from selfcal.adequacy.document import check_writable, write_json
-from selfcal.bank.result import HALF_90
-from selfcal.base import units
-from selfcal.base.errors import UserError, printable, short
-from selfcal.batch.spread import Row, record_seeds, spread
-from selfcal.batch.verdicts import duration_words
-from selfcal.model.file import Model, Regressor
-from selfcal.model.laws import PLACES, Law
-from selfcal.model.regressors import coefficient_unit, offered
-from selfcal.model.tables import make_tables
-from selfcal.show.plot import COLORS, check_picture, save_picture
-from selfcal.studies.montecarlo import has_nodes, simulate_bank_samples
-from selfcal.verbs.simulate import truth_of
-
-SCHEMA = "selfcal.plan/1"
-Floats = NDArray[np.float64]
-#: Share of the records that have what is wanted at the planned length.
-SHARE = 0.9
-#: Bank samples of the shortest record, and of the longest.
-LEAST, MOST = 64, 200_000
-#: Halvings of the last step of the length, in its logarithm.
-HALVINGS = 3
-#: A law is there in so many of the records at least.
-LEAST_SHARE = 0.1
-#: A bank so many times faster or slower is worth a line if it shortens the length to this share, or lengthens it less.
-FASTER, WORTH = 10.0, 0.8
-#: Smallest number of a metric: an interval of no width has no logarithm.
-TINY = 1e-12
-#: Readings at least of which an information is taken.
-_FEWEST = 8
-#: Cycles of a regressor's channel over the record: one sweep is half of one. Record without another wish, s.
-CYCLES, SWEEP_S = (0.5, 1.0, 4.0), 3600.0
-_NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
-_LAW = re.compile(rf"law decided {_NUMBER} ?%")
-_SHARE, _VALUE = re.compile(rf"(\w+) within {_NUMBER} ?%"), re.compile(rf"(\w+) within {_NUMBER} (\S+)")
-
-
-@dataclass(frozen=True)
-class Wish:
-    """What is wanted: a metric of at most `most`. Of the law (`parameter` ""): 1 - P of the true one. Of a parameter,
-    or a regressor's coefficient: half its 90 % interval, over its median if `unit` is ""."""
-
-    text: str
-    parameter: str
-    most: float
-    unit: str = ""
-
-    @staticmethod
-    def of(text: str, like: str, regressors: Mapping[str, tuple[str, float]] = MappingProxyType({})) -> Wish:
-        """A text such as `K within 20 %`, of an axis that reads in `like`. `regressors`: unit and size of the
-        coefficients that may be wanted. Raises UserError."""
-        plain = " ".join(text.split())
-        if match := _LAW.fullmatch(plain):
-            if not 50.0 <= float(match[1]) < 100.0:
-                raise UserError(f"--want '{short(text)}': a law is decided by 50 % or more, and by less than 100 %")
-            return Wish(plain, "", 1.0 - float(match[1]) / 100.0)
-        match = _SHARE.fullmatch(plain) or _VALUE.fullmatch(plain)
-        if match is None or match[1] not in ("bias", *PLACES, *regressors):
-            raise UserError(
-                f"--want '{short(text)}': takes 'K within 20 %', 'bias within 0.001 {like}' or 'law decided 95 %'"
-            )
-        if not 0.0 < float(match[2]) < math.inf:
-            raise UserError(f"--want '{short(text)}': must be within more than 0")
-        if match.re is _SHARE:
-            if match[1] == "bias":
-                raise UserError(f"--want '{short(text)}': a bias may be 0: state a unit, as 'bias within 0.001 {like}'")
-            unit, size = regressors.get(match[1], ("", 1.0))
-            return Wish(plain, match[1], float(match[2]) / 100.0 * size, unit)
-        unit = units.plain(match[3])
-        own = regressors[match[1]][0] if match[1] in regressors else units.parameter_unit(match[1], like)
-        if not units.known(unit) or unit == units.LSB or not units.same_kind(unit, own):
-            raise UserError(f"--want '{short(text)}': takes a unit as {own}, or %")
-        return Wish(plain, match[1], float(match[2]) * units.factor(unit, own), unit)
+from selfcal.base.errors import UserError
+from selfcal.base.options import argument, option
+from selfcal.verbs._shared import Json, Scheduler, to_stderr
 
 
 def plan(
-    model: Path | str,
+    model: Annotated[Path | str, argument("Model file of the part", "MODEL.yaml")],
     *,
-    want: Sequence[str],
-    axis: str | None = None,
-    records: int = 200,
-    seed: int = 1,
-    plot: Path | str | None = None,
-    json: Path | str | None = None,
-    scheduler: str | None = None,
+    want: Annotated[
+        Sequence[str],
+        option(
+            "'K within 20 %', 'bias within 0.001 deg/s', 'law decided 95 %', 'temperature within 10 %' (repeat)",
+            metavar="WISH",
+        ),
+    ],
+    axis: Annotated[
+        str | None, option("Axis of the part; default: the first that `simulate` states", metavar="NAME")
+    ] = None,
+    records: Annotated[int, option("Simulated parts", metavar="N")] = 200,
+    seed: Annotated[int, option("Same seed, same parts", metavar="N", min=0)] = 1,
+    plot: Annotated[Path | str | None, option("Save what is reached over the length", metavar="FILE")] = None,
+    json: Json = None,
+    scheduler: Scheduler = None,
 ) -> dict[str, Any]:
     """How long to record the part of a model file, so that SHARE of the records have each of the wishes `want`.
 
@@ -121,6 +40,12 @@ def plan(
     Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
+    from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.batch.plan import SCHEMA, SHARE, SWEEP_S, Ensemble, Wish, as_is, cycling, picture, rates
+    from selfcal.batch.spread import record_seeds
+    from selfcal.model.file import Model
+    from selfcal.model.regressors import coefficient_unit, offered
+
     check_writable(json, plot, inputs=(model,))
     if plot is not None:
         check_picture(plot)
@@ -131,7 +56,7 @@ def plan(
     group = loaded.group_of(name)
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
-    columns = {one.name: one for one in offered(loaded, name) if _as_is(one)}
+    columns = {one.name: one for one in offered(loaded, name) if as_is(one)}
     sizes = {one.name: (coefficient_unit(group.unit, one.unit), one.sd[group.name]) for one in columns.values()}
     wishes = [Wish.of(text, group.unit, sizes) for text in want]
     there = {parameter for law in loaded.laws.values() for parameter in law.parameters} | {"", "bias", *columns}
@@ -140,7 +65,7 @@ def plan(
             raise UserError(f"--want '{wish.text}': no law of {loaded.path} has {wish.parameter}")
     seeds = record_seeds(records, seed)
     plain = replace(loaded, regressors=())
-    ensemble = _Ensemble(plain, name, wishes, seeds, scheduler)
+    ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
     lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
     truth = ensemble.typical
     entries = []
@@ -159,7 +84,7 @@ def plan(
         if wish.parameter in columns:
             entry["duration_s"] = samples / loaded.bank_rate_hz
             entry["channel"], entry["unit"] = columns[wish.parameter].column, columns[wish.parameter].unit
-            entry["cycling"] = _cycling(loaded, name, wish, columns[wish.parameter], samples, seeds, scheduler)
+            entry["cycling"] = cycling(loaded, name, wish, columns[wish.parameter], samples, seeds, scheduler)
     all_known = all(one["duration_s"] is not None for one in entries)
     document: dict[str, Any] = {
         "schema": SCHEMA,
@@ -170,276 +95,18 @@ def plan(
         "rate_hz": loaded.bank_rate_hz,
         "duration_s": samples / loaded.bank_rate_hz if all_known else None,
         "wishes": entries,
-        "rates": _rates(loaded, wishes, lengths, truth),
+        "rates": rates(loaded, wishes, lengths, truth),
     }
     if json is not None:
         write_json(document, json)
     if plot is not None:
-        _picture(document, plot)
+        picture(document, plot)
     return document
 
 
-def _as_is(one: Regressor) -> bool:
-    """Whether its column is its channel's value."""
-    return one.kind == "column" and one.form == "static" and one.input == "value" and math.isnan(one.window_s)
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+    """Print how long for each wish."""
+    from selfcal.batch.plan import show as table
 
-
-class _Ensemble:
-    """The records at each length that was asked for: metrics [records, wishes], NaN where a wish is not of the law."""
-
-    def __init__(
-        self, model: Model, axis: str, wishes: Sequence[Wish], seeds: Sequence[int], scheduler: str | None
-    ) -> None:
-        self.model, self.axis, self.wishes, self.seeds, self.scheduler = model, axis, wishes, seeds, scheduler
-        self.at: dict[int, Floats] = {}
-        self.typical: dict[str, tuple[Law, dict[str, float]]] = {}
-
-    def metrics(self, samples: int) -> Floats:
-        """Of records of so many bank samples."""
-        if samples not in self.at:
-            rows = spread(
-                partial(rows_of, self.model, self.axis, tuple(self.wishes), samples),
-                self.seeds,
-                settings={},
-                scheduler=self.scheduler,
-            )
-            self.at[samples] = np.array([row["metrics"] for row in rows], np.float64)
-            by_law: dict[str, list[dict[str, float]]] = {}
-            for row in rows:
-                by_law.setdefault(row["law"], []).append(row["truth"])
-            self.typical = {
-                law: (
-                    self.model.laws[law],
-                    {key: float(np.exp(np.mean(np.log([one[key] for one in truths])))) for key in truths[0]},
-                )
-                for law, truths in by_law.items()
-            }
-        return self.at[samples]
-
-    def reached(self, k: int, samples: int) -> float:
-        """ln of the metric that SHARE of the records keep, over the wish's: 0 or less is reached."""
-        metric = self.metrics(samples)[:, k]
-        metric = metric[~np.isnan(metric)]
-        if metric.size < LEAST_SHARE * len(self.seeds):
-            raise UserError(
-                f"--want '{self.wishes[k].text}': hardly a part of {self.model.path} has a law with "
-                f"{self.wishes[k].parameter}: state `hypothesis` under simulate.axes.{self.axis}"
-            )
-        return math.log(max(float(np.quantile(metric, SHARE)), TINY) / self.wishes[k].most)
-
-    def length(self, k: int) -> int | None:
-        """Bank samples at which the wish is reached; None beyond MOST."""
-        low, high = 0, LEAST
-        while self.reached(k, high) > 0.0:
-            low, high = high, 2 * high
-            if high > MOST:
-                return None
-        if not low:
-            return high
-        for _ in range(HALVINGS):
-            middle = int(math.sqrt(low * high))
-            low, high = (middle, high) if self.reached(k, middle) > 0.0 else (low, middle)
-        above, below = self.reached(k, low), self.reached(k, high)
-        share = above / (above - below) if above > below else 1.0
-        return math.ceil(low * math.exp(share * math.log(high / low)))
-
-    def curve(self, k: int) -> list[dict[str, float]]:
-        """By length: what a tenth, half and nine tenths of the records keep."""
-        found = []
-        for samples, metrics in sorted(self.at.items()):
-            metric = metrics[~np.isnan(metrics[:, k]), k]
-            q10, q50, q90 = np.quantile(metric, (0.1, 0.5, 0.9)).tolist()
-            found.append({"duration_s": samples / self.model.bank_rate_hz, "q10": q10, "q50": q50, "q90": q90})
-        return found
-
-
-def _cycling(
-    model: Model, axis: str, wish: Wish, regressor: Regressor, samples: int, seeds: Sequence[int], scheduler: str | None
-) -> list[dict[str, float]]:
-    """The swing of the regressor's channel, from its lowest to its highest value, that SHARE of the records need."""
-    bare, found = replace(model, regressors=()), []
-    parts = [part_of(bare, axis, seed) for seed in seeds]
-    needed = (HALF_90 / wish.most) ** 2 - regressor.sd[model.group_of(axis).name] ** -2
-    for cycles in CYCLES:
-        omega = np.array([2.0 * math.pi * cycles / samples])
-        power = [
-            float(terms_of(bare.laws[law], truth, 1.0 / model.bank_rate_hz).spectrum(omega)[0]) for law, truth in parts
-        ]
-        swing = math.sqrt(8.0 * float(np.quantile(power, SHARE)) * max(needed, 0.0) / samples)
-        if swing > 0.0:
-            rows = spread(
-                partial(coefficient_rows, replace(model, regressors=(regressor,)), axis, samples, cycles, swing),
-                seeds,
-                settings={},
-                scheduler=scheduler,
-            )
-            # The information of a swing is as its square: each record's own swing by the one that it had.
-            own = [(HALF_90 / row["half"]) ** 2 - regressor.sd[model.group_of(axis).name] ** -2 for row in rows]
-            swing *= math.sqrt(needed / float(np.quantile(own, 1.0 - SHARE)))
-        found.append({"cycles": cycles, "period_s": samples / model.bank_rate_hz / cycles, "swing": swing})
-    return found
-
-
-def coefficient_rows(model: Model, axis: str, samples: int, cycles: float, swing: float, seed: int) -> list[Row]:
-    """Half the 90 % interval of the coefficient of the model's only regressor, whose channel follows a cosine."""
-    from selfcal.bank.library import Bank
-
-    (regressor,), group = model.regressors, model.group_of(axis)
-    law, truth = part_of(replace(model, regressors=()), axis, seed)
-    y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)
-    off = 0.5 * swing * np.cos(2.0 * math.pi * cycles * (np.arange(samples) + 0.5) / samples)
-    bank = Bank(make_tables(model, model.bank_rate_hz, (axis,)))
-    column = (regressor.reference + off).astype(np.float32)[:, None]
-    bank.push((y + regressor.sd[group.name] * off)[:, None], None, column)
-    return [{"half": HALF_90 * bank.report(0, 1).coefficients[law][0][1]}]
-
-
-def part_of(model: Model, axis: str, seed: int) -> tuple[str, dict[str, float]]:
-    """Law and truth of a part as the model's `simulate` entry states it, within what the grid of nodes has."""
-    tables = make_tables(model, model.bank_rate_hz, (axis,))
-    for again in range(1000):
-        truth = dict(truth_of(model, seed + 7_000_003 * again)[axis])
-        law, _ = truth.pop("hypothesis"), truth.pop("unit")
-        if law not in model.laws:
-            raise UserError(f"{model.path}: simulate.axes.{axis}: '{law}' is none of the model's hypotheses")
-        if has_nodes(model.laws[law], truth, tables):
-            return law, truth
-    raise UserError(f"{model.path}: the grid has no node for the parts that it draws: more nodes, closer priors")
-
-
-def rows_of(model: Model, axis: str, wishes: Sequence[Wish], samples: int, seed: int) -> list[Row]:
-    """One record of the part: its law, truth, and the metric of each wish."""
-    from selfcal.bank.library import Bank
-
-    law, truth = part_of(model, axis, seed)
-    y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)
-    bank = Bank(make_tables(model, model.bank_rate_hz, (axis,)))
-    bank.push(y[:, None])
-    result = bank.report(0)
-    metrics = []
-    for wish in wishes:
-        if not wish.parameter:
-            metrics.append(1.0 - result.probability[law])
-        elif wish.parameter == "bias":
-            metrics.append(HALF_90 * result.bias_sd)
-        elif wish.parameter in result.parameters[law]:
-            e = result.parameters[law][wish.parameter]
-            half = 0.5 * (e.q95 - e.q05)
-            metrics.append(half if wish.unit else half / e.median)
-        else:
-            metrics.append(math.nan)
-    kept = {key: value for key, value in truth.items() if key in model.laws[law].parameters}
-    return [{"law": law, "truth": kept, "metrics": metrics}]
-
-
-def _rates(
-    model: Model,
-    wishes: Sequence[Wish],
-    lengths: Sequence[int | None],
-    typical: Mapping[str, tuple[Law, Mapping[str, float]]],
-) -> list[dict[str, Any]]:
-    """The lengths at other rates of the bank, by the Fisher information of a typical part: only of wishes about a
-    parameter."""
-    found = []
-    own = model.bank_rate_hz
-    for factor in (0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0):
-        rate = own * factor
-        if rate > model.sensor_rate_hz:
-            break
-        for wish, samples in zip(wishes, lengths, strict=True):
-            law = next((one for one in typical.values() if wish.parameter in one[0].parameters), None)
-            if samples is None or law is None:
-                continue
-            duration_s = samples / own
-            target = _half_interval(*law, wish.parameter, own, duration_s)
-            if target is None:
-                continue
-            low, high = math.log(1e-3), math.log(1e3)
-            for _ in range(40):
-                at = 0.5 * (low + high)
-                half = _half_interval(*law, wish.parameter, rate, duration_s * math.exp(at))
-                low, high = (low, at) if half is not None and half <= target else (at, high)
-            found.append({"wish": wish.text, "rate_hz": rate, "duration_s": duration_s * math.exp(high)})
-    return found
-
-
-def _half_interval(
-    law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float
-) -> float | None:
-    """Half of the 90 % interval of ln of a parameter, by the Fisher information; None where the record has none."""
-    n = duration_s * rate_hz
-    if n < _FEWEST:
-        return None
-    try:
-        covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))
-    except np.linalg.LinAlgError:
-        return None
-    variance = float(covariance[law.parameters.index(parameter), law.parameters.index(parameter)])
-    return HALF_90 * math.sqrt(variance) if variance > 0.0 else None
-
-
-def _picture(document: Mapping[str, Any], path: Path | str) -> None:
-    """What is reached over the length: median and middle four fifths of the records, and the wish."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot
-
-    wishes = [wish for wish in document["wishes"] if wish["curve"]]
-    figure, panels = pyplot.subplots(len(wishes), 1, figsize=(7.0, 2.9 * len(wishes)), squeeze=False, sharex=True)
-    for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
-        hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
-        q10, q50, q90 = (np.maximum([one[key] for one in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
-        panel.fill_between(hours, q10, q90, color=color, alpha=0.25, linewidth=0.0, label="four records of five")
-        panel.plot(hours, q50, color=color, label="median")
-        panel.axhline(wish["most"], color="black", linewidth=1.0, linestyle="--", label="wanted")
-        if wish["duration_s"] is not None:
-            panel.axvline(wish["duration_s"] / 3600.0, color="black", linewidth=1.0, linestyle=":", label="planned")
-        panel.set_xscale("log")
-        panel.set_yscale("log")
-        law = wish["wish"].startswith("law")
-        panel.set_ylabel("1 - P of the true law" if law else "half the 90 % interval")
-        panel.set_title(wish["wish"], loc="left", fontweight="bold")
-        panel.grid(True, which="major", alpha=0.3)
-        panel.legend(fontsize="x-small")
-    panels[-1, 0].set_xlabel("length of the recording, h")
-    figure.tight_layout()
-    save_picture(figure, path, dpi=110)
-
-
-def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """How long for each wish, in all, and what another rate would change."""
-    console = Console(stderr=to_stderr)
-    for line in _lines(document):
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
-
-
-def _swings(wish: Mapping[str, Any]) -> str:
-    """By how much to change the channel: once, or to and fro."""
-    once, _, often = wish["cycling"]
-    if once["swing"] == 0.0:
-        return f"the prior has it: {wish['channel']} may stay as it is"
-    said = f"in {duration_words(wish['duration_s'])} sweep {wish['channel']} once by {once['swing']:.2g} {wish['unit']}"
-    every = duration_words(often["period_s"])
-    return f"{said}, or cycle it {often['cycles']:g} times by {often['swing']:.2g} {wish['unit']}, {every} each"
-
-
-def _lines(document: Mapping[str, Any]) -> list[str]:
-    lines = [f"{document['axis']}: {document['records']} simulated parts, means at {document['rate_hz']:g} Hz"]
-    for wish in document["wishes"]:
-        there = wish["duration_s"]
-        said = "no length that can be simulated suffices" if there is None else f"record {duration_words(there)}"
-        lines.append(f"{wish['wish']}: {_swings(wish) if 'cycling' in wish else said}")
-        for one in document["rates"]:
-            times = math.nan if there is None or one["wish"] != wish["wish"] else one["duration_s"] / there
-            factor = one["rate_hz"] / document["rate_hz"]
-            if abs(factor / FASTER - 1.0) < 1e-6 and times < WORTH:
-                lines.append(f"  by means at {one['rate_hz']:g} Hz: {duration_words(one['duration_s'])}")
-            if abs(factor * FASTER - 1.0) < 1e-6 and times < 1.0 / WORTH:
-                lines.append(f"  means at {one['rate_hz']:g} Hz suffice: {duration_words(one['duration_s'])}")
-    if document["duration_s"] is not None:
-        lines.append(
-            f"in all: record {duration_words(document['duration_s'])} at {document['rate_hz']:g} Hz or faster: "
-            f"{100.0 * document['share']:g} % of such parts have it then"
-        )
-    return lines
+    table(document, to_stderr=to_stderr(given))
+    return 0

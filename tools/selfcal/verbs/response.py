@@ -1,74 +1,33 @@
-"""`selfcal response`: how an axis answers to a channel, and whether the record shows which of the two acts."""
+"""How an axis answers to a channel: gain, lag, order, frequency response, and which of the two acts."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Annotated, Any, Unpack
 
-import numpy as np
-from rich import box
-from rich.console import Console
-from rich.table import Table
-
-from selfcal.adequacy.document import check_writable, recording_entry, write_json
-from selfcal.base import units
-from selfcal.base.errors import UserError, printable
-from selfcal.diagnosis import transfer
-from selfcal.diagnosis.estimators import beside
-from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
-from selfcal.diagnosis.record import Record, of_recording, why_left_out
-from selfcal.diagnosis.transfer import PROBABILITY, Empirical, Input, Posterior, Tried
-from selfcal.likelihood.state import ALIKE, NET_LEAST, State
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.errors import UserError
+from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged, list_of, load
-from selfcal.model.file import Model
-from selfcal.model.forms import POWER
-from selfcal.model.regressors import coefficient_unit
-from selfcal.readings.held import updates
-from selfcal.show.plot import check_picture, save_picture
-from selfcal.verbs.diagnose import BELOW_LATTICE
-from selfcal.verbs.identify import stretch_of
-
-SCHEMA = "selfcal.response/1"
-#: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
-#: time constants are in memory together.
-SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
-#: Other methods take means over so many seconds at least of a channel with a noise of its own, and so many steps.
-NOISY_STEP_S, STEPS_LEAST = 10.0, 150
-#: Frequencies of the response that is written, and draws that its band is of.
-FREQUENCIES, BAND_DRAWS = 60, 1000
-LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
-#: How the readings of a held input were taken.
-LINES = "straight lines between readings"
-NO_INFLUENCE = "this record shows no influence of the input"
-#: Words for the keys of an estimate.
-WORDS = {
-    "gain": "static gain",
-    "rate": "rate coefficient",
-    "direct": "gain of fast changes",
-    "lag_s": "time constant",
-    "delay_s": "delay of slow changes",
-    "square": "square coefficient",
-    "cube": "cube coefficient",
-}
+from selfcal.verbs._shared import End, Gate, Json, Logs, ModelFile, Start, to_stderr
 
 
 def response(
-    log: Path | str | Sequence[Path | str],
+    log: Logs,
     *,
-    input: str,
-    output: str,
-    model: Path | str | None = None,
-    decimate: float | None = None,
-    json: Path | str | None = None,
-    plot: Path | str | None = None,
-    start_s: float | None = None,
-    end_s: float | None = None,
-    gate: bool = False,
+    input: Annotated[str, option("What acts: temp, supply or an axis", "--input", metavar="CH", show_default=False)],
+    output: Annotated[str, option("The axis that answers", metavar="AXIS", show_default=False)],
+    model: ModelFile = None,
+    decimate: Annotated[
+        float | None, option("Rate of the block means; default: every sample, up to 20 000", metavar="HZ")
+    ] = None,
+    json: Json = None,
+    plot: Annotated[
+        Path | str | None, option("Save gain, phase and coherence (.png .pdf .svg)", metavar="FILE")
+    ] = None,
+    start_s: Start = None,
+    end_s: End = None,
+    gate: Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """The answer of the axis `output` to the column `input`: temperature, supply or another axis.
@@ -77,15 +36,32 @@ def response(
     block means, Hz; default: every sample of 20 000, means of a longer record. `start_s`, `end_s`, `gate`, `reading`:
     as `identify` has them. Raises UserError for what the user can put right.
     """
+    from selfcal.adequacy.document import recording_entry
+    from selfcal.adequacy.identify import stretch_of
+    from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.diagnosis.diagnose import BELOW_LATTICE
+    from selfcal.diagnosis.record import of_recording, why_left_out
+    from selfcal.diagnosis.response import (
+        LINES,
+        REFUSED_FROM,
+        SAMPLES_MOST,
+        SCHEMA,
+        answer_of,
+        inputs_of,
+        plot_response,
+    )
+    from selfcal.logs.recording import list_of, load
+    from selfcal.model.file import Model
+
     check_writable(json, plot, inputs=(*list_of(log), model))
     if plot is not None:
         check_picture(plot)
     loaded = Model.load(model)
     recording = stretch_of(load(log, **reading), loaded, start_s, end_s, gate)
-    for option, name in (("--input", input), ("--output", output)):
+    for asked, name in (("--input", input), ("--output", output)):
         if name not in recording.columns:
             there = ", ".join(recording.columns)
-            raise UserError(f"{recording.path}: {option}: there is no column '{name}' (there are {there})")
+            raise UserError(f"{recording.path}: {asked}: there is no column '{name}' (there are {there})")
     if input == output:
         raise UserError(f"--input and --output are both {input}: give two columns")
     loaded.group_of(output)
@@ -101,11 +77,11 @@ def response(
         raise UserError(f"{recording.path}: more than {REFUSED_FROM:,} samples at this rate: take a lower --decimate")
     if record.axes[output].below_lattice:
         raise UserError(f"{recording.path}: {output}: {BELOW_LATTICE}")
-    inputs = _inputs(recording, record, input)
+    inputs = inputs_of(recording, record, input)
     state = record.axes[output]
     # The model file may state the input's influence: it is the question here.
     state = state.refit(regressors=tuple(one for one in state.regressors if one.entry.get("column") != input))
-    answer, given = _answer(state, inputs)
+    answer, given = answer_of(state, inputs)
     document = {
         "schema": SCHEMA,
         "recording": recording_entry(recording),
@@ -127,275 +103,11 @@ def response(
     return document
 
 
-def _inputs(recording: Recording, record: Record, name: str) -> list[Input]:
-    """The input about its median, as it may act. The reading of another axis acts itself. What a channel reads acts:
-    behind its noise, and between the readings of a held one. The held readings may act themselves as well: a part that
-    compensates by its own temperature."""
-    if name in record.axes:
-        return [_about(Input(bridged(record.axes[name].y) + record.axes[name].level, record.axes[name].unit))]
-    if name not in record.channel_names.values():
-        known = name in dict(SIDE_CHANNELS.values())
-        reason = "does not change" if known else "is neither temp, nor supply, nor an axis of the model"
-        raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
-    unit = recording.columns[name].unit
-    values = units.convert(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
-    clock = recording.clock
-    rows = updates(recording.columns[name].values, clock.place)
-    read_at = clock.time_s if rows is None else clock.time_s[rows]
-    held_s = float(read_at[-1] - read_at[0]) / max(1, read_at.size - 1)
-    random = np.random.default_rng(1)
-    if rows is None or held_s < 2.0 / record.rate_hz:
-        noises = _noise_of(values) * random.standard_normal((NOISES, values.size))
-        return [_about(Input(values, unit, noises=noises, widths_s=(0.0, *SMOOTHING_S)))]
-    # The middle of each cell of the grid.
-    time = record.time_s + 0.5 * (1.0 / record.rate_hz - 1.0 / record.recorded_hz)
-    time += float(recording.clock_of(next(iter(record.axes))).time_s[0])
-    read = recording.columns[name].values[rows]
-    drawn = _noise_of(read) * random.standard_normal((NOISES, read.size))
-    noises = np.array([np.interp(time, read_at, one) for one in drawn])
-    lines = Input(np.interp(time, read_at, read), unit, 0.0, noises, (0.0, *SMOOTHING_S), held_s, LINES)
-    return [_about(lines), _about(Input(values, unit, held_s=held_s, taken="held readings"))]
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+    """Print the answer in a few lines. A signal that came ends the command here."""
+    from selfcal.base.ending import Held
+    from selfcal.diagnosis.response import show as table
 
-
-def _about(given: Input) -> Input:
-    """The input about its median."""
-    reference = float(np.median(given.values))
-    return replace(given, values=given.values - reference, reference=reference)
-
-
-def _noise_of(values: Array) -> float:
-    """Deviation of a white noise by differences. The order that sees least of what changes slowly."""
-    orders = range(2, 6)
-    return math.sqrt(min(float(np.var(np.diff(values, k))) / math.comb(2 * k, k) for k in orders))
-
-
-def _answer(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Input]:
-    """Everything that is found of an axis and an input, as the document has it, and the input as it acts likeliest."""
-    dt = state.dt
-    each = [[transfer.tried(state, one) for one in transfer.structures(u.values, dt, u.widths_s)] for u in inputs]
-    # Of two that explain a record alike, the first is meant.
-    best = [max(one.score for one in tried) for tried in each]
-    place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
-    found, given = each[place], inputs[place]
-    u, unit = given.values, given.unit
-    found = transfer.beside_two_terms(state, found)
-    chosen = max(found, key=lambda one: one.score)
-    net = transfer.worth(state, chosen)
-    shown = chosen.score > 0.0 and net >= NET_LEAST
-    weight = np.exp(np.array([one.score for one in found]) - max(0.0, chosen.score))
-    weight /= weight.sum()
-    poles = np.array([one.structure.poles for one in found])
-    orders = {str(order): float(weight[poles == order].sum()) for order in sorted(set(poles.tolist()))}
-    likely = sorted(orders, key=lambda order: -orders[order])
-    within = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
-    seen = transfer.empirical(u, bridged(state.y), dt)
-    entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
-    if shown:
-        drawn = transfer.posterior(state, chosen, transfer.undistorted(state, given, chosen))
-        verdict, reason = transfer.source(state, u, chosen, drawn)
-        entry |= {
-            "structure": chosen.structure.name,
-            "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, within)), "probability": orders},
-            "structures": {one.structure.name: float(share) for one, share in zip(found, weight, strict=True)},
-            "estimate": _estimate(drawn, state.unit, unit),
-            "source": {"verdict": verdict, "reason": reason},
-            "frequency_response": _band(drawn, state.y.size, dt),
-            **_methods(state, given, chosen, drawn, seen),
-        }
-    else:
-        least = state.least(u)
-        entry |= {
-            "source": {"verdict": "none", "reason": NO_INFLUENCE},
-            "would_have_been_found": {"gain": least, "unit": coefficient_unit(state.unit, unit)},
-        }
-    return entry | {"empirical": _empirical(seen)}, given
-
-
-def _estimate(drawn: Posterior, output: str, unit: str) -> dict[str, Any]:
-    """Posterior of each number of the structure."""
-    values = dict(zip(drawn.structure.keys[: drawn.structure.own], drawn.c.T, strict=True))
-    if drawn.structure.poles:
-        values["lag_s"] = drawn.lag
-    if drawn.structure.name in ("static and rate", "lag and direct", "second order"):
-        values["delay_s"] = drawn.delay_s
-    named = {"rate": coefficient_unit(output, f"{unit}/s"), "lag_s": "s", "delay_s": "s"}
-    named |= {key: coefficient_unit(output, units.power(unit, exponent)) for key, exponent in POWER.items()}
-    return {
-        key: {
-            "mean": float(draws.mean()),
-            "sd": float(draws.std()),
-            **dict(zip(("q05", "median", "q95"), np.quantile(draws, (LOW, 0.5, HIGH)).tolist(), strict=True)),
-            "unit": named.get(key, coefficient_unit(output, unit)),
-        }
-        for key, draws in values.items()
-    }
-
-
-def _methods(state: State, given: Input, chosen: Tried, drawn: Posterior, seen: Empirical) -> dict[str, Any]:
-    """Estimates of other methods beside an answer that is linear and has a static gain, and the step of their means."""
-    keys = set(chosen.structure.keys)
-    if "gain" not in keys or keys & set(POWER):
-        return {}
-    finest = max(state.dt, NOISY_STEP_S if given.noises.size else 0.0, abs(float(np.median(drawn.delay_s))) / 3.0)
-    steps = max(1, min(round(finest / state.dt), state.y.size // STEPS_LEAST))
-    own, columns = chosen.structure.own, chosen.structure.columns(chosen.number)
-    parts = chosen.fit.c[-len(columns) :, None] * columns
-    found = beside(state, chosen.fit, given.values, parts[:own].sum(axis=0), parts[own:].sum(axis=0), steps)
-    step_s = steps * state.dt
-    clear = seen.coherence > seen.chance
-    off = np.abs(seen.ratio - drawn.at(seen.frequency_hz).mean(axis=0))[clear]
-    return {
-        "methods_step_s": step_s,
-        "spectra": {"bands": off.size, "hold_answer": int(np.count_nonzero(off <= seen.within[clear]))},
-        "methods": {
-            name: {
-                "order": one.estimate.order,
-                "evidence_nats": {str(order): nats for order, nats in one.estimate.evidence.items()},
-                "gain": one.estimate.gain,
-                "delay_s": one.estimate.delay * step_s,
-                "if_answer_holds": {
-                    "gain": [float(one.least[0]), float(one.most[0])],
-                    "delay_s": [float(one.least[1] * step_s), float(one.most[1] * step_s)],
-                },
-                "agrees": one.agrees,
-            }
-            for name, one in found.items()
-        },
-    }
-
-
-def _band(drawn: Posterior, n: int, dt: float) -> dict[str, list[float]]:
-    """Gain and phase over frequency with their 90 % bands, point by point."""
-    frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, FREQUENCIES)
-    few = Posterior(drawn.structure, drawn.c[:BAND_DRAWS], drawn.lag[:BAND_DRAWS])
-    G = few.at(frequency)
-    gain = np.quantile(np.abs(G), (LOW, 0.5, HIGH), axis=0)
-    middle = G.mean(axis=0)
-    turn = np.quantile(np.angle(G / middle), (LOW, 0.5, HIGH), axis=0)
-    phase = np.degrees(np.unwrap(np.angle(middle)) + turn)
-    named = {"gain_q05": gain[0], "gain": gain[1], "gain_q95": gain[2]}
-    named |= {"phase_deg_q05": phase[0], "phase_deg": phase[1], "phase_deg_q95": phase[2]}
-    return {"frequency_hz": frequency.tolist(), **{key: values.tolist() for key, values in named.items()}}
-
-
-def _empirical(found: Empirical) -> dict[str, list[float]]:
-    """The ratio of spectra. Its phase is known nowhere that the band holds 0."""
-    size = np.abs(found.ratio)
-    turn = np.degrees(np.where(found.within < size, np.arcsin(np.minimum(found.within / size, 1.0)), math.pi))
-    phase = np.degrees(np.angle(found.ratio))
-    named = {
-        "frequency_hz": found.frequency_hz,
-        "gain": size,
-        "gain_q05": np.maximum(size - found.within, 0.0),
-        "gain_q95": size + found.within,
-        "phase_deg": phase,
-        "phase_deg_q05": phase - turn,
-        "phase_deg_q95": phase + turn,
-        "coherence": found.coherence,
-        "coherence_by_chance": found.chance,
-    }
-    return {key: values.tolist() for key, values in named.items()}
-
-
-def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """The answer in a few lines, and the table of its numbers."""
-    console = Console(stderr=to_stderr)
-
-    def line(text: str) -> None:
-        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
-
-    source, axis = document["source"], document["output"]["axis"]
-    given = document["input"]
-    line(f"{given['column']} -> {axis}, means of {1.0 / document['judged_at_hz']:g} s")
-    if "held_s" in given:
-        line(f"{given['column']} is read every {given['held_s']:.4g} s: taken as {given['taken']}")
-    if not document["influence"]:
-        least = document["would_have_been_found"]
-        line(str(source["reason"]))
-        if math.isfinite(least["gain"]):
-            line(f"a static gain of {least['gain']:.2g} {least['unit']} would have been found")
-        return
-    order = document["order"]
-    others = ", ".join(map(str, order["within_90"]))
-    line(f"influence: {document['structure']}, order {order['chosen']} (90 %: {others})")
-    line(f"evidence {document['evidence_gain_nats']:.1f} nats, {document['net_nats']:.1f} net of the search")
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("", "median", "5 %", "95 %", "unit"):
-        table.add_column(heading, no_wrap=True)
-    for key, one in document["estimate"].items():
-        table.add_row(WORDS[key], *(f"{one[at]:.4g}" for at in ("median", "q05", "q95")), one["unit"])
-    console.print(table)
-    if set(document["estimate"]) & set(POWER):
-        line(f"gain at {given['reference']:.4g} {given['unit']}, from which the powers count")
-    if given.get("taken") == LINES:
-        line(f"a delay of less than {document['delay_resolution_s']:.4g} s is not resolved")
-    line(f"source: {source['verdict']}: {source['reason']}")
-    if "methods" not in document:
-        return
-    line("")
-    line(f"other methods, means of {document['methods_step_s']:g} s; in brackets 90 % if the answer holds")
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("", "order", "static gain", "delay, s", "agrees"):
-        table.add_column(heading, no_wrap=True)
-    for name, one in document["methods"].items():
-        cells = []
-        for key in ("gain", "delay_s"):
-            low, high = one["if_answer_holds"][key]
-            cells.append(f"{one[key]:.3g} ({low:.3g} to {high:.3g})")
-        table.add_row(name, str(one["order"]), *cells, "yes" if one["agrees"] else "no")
-    console.print(table)
-    spectra = document["spectra"]
-    if spectra["bands"]:
-        line(f"ratio of spectra: {spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")
-    else:
-        line("ratio of spectra: no band is coherent beyond chance")
-
-
-def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
-    """Save gain, phase and coherence over frequency. Raises UserError if the file cannot be written."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, (gain, phase, coherence) = pyplot.subplots(
-        3, 1, figsize=(8.0, 8.6), sharex=True, layout="constrained", height_ratios=(3, 3, 2)
-    )
-    column, axis = document["input"], document["output"]
-    found = document["structure"] if document["influence"] else "no influence"
-    figure.suptitle(
-        f"{printable(Path(document['recording']['path']).name)}: {column['column']} -> {axis['axis']}, {found}\n"
-        f"source: {document['source']['verdict']}",
-        parse_math=False,
-    )
-    seen = {key: np.array(values) for key, values in document["empirical"].items()}
-    clear = seen["coherence"] > seen["coherence_by_chance"]
-    for panel, key in ((gain, "gain"), (phase, "phase_deg")):
-        for which, color, label in ((clear, "black", "ratio of spectra, 90 %"), (~clear, "0.75", "... by chance")):
-            error = [seen[key] - seen[f"{key}_q05"], seen[f"{key}_q95"] - seen[key]]
-            shown = [np.where(which, one, np.nan) for one in (seen[key], *error)]
-            panel.errorbar(
-                seen["frequency_hz"], shown[0], shown[1:], color=color, marker="o", markersize=3.5, linestyle="",
-                elinewidth=1, label=label,
-            )  # fmt: skip
-        if document["influence"]:
-            band = document["frequency_response"]
-            at = band["frequency_hz"]
-            panel.fill_between(at, band[f"{key}_q05"], band[f"{key}_q95"], color="tab:blue", alpha=0.3, linewidth=0)
-            panel.plot(at, band[key], color="tab:blue", label=f"{document['structure']}, 90 %")
-        panel.grid(True, alpha=0.3)
-    gain.set_xscale("log")
-    gain.set_yscale("log")
-    if clear.any():
-        gain.set_ylim(bottom=0.2 * float(seen["gain"][clear].min()))
-    gain.set_ylabel(f"gain, {units.typeset(coefficient_unit(axis['unit'], column['unit']))}")
-    gain.legend(fontsize="small", frameon=False)
-    phase.set_ylabel("phase, degrees")
-    coherence.plot(seen["frequency_hz"], seen["coherence"], color="black", marker="o", markersize=3.5)
-    coherence.plot(seen["frequency_hz"], seen["coherence_by_chance"], color="0.6", linestyle="--", label="by chance")
-    coherence.set_ylim(0.0, 1.02)
-    coherence.set_ylabel("coherence")
-    coherence.set_xlabel("frequency, Hz")
-    coherence.legend(fontsize="small", frameon=False)
-    coherence.grid(True, alpha=0.3)
-    save_picture(figure, path, dpi=110)
+    table(document, to_stderr=to_stderr(given))
+    Held().check()
+    return 0

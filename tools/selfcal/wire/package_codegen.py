@@ -11,7 +11,9 @@ import shutil
 from pathlib import Path
 
 from selfcal.base.errors import UserError
-from selfcal.verbs.codegen import codegen
+from selfcal.model.file import Model
+from selfcal.model.tables import make_tables
+from selfcal.wire.c_tables import write_tables
 from selfcal.wire.frames import ROOT
 
 #: Core that the default tables are for: a package goes into firmware.
@@ -34,7 +36,8 @@ def version(library: Path) -> str:
 
 def write(library: Path) -> None:
     """Write all into `library`, a folder like lib/. Raises UserError for a manifest without a version."""
-    codegen(None, library / "default", target=TARGET)
+    model = Model.load(None)
+    write_tables(model, make_tables(model, model.sensor_rate_hz, None, TARGET), library / "default", TARGET)
     for name, place in VERSIONS.items():
         text, count = place.subn(version(library), (library / name).read_text("utf-8"))
         if count != 1:

@@ -17,8 +17,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
-from selfcal.adequacy.document import finite
 from selfcal.base.errors import UserError, install
+from selfcal.base.output import finite
 from selfcal.base.units import parameter_unit
 from selfcal.wire.dbc_file import PLACE_NAMES, Names
 from selfcal.wire.frames import AXES, AxisReport, axis_unit

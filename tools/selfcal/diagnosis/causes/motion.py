@@ -1,5 +1,5 @@
-"""The sensor was moved or shaken. `selfcal.readings.motion` finds the stretches of one axis in the raw readings, before any fit;
-`integrity.motion` the quieter ones afterwards, by energy that several axes share."""
+"""The sensor was moved or shaken. `readings.motion` finds the stretches of one axis in the raw readings, before any
+fit; `integrity.motion` the quieter ones afterwards, by energy that several axes share."""
 
 from __future__ import annotations
 

@@ -10,13 +10,12 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, TypedDict
+from typing import Annotated, TypedDict
 
 from selfcal.base.errors import UserError, install
-
-if TYPE_CHECKING:
-    from selfcal.logs.recording import Scale
+from selfcal.base.options import option
 
 #: Text, each with .gz too.
 TEXT = (".csv", ".tsv", ".txt", ".log", ".dat", ".lvm")
@@ -66,17 +65,69 @@ READ = (
 WRITTEN = ".csv, .csv.gz or .npz"
 
 
+#: Size of one LSB, with its unit unless the column's usual one is meant.
+Scale = tuple[float, str | None]
+
+
+def parse_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
+    """`NAME=VALUE` texts of a repeated command line option as a dict. Raises UserError naming the option."""
+    found: dict[str, str] = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not (name and equals and value):
+            raise UserError(f"{option} takes NAME=VALUE, not '{pair}'")
+        if name in found:
+            raise UserError(f"{option}: '{name}' is given twice")
+        found[name] = value
+    return found
+
+
+def _scales(texts: Sequence[str]) -> dict[str, Scale]:
+    from selfcal.logs.recording import parse_scales
+
+    return parse_scales(texts)
+
+
 class Reading(TypedDict, total=False):
     """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
 
-    rate: float | None
-    columns: Mapping[str, str] | None
-    units: Mapping[str, str] | None
-    scale: Mapping[str, Scale] | float | None
-    no_time: bool
-    skip_bad: bool
-    sources: Sequence[str]
-    dbc: Path | str | None
+    rate: Annotated[float | None, option("Sampling rate, for recordings without a t column", metavar="HZ")]
+    columns: Annotated[
+        Mapping[str, str] | None,
+        option(
+            "Column of a foreign header (repeat for more)",
+            "--column",
+            metavar="gx=NAME",
+            kind=list[str],
+            made=partial(parse_pairs, "--column"),
+        ),
+    ]
+    units: Annotated[
+        Mapping[str, str] | None,
+        option(
+            "Unit of a column whose header states none (repeat for more)",
+            "--unit",
+            metavar="gx=rad/s",
+            kind=list[str],
+            made=partial(parse_pairs, "--unit"),
+        ),
+    ]
+    scale: Annotated[
+        Mapping[str, Scale] | float | None,
+        option(
+            "Size of one LSB of LSB columns (repeat for more)",
+            metavar="[gx=]SIZE[unit]",
+            kind=list[str],
+            made=_scales,
+        ),
+    ]
+    no_time: Annotated[bool, option("Leave the time column out; takes --rate", "--no-time")]
+    skip_bad: Annotated[bool, option("Skip lines of a text that are no rows, and count them", "--skip-bad")]
+    sources: Annotated[
+        Sequence[str],
+        option("Sensor to read of a log that has several (repeat for more)", "--source", metavar="NAME"),
+    ]
+    dbc: Annotated[Path | str | None, option("Signals of a log of CAN frames", metavar="FILE.dbc")]
 
 
 #: Bytes from a file's begin that tell its format.

@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.batch.spread import Row
 from selfcal.model.file import Group, Model, Prior
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods import Rival
 from selfcal.studies.methods.problem import Answer, Floats, Problem
-from selfcal.studies.montecarlo import draw, simulate_bank_samples
 
 #: The method that errors are compared with.
 REFERENCE = "ml"

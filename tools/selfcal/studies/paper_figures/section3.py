@@ -12,16 +12,16 @@ from numpy.typing import NDArray
 from scipy import signal
 
 from selfcal.adequacy.allan import terms_of
+from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.result import AxisResult
 from selfcal.batch.spread import Row, spread
-from selfcal.model.file import DEFAULT, Model
+from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import make_tables
 from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import curve, fit
 from selfcal.studies.methods.problem import Problem
 from selfcal.studies.methods.whittle import whittle
-from selfcal.studies.montecarlo import draw, settings_of, simulate_bank_samples
 from selfcal.studies.paper_figures.told import Told
 
 Floats = NDArray[np.float64]

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.result import HALF_90, AxisResult
 from selfcal.logs.recording import as_float, load
 from selfcal.model.file import Model, Prior
@@ -18,7 +19,6 @@ from selfcal.model.tables import Tables, make_tables
 from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import fit
 from selfcal.studies.methods.problem import Problem, Value
-from selfcal.studies.montecarlo import simulate_bank_samples
 from selfcal.studies.paper_figures.section3 import PAPER, over_time
 from selfcal.studies.paper_figures.told import Told
 

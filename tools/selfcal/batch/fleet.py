@@ -1,0 +1,108 @@
+"""`selfcal fleet`: many recordings at once, and the table of the units."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+
+from selfcal.base.errors import printable
+from selfcal.batch.fail_on import outcome
+from selfcal.batch.table import Unit
+from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
+
+SCHEMA = "selfcal.fleet/1"
+#: Names that are printed of a kind at most.
+MOST_NAMES = 40
+
+
+def version_of_package() -> str:
+    """The version that a table states."""
+    import selfcal
+
+    return str(selfcal.__version__)
+
+
+def judged_units(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
+    """The verdicts of each recording. A group's limit holds for the axes that any recording of the batch has."""
+    stated = limits.of({name for unit in batch for name in unit.axes})
+    return [
+        (
+            unit.device,
+            unit.source.path,
+            judge(stated, unit.axes, unit.record["recording"]["duration_s"])
+            if unit.error is None
+            else unjudged(stated, unit.error),
+        )
+        for unit in batch
+    ]
+
+
+def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[Judged]) -> dict[str, Any]:
+    """What the batch comes to, by device."""
+    failed: dict[str, list[str]] = {}
+    open_: dict[str, list[str]] = {}
+    for unit in batch:
+        for axis, reason in unit.errors.items():
+            open_.setdefault(unit.device, []).append(f"{axis}: {reason}" if axis else reason)
+        if fail_on is not None and unit.error is None:
+            shown, lines = _by_cause(unit, fail_on)
+            if shown:
+                failed.setdefault(unit.device, []).append(f"{fail_on}: {', '.join(shown)}")
+            elif lines:
+                open_.setdefault(unit.device, []).extend(lines)
+    broken = {unit.source.path for unit in batch if unit.error is not None}  # listed with their errors
+    for device, path, verdicts in judged:
+        for one in verdicts:
+            if one.verdict != PASS and path not in broken:
+                (failed if one.verdict == FAIL else open_).setdefault(device, []).append(one.words)
+    devices = dict.fromkeys(unit.device for unit in batch)
+    return {
+        "schema": SCHEMA,
+        "devices": len(devices),
+        "recordings": len(batch),
+        "failed": failed,
+        "not_judged": {device: list(dict.fromkeys(lines)) for device, lines in open_.items()},
+        "limits": [
+            {"device": device, "recording": path, **one.entry()}
+            for device, path, verdicts in judged
+            for one in verdicts
+        ],
+        "code": 1 if failed else 2 if open_ else 0,
+    }
+
+
+def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
+    """The axes that show it, and why others cannot be judged."""
+    shown, lines = [], []
+    diagnosis = unit.record.get("diagnosis", {})
+    for name, axis in unit.axes.items():
+        if "error" not in axis:
+            found = outcome({"axes": {name: diagnosis.get(name, axis)}}, fail_on)
+            shown += [name] if found.code == 1 else []
+            lines += found.lines
+    return shown, lines
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """What a person reads: how many, and by name the devices that need a look."""
+    console = Console(stderr=to_stderr)
+    for line in _lines(document):
+        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+
+
+def _lines(document: Mapping[str, Any]) -> Iterator[str]:
+    yield f"{document['recordings']} recordings of {document['devices']} devices"
+    yield from document["words"]
+    yield from _listed("unlike the batch", document["unlike"])
+    yield from _listed("drifting", document["drifting"])
+    yield from _listed("failed", document["failed"])
+    yield from _listed("not judged", document["not_judged"])
+
+
+def _listed(what: str, devices: Mapping[str, Sequence[str]]) -> Iterator[str]:
+    for device, reasons in list(devices.items())[:MOST_NAMES]:
+        yield f"{what}: {device}: {'; '.join(reasons)}"
+    if len(devices) > MOST_NAMES:
+        yield f"{what}: {len(devices) - MOST_NAMES} more: the table names them"

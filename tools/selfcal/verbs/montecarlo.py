@@ -1,0 +1,73 @@
+"""Simulate records with parameters drawn from the prior and compare stated with actual errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from selfcal.base.errors import UserError
+from selfcal.base.options import option
+from selfcal.verbs._shared import Json, ModelFile, Results, Scheduler, Workers, to_stderr
+
+
+def montecarlo(
+    model: ModelFile = None,
+    *,
+    records: Annotated[int, option("Records per law", metavar="N")] = 400,
+    duration_s: Annotated[float, option("Length of each, s", "--duration", metavar="S")] = 3600.0,
+    axis: Annotated[str, option("Axis whose priors are drawn from", metavar="NAME")] = "gx",
+    seed: Annotated[int, option("Same seed, same records", metavar="N", min=0)] = 1,
+    json: Json = None,
+    workers: Workers = None,
+    scheduler: Scheduler = None,
+    results: Results = None,
+) -> dict[str, Any]:
+    """Simulate `records` records per law, at most BLOCK samples a bank interval, identify each with the library, and
+    compare with the truth.
+
+    Parameters that no node of the grid has are drawn again: `without_nodes` is their share by law.
+
+    `workers`: processes here, one for each processor by default; `scheduler`: address of a Dask scheduler instead. The
+    numbers are the same. `results`: a folder that keeps finished records: a run that was stopped continues from them,
+    and one of more records adds to them.
+    Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
+    records the calculated and actual probability of false identification, with the sd of their difference.
+    """
+    from functools import partial
+
+    from selfcal.base.output import check_writable, write_json
+    from selfcal.batch.spread import record_seeds, spread
+    from selfcal.model.file import Model, settings_of
+    from selfcal.studies.montecarlo import MIN_SAMPLES, MOST_SAMPLES, SCHEMA, rows_of, summary
+
+    check_writable(json)
+    loaded = Model.load(model)
+    seeds = record_seeds(records, seed)
+    if not duration_s * loaded.bank_rate_hz >= MIN_SAMPLES:
+        raise UserError(f"--duration must be at least {MIN_SAMPLES / loaded.bank_rate_hz:g} s")
+    if not duration_s * loaded.bank_rate_hz <= MOST_SAMPLES:
+        raise UserError(f"--duration must be at most {MOST_SAMPLES / loaded.bank_rate_hz:g} s")
+    if loaded.regressors:
+        raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
+    loaded.group_of(axis)
+    jobs = [(law, one) for one in seeds for law in loaded.hypotheses]
+    found = spread(
+        partial(rows_of, loaded, axis, duration_s),
+        jobs,
+        settings={"schema": SCHEMA, "model": settings_of(loaded), "axis": axis, "duration_s": duration_s, "seed": seed},
+        scheduler=scheduler,
+        results=results,
+        count=workers,
+    )
+    document = summary(found, records, duration_s, axis)
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+    """Print calculated against actual errors."""
+    from selfcal.studies.montecarlo import show as table
+
+    table(document, to_stderr=to_stderr(given))
+    return 0

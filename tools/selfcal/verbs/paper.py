@@ -1,0 +1,99 @@
+"""Make the figures of Stepanov & Motorin (2017) anew, on one page beside what the paper says."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+from selfcal.base.errors import UserError, note
+from selfcal.base.options import option
+from selfcal.verbs._shared import Results, Scheduler
+
+if TYPE_CHECKING:
+    from selfcal.studies.paper_figures.told import Told
+
+
+def paper(
+    output: Annotated[Path | str, option("Page to write", "-o", "--output", metavar="FILE.html", show_default=False)],
+    *,
+    data: Annotated[
+        Path | str | None, option("Folder of the real recordings; default: beside the repository", metavar="DIR")
+    ] = None,
+    records: Annotated[int, option("Records per law in Figs 1 and 2", metavar="N")] = 500,
+    seed: Annotated[int, option("Same seed, same page", metavar="N", min=0)] = 1,
+    scheduler: Scheduler = None,
+    results: Results = None,
+    tracks: Annotated[
+        Path | str | None, option("Folder for the map errors of Section 4.2, a recording a track", metavar="DIR")
+    ] = None,
+) -> list[Told]:
+    """Write the page to `output`; returns its figures.
+
+    `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
+    so and a line says so too. `records`: of each law in Figs 1 and 2, 500 in the paper. `scheduler`, `results`: as for
+    `montecarlo`. `tracks`: a folder for the map errors of Section 4.2, a recording a track. All seeds follow from
+    `seed`.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    from selfcal.base.output import check_writable, write_text
+    from selfcal.batch.spread import record_seeds
+    from selfcal.model.file import Model
+    from selfcal.studies.paper import DATA, EXPLAINED, page, with_reason
+    from selfcal.studies.paper_figures import section3, section4, survey
+    from selfcal.studies.paper_figures.told import Told
+    from selfcal.verbs.diagnose import diagnose
+
+    check_writable(output)
+    seeds = record_seeds(records, seed)
+    folder = DATA if data is None else Path(data)
+    if data is not None and not folder.is_dir():
+        raise UserError(f"--data {folder}: there is no such folder")
+    areas = survey.surveys(seed)
+    if tracks is not None:
+        survey.write_tracks(Path(tracks), areas)
+    priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
+    rows = section3.ensemble(priors, seeds, seed, scheduler, results)
+    told = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
+    console = Console(stderr=True)
+    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("Figs 5 to 8", total=5)
+        simulated = section4.simulated(seed)
+        told += section4.figures_5_and_6(default, simulated, False, seed)
+        progress.advance(task)
+        real = section4.real(folder, default)
+        progress.advance(task)
+        if len(real) == len(section4.STRETCHES):
+            told += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED, diagnose)
+        else:
+            missing = sorted({name for name, _ in section4.STRETCHES if not (folder / name).exists()})
+            note(
+                f"REAL DATA ABSENT: {', '.join(missing)} not in {folder}: Figs 5 and 6 are of simulated records alone;"
+                " name their folder with --data DIR"
+            )
+            told.append(
+                Told(
+                    "Figs 5, 6, real",
+                    (),
+                    "P(random walk) goes to 1 on four accelerometer records.",
+                    "Not made: the real recordings are absent. The README says where they are; --data names a folder.",
+                    "skipped",
+                )
+            )
+        progress.advance(task)
+        told += section4.figures_7(default, simulated | real, seed)
+        progress.advance(task)
+        told += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
+        progress.advance(task)
+    write_text(output, page(told, records, seed))
+    return told
+
+
+def show(told: list[Told], given: Mapping[str, Any]) -> int:
+    """Print a line a figure."""
+    from selfcal.studies.paper import show as table
+
+    table(told, given["output"])
+    return 0

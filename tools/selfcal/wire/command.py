@@ -1,0 +1,150 @@
+"""`selfcal command`: an order to a module whose image takes commands (port/app/command.h)."""
+
+from __future__ import annotations
+
+import secrets
+import shlex
+import struct
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from selfcal.base.errors import UserError, called
+from selfcal.wire.dbc_file import NODE_IDS
+from selfcal.wire.frames import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of
+
+if TYPE_CHECKING:
+    import can
+
+CHALLENGE = "challenge"
+#: s to wait for a challenge, and for an answer: a module obeys between reports, and a Cortex-M0's takes 200 s.
+CHALLENGE_S, ANSWER_S = 5.0, 400.0
+#: s after a challenge or a wrong tag within which a module gives no other.
+PAUSE_S = 1.0
+#: Of every answer: whoever is on the wire can give it.
+UNVERIFIED = "unverified: an answer has a checksum, but no tag"
+#: Orders that go to no module.
+OWN_ORDERS = ("new-key", "build-flag")
+_MASK = 2**64 - 1
+
+
+def siphash(key: bytes, message: bytes) -> int:
+    """SipHash-2-4 of `message` under a key of 16 bytes (Aumasson & Bernstein, INDOCRYPT 2012, 489-508)."""
+    k0, k1 = struct.unpack("<2Q", key)
+    v = [k0 ^ 0x736F6D6570736575, k1 ^ 0x646F72616E646F6D, k0 ^ 0x6C7967656E657261, k1 ^ 0x7465646279746573]
+
+    def rotate(x: int, by: int) -> int:
+        return (x << by | x >> 64 - by) & _MASK
+
+    def half_round(a: int, b: int, c: int, d: int, s: int, t: int) -> None:
+        v[a] = (v[a] + v[b]) & _MASK
+        v[c] = (v[c] + v[d]) & _MASK
+        v[b] = rotate(v[b], s) ^ v[a]
+        v[d] = rotate(v[d], t) ^ v[c]
+        v[a] = rotate(v[a], 32)
+
+    padded = message + bytes(7 - len(message) % 8) + bytes((len(message) & 0xFF,))
+    for (word,) in struct.iter_unpack("<Q", padded):
+        v[3] ^= word
+        for _ in range(2):
+            half_round(0, 1, 2, 3, 13, 16)
+            half_round(2, 1, 0, 3, 17, 21)
+        v[0] ^= word
+    v[2] ^= 0xFF
+    for _ in range(4):
+        half_round(0, 1, 2, 3, 13, 16)
+        half_round(2, 1, 0, 3, 17, 21)
+    return int(v[0] ^ v[1] ^ v[2] ^ v[3])
+
+
+def codes(signal: str) -> dict[str, int]:
+    """Names of an answer's `command` or `result`, with their numbers in the DBC."""
+    choices: Any = load_dbc().get_message_by_name(ANSWER).get_signal_by_name(signal).choices or {}
+    return {str(name): int(number) for number, name in choices.items()}
+
+
+def payload(command: str, argument: int = 0, *, key: bytes | None = None, challenge: int = 0) -> bytes:
+    """The 8 bytes of a command; `key` and `challenge` make its tag, the request for a challenge has none."""
+    said = struct.pack("<I", codes("command")[command] | argument << 8)
+    tag = siphash(key, struct.pack("<I", challenge) + said) & 0xFFFFFFFF if key is not None else 0
+    return said + struct.pack("<I", tag)
+
+
+def frame(data: bytes, node: int = 0) -> can.Message:
+    """A message COMMAND to a node."""
+    import can
+
+    identifier = load_dbc().get_message_by_name(COMMAND).frame_id + NODE_IDS * node
+    return can.Message(arbitration_id=identifier, data=data, is_extended_id=False)
+
+
+def read_key(path: Path | str) -> bytes:
+    """A key file: 32 hexadecimal digits. Raises UserError for anything else."""
+    try:
+        key = bytes.fromhex(Path(path).read_text(encoding="ascii").strip())
+    except FileNotFoundError as error:
+        make = f"{called()} command new-key --key {shlex.quote(str(path))}"
+        raise UserError(f"{path}: there is no such key; --key names the module's, `{make}` makes one") from error
+    except OSError as error:
+        raise UserError(f"{path}: cannot read the key: {error.strerror}") from error
+    except ValueError as error:
+        raise UserError(f"{path}: a key is 32 hexadecimal digits") from error
+    if len(key) != 16:
+        raise UserError(f"{path}: a key is 32 hexadecimal digits")
+    return key
+
+
+def new_key(path: Path | str) -> None:
+    """Write a random key, for the owner alone to read. Raises UserError if the file is there or cannot be written."""
+    try:
+        Path(path).touch(mode=0o600, exist_ok=False)
+        Path(path).write_text(secrets.token_hex(16) + "\n", encoding="ascii")
+    except OSError as error:
+        raise UserError(f"{path}: cannot write the key: {error.strerror}") from error
+
+
+def build_flag(key: bytes) -> str:
+    """What gives an image this key: an entry of CFLAGS."""
+    low, high = struct.unpack("<2Q", key)
+    return f"-DAPP_COMMAND_KEY=0x{low:016X}ULL,0x{high:016X}ULL"
+
+
+def argument_of(order: str, value: str | None) -> int:
+    """The number that goes with an order: ms, axes (`gx,gz`; `none` takes offsets back), or nothing."""
+    if order == "telemetry_period":
+        if value is None or not value.isdecimal() or not 100 <= int(value) < 2**24:
+            raise UserError(f"telemetry_period wants a number of ms from 100 to {2**24 - 1}")
+        return int(value)
+    if order == "write_offsets":
+        names = [] if value == "none" else (value or "").split(",")
+        unknown = [name for name in names if name not in AXES]
+        if unknown:
+            raise UserError(f"write_offsets wants axes ({','.join(AXES)}) or none, not '{value or ''}'")
+        return sum(1 << AXES.index(name) for name in set(names))
+    if order == "reset" and value == "forget":
+        return 1
+    if value is not None:
+        raise UserError(f"{order} takes {'no word but forget' if order == 'reset' else 'nothing'} after it")
+    return 0
+
+
+def answer_in(link: Link, signal: str, timeout_s: float, about: int, node: int) -> int | None:
+    """A signal of the answer, None if it is another; raises UserError if none comes within `timeout_s`."""
+    decoder = Decoder(node=node)
+    end = time.monotonic() + timeout_s
+    while (left := end - time.monotonic()) > 0 and not link.closed:
+        message = link.recv(left)
+        if message is None:
+            break
+        if node_of(message.arbitration_id) == node:
+            decoder.feed(message)
+        if decoder.foreign:
+            raise UserError(decoder.foreign)
+        if signal in decoder.answer:
+            return int(decoder.answer[signal])
+        if decoder.answer.get("command") == about:
+            return None
+        decoder.answer.clear()
+    if signal == "result":
+        raise UserError(f"the module gave a challenge, but no word within {timeout_s:g} s of what came of the command")
+    raise UserError("the module does not answer: is its image built with a command key?")
