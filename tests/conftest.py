@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import select
 import shlex
@@ -15,6 +16,7 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Generator
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import NoReturn
@@ -99,11 +101,19 @@ def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object
 TIMEOUT_S = 120
 
 
+@cache
+def _loaded(verb: str) -> None:
+    """Import once for all forks what a verb imports when it runs."""
+    for node in ast.walk(ast.parse(selfcal.VERBS[verb].read_text(encoding="utf-8"))):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            import_module(node.module)
+
+
 def run(*arguments: str | Path, cwd: Path | None = None) -> subprocess.CompletedProcess[str]:
     """The command as a user starts it, in a fork of this process: a new Python, which takes longer than most commands,
     is not started for each. test_cli.py starts the program itself as well."""
     if arguments and arguments[0] in selfcal.VERBS:
-        import_module(f"selfcal.{selfcal.VERBS[str(arguments[0])]}.{arguments[0]}")  # once for all forks
+        _loaded(str(arguments[0]))
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         number = os.fork()
         if number == 0:

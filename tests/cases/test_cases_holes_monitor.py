@@ -166,7 +166,7 @@ def test_monitor_notes_contact_for_the_view_that_it_shows(monkeypatch: pytest.Mo
             seen.append(self)
             super().print_last()
 
-    monkeypatch.setattr(verb, "View", Kept)
+    monkeypatch.setattr("selfcal.wire.live.View", Kept)
     sent = lines(stream(21, 1))
     with serial_line("".join(line + "\r" for line in sent).encode()) as path:
         verb.monitor(channel=path, duration=1.5)

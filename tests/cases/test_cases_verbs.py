@@ -24,6 +24,7 @@ from selfcal.adequacy.identify import identify_axis
 from selfcal.base import ending
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
+from selfcal.diagnosis import diagnose as diagnose_module
 from selfcal.diagnosis import integrity, loop
 from selfcal.diagnosis.record import of_recording
 from selfcal.likelihood import fit, work
@@ -32,7 +33,6 @@ from selfcal.model.file import Model
 from selfcal.model.regressors import columns_of
 from selfcal.readings import gate
 from selfcal.readings.rest import rest_of
-from selfcal.verbs import diagnose as diagnose_module
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

@@ -178,7 +178,7 @@ def test_what_the_wheel_has(installed: Installed) -> None:
 def test_every_verb_runs(installed: Installed) -> None:
     """In an empty folder, one after the other over what they write themselves."""
     log, model = installed.folder / "log.csv", installed.folder / "my.yaml"
-    shutil.copy(ROOT / "tools" / "selfcal" / "models" / "default.yaml", model)
+    shutil.copy(ROOT / "tools" / "selfcal" / "model" / "models" / "default.yaml", model)
     for name in ("shipped.npz", "again.npz"):
         shutil.copy(SHIPPED, installed.folder / name)
     calls: dict[str, list[str | Path]] = {

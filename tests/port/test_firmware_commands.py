@@ -24,7 +24,8 @@ from typer.testing import CliRunner
 from selfcal.base.errors import UserError
 from selfcal.cli import app
 from selfcal.model.file import Model
-from selfcal.verbs import command as verb
+from selfcal.verbs.command import command
+from selfcal.wire import command as verb
 from selfcal.wire.frames import Decoder, frame_crc, load_dbc, reasons
 
 KEY = bytes(range(16))
@@ -129,11 +130,11 @@ def test_what_the_command_line_says(tmp_path: Path) -> None:
     verb.new_key(tmp_path / "k")
     there = {"key_file": tmp_path / "k", "interface": "slcan"}
     with pytest.raises(UserError, match=r"to which module\? --channel names its serial port"):
-        verb.command("save", None, channel="", **there)
+        command("save", None, channel="", **there)
     with pytest.raises(UserError, match=r"no such key; --key names .*`selfcal command new-key --key .*none` makes"):
-        verb.command("save", None, key_file=tmp_path / "none", interface="slcan", channel="/dev/null")
+        command("save", None, key_file=tmp_path / "none", interface="slcan", channel="/dev/null")
     with pytest.raises(UserError, match=r"no such command: sing \(there are .*save.*new-key, build-flag\)"):
-        verb.command("sing", None, channel="/dev/null", **there)
+        command("sing", None, channel="/dev/null", **there)
     words = " ".join(CliRunner().invoke(app, ["command", "--help"]).output.split())
     orders = [name for name in COMMAND if name != "challenge"]
     assert all(name in words for name in (*orders, *verb.OWN_ORDERS))

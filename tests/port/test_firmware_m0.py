@@ -31,8 +31,8 @@ from firmware import (
 from unicorn import UC_HOOK_CODE, Uc
 
 from selfcal.model.file import Model
-from selfcal.verbs import command as verb
 from selfcal.verbs.codegen import codegen
+from selfcal.wire import command as verb
 from selfcal.wire.frames import Decoder
 
 KEY = bytes(range(16))

@@ -23,7 +23,6 @@ from selfcal.base.errors import UserError
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Model
 from selfcal.model.tables import make_tables
-from selfcal.verbs import monitor as monitor_module
 from selfcal.verbs.dbc import dbc
 from selfcal.verbs.monitor import monitor
 from selfcal.verbs.replay import replay
@@ -35,7 +34,7 @@ from selfcal.wire.replay import build, can_bus, write_rows
 from conftest import needs_multicast, run
 from wire_stream import lines, message, serial_line, stream
 
-SUMS = ROOT / "tools" / "selfcal" / "models" / "sums.yaml"
+SUMS = ROOT / "tools" / "selfcal" / "model" / "models" / "sums.yaml"
 
 
 def text_of(sent_lines: list[str]) -> bytes:
@@ -101,7 +100,7 @@ def test_two_modules_on_one_bus_are_not_mixed(
     recording = load(part_of_shipped(tmp_path / "part.npz"))
     plain, sums = Model.load(), Model.load(SUMS)
     bus, link = can_bus("")
-    monkeypatch.setattr(monitor_module, "open_bus", lambda *_, **__: link)
+    monkeypatch.setattr("selfcal.wire.frames.open_bus", lambda *_, **__: link)
     modules = [
         Playing(tmp_path, bus, recording, plain, ("gx", "az"), 0),
         Playing(tmp_path, bus, recording, sums, ("gx",), 3),

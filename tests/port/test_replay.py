@@ -26,7 +26,7 @@ from selfcal.logs import recording as recording_module
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Model
 from selfcal.model.tables import make_tables
-from selfcal.verbs import replay as replay_module
+from selfcal.show import plot as plot_module
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
 from selfcal.wire.replay import build, run, write_rows
@@ -190,13 +190,13 @@ def test_replay_is_the_library_over_the_wire(
 ) -> None:
     log = part_of_shipped(tmp_path / "part.csv.gz")
     titles: list[str] = []
-    drawn = replay_module.plot_run
+    drawn = plot_module.plot_run
 
     def watched(history: Any, path: Any, title: str, *more: Any, **named: Any) -> None:
         titles.append(title)
         drawn(history, path, title, *more, **named)
 
-    monkeypatch.setattr(replay_module, "plot_run", watched)
+    monkeypatch.setattr(plot_module, "plot_run", watched)
     document = replay(log, report_every=100.0, json=tmp_path / "report.json", plot=tmp_path / "report.png")
     assert json.loads((tmp_path / "report.json").read_text()) == document
     assert document["schema"] == "selfcal.identify/1"

@@ -22,7 +22,7 @@ from selfcal.logs.loaders import READ, Reading
 from conftest import CALLED, COMMAND, ROOT, run
 
 NO_FOLDER = "no/out.json: cannot be written: there is no folder 'no'; make it first"
-DEFAULT = ROOT / "tools" / "selfcal" / "models" / "default.yaml"
+DEFAULT = ROOT / "tools" / "selfcal" / "model" / "models" / "default.yaml"
 
 
 def one_error(*arguments: str | Path, cwd: Path | None = None) -> str:
@@ -220,7 +220,7 @@ def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> N
     """Truth: the table in tools/README.md. A monitor's `start` is its `--from`."""
     named = {"start": "start_s", "end": "end_s", "since_power_on": "since_power_on_s", "axis": "axes"}
     named |= {"column": "columns", "unit": "units", "source": "sources", "from": "start", "no_suspicion": "suspicion"}
-    function = getattr(import_module(f"selfcal.{selfcal.VERBS[verb]}.{verb}"), verb)
+    function = getattr(import_module(f"selfcal.verbs.{verb}"), verb)
     keywords = set(inspect.signature(function).parameters)
     if "reading" in keywords:
         keywords |= Reading.__annotations__.keys()
@@ -228,7 +228,7 @@ def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> N
     assert isinstance(command, typer.core.TyperGroup)
     options = {
         max(one.opts, key=len).strip("-").replace("-", "_")
-        for one in command.commands[verb].params
+        for one in command.get_command(None, verb).params
         if one.param_type_name == "option"
     }
     ensemble = {"records", "results", "samples", "scheduler", "seed", "truth", "workers"} if verb == "rivals" else set()

@@ -529,7 +529,7 @@ def test_a_change_of_the_sampling_clock_is_told(tmp_path: Path) -> None:
 INTERRUPTED = """
 import os, signal, sys, time
 from selfcal import cli
-from selfcal.verbs import diagnose as verb
+from selfcal.diagnosis import diagnose as verb
 
 loop, last = verb.diagnose_record, time.monotonic()
 

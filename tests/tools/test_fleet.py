@@ -24,6 +24,7 @@ import pytest
 from selfcal.base.errors import UserError
 from selfcal.base.units import factor
 from selfcal.batch.files import Source
+from selfcal.batch.fleet import document_with, judged_units
 from selfcal.batch.page import page
 from selfcal.batch.spread import DEATHS, Row, spread
 from selfcal.batch.summary import document_of, lines_of, summed_up
@@ -31,7 +32,7 @@ from selfcal.batch.table import COLUMNS, Unit
 from selfcal.batch.verdicts import Limits
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
-from selfcal.verbs.fleet import _document, _judged, fleet
+from selfcal.verbs.fleet import fleet
 
 from conftest import COMMAND, case_records, run
 
@@ -461,7 +462,7 @@ def test_a_quantity_that_few_units_identify_is_a_line() -> None:
     assert document["unidentified"] == {"gz.N": {"identified": 3, "units": 9}}
     assert "gz.N" not in document["population"] and "gz.K" in document["population"]
     (line,) = [line for line in lines_of(summary) if line.startswith("no population of gz.N: 3 of 9 units identify it")]
-    assert line in page({**_document(batch, None, []), **document}, summary, {})
+    assert line in page({**document_with(batch, None, []), **document}, summary, {})
 
 
 def test_the_page_stays_small(tmp_path: Path) -> None:
@@ -469,9 +470,9 @@ def test_the_page_stays_small(tmp_path: Path) -> None:
     batch = synthetic(case_records(2000, 10000))
     limits = tmp_path / "limits.yaml"
     limits.write_text("gyro.N: {max: 0.021 deg/s/sqrt(Hz)}\n")
-    judged = _judged(batch, Limits.load(limits, Model.load()))
+    judged = judged_units(batch, Limits.load(limits, Model.load()))
     summary = summed_up(batch, Model.load())
-    document = {**_document(batch, None, judged), **document_of(summary)}
+    document = {**document_with(batch, None, judged), **document_of(summary)}
     text = page(document, summary, {})
     assert len(text.encode()) < 1_000_000
     assert "<script" not in text and "http://" not in text and "https://" not in text

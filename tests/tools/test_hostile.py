@@ -194,7 +194,7 @@ def test_changed_recordings(tmp_path: Path, name: str) -> None:
 def test_changed_model_files(tmp_path: Path) -> None:
     path = tmp_path / "model.yaml"
     chance = random.Random("model")
-    sources = [DEFAULT.read_bytes(), (ROOT / "tools" / "selfcal" / "models" / "sums.yaml").read_bytes()]
+    sources = [DEFAULT.read_bytes(), (ROOT / "tools" / "selfcal" / "model" / "models" / "sums.yaml").read_bytes()]
     refused = 0
     for _ in range(500 * TIMES):
         path.write_bytes(changed(chance.choice(sources), chance))

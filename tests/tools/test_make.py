@@ -17,7 +17,7 @@ import pytest
 
 from selfcal.logs import recording
 from selfcal.model.file import Model
-from selfcal.verbs import replay as verb
+from selfcal.wire import replay as verb
 from selfcal.wire.command import build_flag
 from selfcal.wire.replay import build
 

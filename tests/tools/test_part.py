@@ -14,8 +14,7 @@ import yaml
 from test_cases_priors import at_rest, deviation, write
 
 from selfcal.base.errors import UserError
-from selfcal.model import parts
-from selfcal.model.file import DEFAULT, Model, file_of
+from selfcal.model.file import DEFAULT, Model, file_of, parts
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.identify import identify
 from selfcal.verbs.part import part

@@ -33,7 +33,7 @@ from selfcal.model.laws import (
     Term,
 )
 
-SCHEMA = "selfcal.model.file/1"
+SCHEMA = "selfcal.model/1"
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 #: Model files of common parts, one a part; the default model is that of the ADIS16405.
 PARTS = DEFAULT.parent / "parts"

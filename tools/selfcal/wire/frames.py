@@ -47,7 +47,7 @@ RESYNC = 3  # frames in a row, each one ahead of the last, that restart the coun
 
 
 #: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
-TREE = Path(__file__).resolve().parent / "tree"
+TREE = Path(__file__).resolve().parents[1] / "tree"
 ROOT = TREE if TREE.is_dir() else TREE.parents[2]
 
 
