@@ -2,11 +2,13 @@
 
 Lines of at most 120 columns; in `lib/`, without the generated files: few conditional lines of the preprocessor, no
 circle among its files, no function above 80 lines, no two static functions of one name. In `port/app` and
-`port/sensors`: no circle, and few conditional lines.
+`port/sensors`: no circle, and few conditional lines. In `tools/selfcal` a folder imports those before it in `STAGES`
+alone, files import each other in no circle, and a verb's file loads nothing heavy.
 """
 
 from __future__ import annotations
 
+import ast
 import re
 import subprocess
 import sys
@@ -20,6 +22,24 @@ CONDITIONALS = 45
 #: The same in `port/app`, without include guards.
 APP_CONDITIONALS = 25
 FUNCTION = 80
+#: Folders of `tools/selfcal`, each after those that it may import.
+STAGES = (
+    "base",
+    "logs",
+    "model",
+    "readings",
+    "bank",
+    "likelihood",
+    "adequacy",
+    "diagnosis",
+    "wire",
+    "show",
+    "batch",
+    "studies",
+    "verbs",
+)
+#: What the head of a verb's file may import, so that `selfcal VERB --help` answers at once.
+LIGHT = ("selfcal.base", "selfcal.logs.loaders", "selfcal.verbs._shared")
 #: Files whose lines a person writes.
 WRITTEN = (".c", ".h", ".cpp", ".hpp", ".py", ".pyi", ".mk", ".ld", ".txt", ".sh", ".md", "Makefile")
 #: Made by programs.
@@ -108,11 +128,49 @@ def calls(texts: Mapping[str, str]) -> dict[str, set[str]]:
     return edges
 
 
+def imports(package: Path) -> dict[str, dict[str, bool]]:
+    """Which module of a Python package imports which, anywhere in its file; whether at its head."""
+    files = {
+        ".".join(path.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__"): path
+        for path in package.rglob("*.py")
+    }
+    found: dict[str, dict[str, bool]] = {}
+    for name, path in files.items():
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        head = {id(node) for node in tree.body}
+        edges = found.setdefault(name, {})
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module is not None:
+                for one in node.names:
+                    module = f"{node.module}.{one.name}"
+                    module = module if module in files else node.module
+                    if module in files and module != name:
+                        edges[module] = edges.get(module, False) or id(node) in head
+    return found
+
+
+def stages(found: Mapping[str, Mapping[str, bool]]) -> list[str]:
+    """What breaks the order of the folders of `tools/selfcal`, and files that import each other."""
+    said = []
+    for name, edges in found.items():
+        own = name.split(".")[1] if "." in name else ""
+        for other, at_head in edges.items():
+            theirs = other.split(".")[1] if "." in other else ""
+            if own in STAGES and theirs in STAGES and STAGES.index(theirs) > STAGES.index(own):
+                said.append(f"tools: {name} imports {other}: {own} comes before {theirs}")
+            if own == "verbs" and at_head and not name.endswith("_shared") and not other.startswith(LIGHT):
+                said.append(f"tools: {name} imports {other} at its head: import it in the function")
+    folders = {path.name for path in (ROOT / "tools" / "selfcal").iterdir() if any(path.glob("*.py"))}
+    said += [f"tools/selfcal/{name}: a folder that is no stage" for name in sorted(folders - set(STAGES))]
+    way = circle({name: set(edges) for name, edges in found.items()})
+    return [*said, *([f"tools: files import each other in a circle: {' > '.join(way)}"] if way else [])]
+
+
 def complaints() -> list[str]:
     """What breaks the rules, a line each."""
     files = [path for path in tracked([".c", ".h"]) if path.parent == ROOT / "lib"]
     library = {path.name: path.read_text(encoding="utf-8") for path in files}
-    found = long_lines(tracked(WRITTEN))
+    found = long_lines(tracked(WRITTEN)) + stages(imports(ROOT / "tools" / "selfcal"))
     application, sensors = (
         {path.name: path.read_text(encoding="utf-8") for path in tracked([".c", ".h"]) if path.parent == room}
         for room in (ROOT / "port" / "app", ROOT / "port" / "sensors")

@@ -23,8 +23,9 @@ from scipy.stats import binom
 
 from selfcal.base.errors import UserError
 from selfcal.logs.loaders import FORMATS, child, format_of
+from selfcal.logs.loaders.headings import parse_scales
 from selfcal.logs.loaders.table import Hints
-from selfcal.logs.recording import Recording, load, parse_pairs, parse_scales
+from selfcal.logs.recording import Recording, load, parse_pairs
 from selfcal.verbs.convert import convert
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

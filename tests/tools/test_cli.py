@@ -231,8 +231,7 @@ def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> N
         for one in command.get_command(None, verb).params
         if one.param_type_name == "option"
     }
-    ensemble = {"records", "results", "samples", "scheduler", "seed", "truth", "workers"} if verb == "rivals" else set()
-    known = {named.get(option, option) for option in options - ensemble - {"help"}}
+    known = {named.get(option, option) for option in options - {"help"}}
     assert known <= keywords, known - keywords
 
 

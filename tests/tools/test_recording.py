@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.logs.loaders import FORMATS, TEXT
-from selfcal.logs.recording import load, parse_scales, save
+from selfcal.logs.loaders.headings import parse_scales
+from selfcal.logs.recording import load, save
 
 from conftest import shared_recording
 

@@ -84,7 +84,7 @@ def _command(name: str) -> Any:
     run.__doc__ = f"{_first_line(selfcal.VERBS[name])}."
     run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {one.name: one.annotation for one in parameters}
-    alone = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None)
+    alone = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None, add_completion=False)
     alone.command(name)(run)
     return typer.main.get_command(alone)
 
@@ -149,8 +149,8 @@ def _usage(error: TyperException) -> str:
         said = said.replace(theirs, ours)
     wanted = getattr(getattr(error, "param", None), "help", None) if said.startswith("Missing") else None
     context = getattr(error, "ctx", None)
-    verb = f" {context.info_name}" if context is not None and context.parent is not None else ""
-    return f"{said}{f' ({wanted})' if wanted else ''}; see `{called()}{verb} --help`"
+    path = "selfcal" if context is None else context.command_path
+    return f"{said}{f' ({wanted})' if wanted else ''}; see `{called()}{path.removeprefix('selfcal')} --help`"
 
 
 def _fail(message: str) -> NoReturn:
@@ -158,11 +158,10 @@ def _fail(message: str) -> NoReturn:
     sys.exit(USER_ERROR)
 
 
-def _check_once(whole: Any, arguments: Sequence[str]) -> None:
+def _check_once(options: Sequence[Any], arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice and takes one value: typer would drop the first without a word."""
-    verb = whole.get_command(None, arguments[0]) if arguments else None
     given = [one.split("=", 1)[0] for one in takewhile(lambda one: one != "--", arguments)]
-    for option in verb.params if verb is not None else ():
+    for option in options:
         times = sum(given.count(name) for name in option.opts if name.startswith("-"))
         if times > 1 and not getattr(option, "multiple", True) and not getattr(option, "is_flag", True):
             name = max(option.opts, key=len)
@@ -176,9 +175,13 @@ def main() -> NoReturn:
     if not sys.warnoptions:  # a library's warning is none for the user
         warnings.simplefilter("ignore")
     try:
-        whole = typer.main.get_command(app)
-        _check_once(whole, sys.argv[1:])
-        code = whole(args=sys.argv[1:] or ["--help"], standalone_mode=False)
+        name, *rest = sys.argv[1:] or ["--help"]
+        if name in selfcal.VERBS:  # without what the options of the command itself take at their start
+            command, arguments, path = _command(name), rest, f"selfcal {name}"
+            _check_once(command.params, rest)
+        else:
+            command, arguments, path = typer.main.get_command(app), [name, *rest], "selfcal"
+        code = command(args=arguments, prog_name=path, standalone_mode=False)
         if code == INTERRUPTED:  # typer's code for every signal
             leave(last_signal() or code)
         sys.exit(code)

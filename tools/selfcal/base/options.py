@@ -5,9 +5,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
+
+from selfcal.base.errors import UserError
+
+#: Size of one LSB, with its unit unless the column's usual one is meant.
+Scale = tuple[float, str | None]
 
 
 @dataclass(frozen=True)
@@ -38,3 +43,16 @@ def option(
 def argument(help: str, metavar: str, *, kind: Any = None, **more: Any) -> Option:
     """An argument of the command line."""
     return Option(help, (), metavar, kind, None, True, {"show_default": False, **more})
+
+
+def parse_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
+    """`NAME=VALUE` texts of a repeated command line option as a dict. Raises UserError naming the option."""
+    found: dict[str, str] = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not (name and equals and value):
+            raise UserError(f"{option} takes NAME=VALUE, not '{pair}'")
+        if name in found:
+            raise UserError(f"{option}: '{name}' is given twice")
+        found[name] = value
+    return found

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import chdtrc
-from scipy.stats import t as student
+from scipy.special import chdtrc, stdtr
 
 from selfcal.batch.population import FALSE_ALARM, Array
 
@@ -92,7 +91,7 @@ def drifts_of(series: Iterable[Series]) -> list[Drift]:
             if degrees == 0:
                 continue  # two dates alone: what a new start changes is unknown
             slope, sd, _ = one.line(square)
-            log_p = math.log(2.0) + float(student.logsf(abs(slope) / sd, degrees))
+            log_p = math.log(2.0) + math.log(max(float(stdtr(degrees, -abs(slope) / sd)), 1e-300))
             significant = log_p <= math.log(FALSE_ALARM / of_unit[one.at])
             days = float(np.ptp(one.days))
             found.append(

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from scipy.fft import rfft
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from selfcal.base.units import power
 from selfcal.diagnosis.cause import Channels, Key, medians, positive
@@ -379,7 +379,7 @@ def inconstancy(state: State, column: Array, beside: Array | None = None) -> flo
     noise = float(np.var(w - c * u)) * u.size / 2.0
     chi = float((score**2 / np.maximum(information, 1e-300)).sum()) / noise
     freedom = information.size - 1
-    return float(-chi2.logsf(chi, freedom)) if freedom > 0 else 0.0
+    return -math.log(max(float(chdtrc(freedom, chi)), 1e-300)) if freedom > 0 else 0.0
 
 
 def _keys(state: State, option: Option) -> list[tuple[str, str]]:

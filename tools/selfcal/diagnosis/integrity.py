@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.special import ndtr
-from scipy.stats import poisson
+from scipy.special import ndtr, pdtrc
 
 from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
@@ -87,7 +86,7 @@ def _held(record: Record) -> Mask:
     ]
     expected = held.size * float(np.prod(np.maximum(shares, 1.0 / held.size)))
     # Chance repeats of coarse axes are not quite independent: three times the expectation.
-    return held if poisson.logsf(int(held.sum()) - 1, 3.0 * expected + 0.05) < -NET_LEAST else none
+    return held if pdtrc(int(held.sum()) - 1, 3.0 * expected + 0.05) < math.exp(-NET_LEAST) else none
 
 
 def _repeats_by_chance(state: State) -> float:

@@ -12,7 +12,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from selfcal.adequacy.checks import against
 from selfcal.diagnosis.causes import shared
@@ -60,7 +60,7 @@ def of_checks(one: Diagnosed, checks: Mapping[str, Mapping[str, Any]]) -> Look |
     """What the checks of `identify` hold against an axis in which no cause was found."""
     for name, deviations in against(checks).items():
         told = float(checks[name]["value"])
-        found = look_of(Statistic(name, told, 0.0, 0.0, 0.0), 2.0 * float(norm.sf(deviations)))
+        found = look_of(Statistic(name, told, 0.0, 0.0, 0.0), 2.0 * float(ndtr(-deviations)))
         return replace(found, shown_by=next((shown for start, shown in SHOWN if name.startswith(start)), name))
     return None
 

@@ -36,9 +36,10 @@ from selfcal.base.limits import (
     read_text,
     reading,
 )
+from selfcal.base.options import Scale
 from selfcal.base.output import together, whole
 from selfcal.base.units import SENSORS
-from selfcal.logs.loaders import WRITTEN, Scale, check_library, format_of, parse_pairs
+from selfcal.logs.loaders import WRITTEN, check_library, format_of
 from selfcal.logs.loaders.child import tables_of
 from selfcal.logs.loaders.headings import Meaning, Sensor, number_of, sensors_of, sides_of, split
 from selfcal.logs.loaders.sources import Part, chosen
@@ -580,19 +581,6 @@ def _save_npz(
             arrays[f"{name}[{unit}]"] = np.asarray(values, np.float64)
     with whole(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)
-
-
-def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:
-    """`--scale` texts, `0.05`, `gx=0.05` or `gx=0.05[deg/s]`, as `load` takes them; the empty name is every column."""
-    scales: dict[str, Scale] = {}
-    for name, text in parse_pairs("--scale", [item if "=" in item else f"*={item}" for item in texts]).items():
-        number, unit = split(text)
-        try:
-            scales["" if name == "*" else name] = (float(number), unit)
-        except ValueError:
-            wanted = "[NAME=]SIZE, a unit in brackets after it (gx=0.05[deg/s])"
-            raise UserError(f"--scale takes {wanted}, not '{text}'") from None
-    return scales
 
 
 def meta_place(path: Path) -> Path:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
-from scipy.optimize import minimize_scalar
 
 from selfcal.diagnosis.cause import Cause, Key, medians
 from selfcal.diagnosis.finding import Diagnosed
@@ -141,6 +140,8 @@ def _line(state: State, record: Record) -> list[Look]:
     def cost(f: float) -> float:
         turns = np.exp(-2j * math.pi * np.mod(f * t, 1.0))
         return -float(np.abs(turns @ w) ** 2)
+
+    from scipy.optimize import minimize_scalar  # a quarter of a second to import: for who has a line alone
 
     f = float(
         minimize_scalar(

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.stats import gamma
+from scipy.special import gammaincinv
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
@@ -215,7 +215,7 @@ def _stays(upper: Mask) -> list[tuple[float, float]]:
 def _dwell(time: float, count: float, dt: float) -> dict[str, Any]:
     """Mean of exponential times of which `count` ended in `time` blocks: an inverse gamma, in equal parts."""
     share = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    values = dt * time / gamma.ppf(share, count)
+    values = dt * time / gammaincinv(count, share)
     return mixture(np.ones(QUANTILES), values, values / QUANTILES, "s")
 
 

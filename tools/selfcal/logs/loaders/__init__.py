@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, TypedDict
 
 from selfcal.base.errors import UserError, install
-from selfcal.base.options import option
+from selfcal.base.options import Scale, option, parse_pairs
 
 #: Text, each with .gz too.
 TEXT = (".csv", ".tsv", ".txt", ".log", ".dat", ".lvm")
@@ -65,25 +65,8 @@ READ = (
 WRITTEN = ".csv, .csv.gz or .npz"
 
 
-#: Size of one LSB, with its unit unless the column's usual one is meant.
-Scale = tuple[float, str | None]
-
-
-def parse_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
-    """`NAME=VALUE` texts of a repeated command line option as a dict. Raises UserError naming the option."""
-    found: dict[str, str] = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not (name and equals and value):
-            raise UserError(f"{option} takes NAME=VALUE, not '{pair}'")
-        if name in found:
-            raise UserError(f"{option}: '{name}' is given twice")
-        found[name] = value
-    return found
-
-
 def _scales(texts: Sequence[str]) -> dict[str, Scale]:
-    from selfcal.logs.recording import parse_scales
+    from selfcal.logs.loaders.headings import parse_scales
 
     return parse_scales(texts)
 

@@ -12,7 +12,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 from selfcal.base import units
-from selfcal.base.limits import LONGEST_HEADING
+from selfcal.base.errors import UserError
+from selfcal.base.limits import (
+    LONGEST_HEADING,
+)
+from selfcal.base.options import Scale, parse_pairs
 
 #: Characters of a heading of no program that is known.
 _LONGEST_NAME = 120
@@ -330,3 +334,16 @@ def _matching(pattern: str | tuple[str, ...], keys: Sequence[str]) -> Iterator[t
 
 def _first(patterns: Sequence[str], text: str) -> re.Match[str] | None:
     return next(filter(None, (re.fullmatch(one, text, re.IGNORECASE) for one in patterns)), None)
+
+
+def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:
+    """`--scale` texts, `0.05`, `gx=0.05` or `gx=0.05[deg/s]`, as `load` takes them; the empty name is every column."""
+    scales: dict[str, Scale] = {}
+    for name, text in parse_pairs("--scale", [item if "=" in item else f"*={item}" for item in texts]).items():
+        number, unit = split(text)
+        try:
+            scales["" if name == "*" else name] = (float(number), unit)
+        except ValueError:
+            wanted = "[NAME=]SIZE, a unit in brackets after it (gx=0.05[deg/s])"
+            raise UserError(f"--scale takes {wanted}, not '{text}'") from None
+    return scales
