@@ -75,7 +75,7 @@ $(OPTIONAL:%=$(VENV)/%.stamp): $(VENV)/%.stamp: tools/requirements-%.txt $(VENV)
 	$(PIP_INSTALL) --requirement $<
 	@touch $@
 
-$(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/*.py tools/selfcal/verbs/codegen.py) \
+$(MODEL)/selfcal_model.c: $(PACKAGE) $(wildcard tools/selfcal/model/*.py tools/selfcal/wire/c_tables.py) \
                           $(wildcard tools/selfcal/model/models/*.yaml)
 	$(BIN)/selfcal codegen tools/selfcal/model/models/default.yaml -o $(MODEL)
 
