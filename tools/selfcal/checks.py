@@ -34,6 +34,8 @@ FEWEST = 20
 #: Share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at 0.9,
 #: where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84
+#: Times of a filter's corner in an average that shows the white noise before it: N of a first-order filter to 5 %.
+CORNERS = 10.0
 #: Spacing of float32 in the noise of a reading from which on it makes N too large: by 0.4 %.
 SPACING_MOST = 0.3
 
@@ -109,6 +111,41 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     terms = terms_of(group.laws[result.best], at, tables.dt_s, tables.block)
     share = terms.lacking / (terms.variance * (1.0 - 2.0 * terms.lag1))
     return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
+
+
+def with_rate(
+    judged: Judged,
+    values: NDArray[np.float64],
+    missing_before: NDArray[np.int64],
+    step: float,
+    tables: Tables,
+    result: AxisResult,
+) -> Judged:
+    """The same with the rates of a `drift_in_average` that failed: `bank_hz`, and `decimate_hz` of averages that show
+    the white noise.
+
+    `values` [n]: the readings, NaN where there is none; `step` of their lattice. Differences over one and two readings
+    part their white noise from a walk. Where it is the larger one, averages over the time in which both are alike show
+    it. Else the part filters its noise, which is white in averages over many times the filter's. Without such a corner
+    in the record there is no rate.
+    """  # fmt: skip
+    near = missing_before[1:] == 0
+
+    def square(differences: NDArray[np.float64]) -> float:
+        pairs = int(np.isfinite(differences).sum())
+        return float(np.nansum(differences**2)) / max(1, pairs) - step**2 / 6.0
+
+    one, two = square(np.diff(values)[near]), square((values[2:] - values[:-2])[near[1:] & near[:-1]])
+    white, walk = one - 0.5 * two, two - one
+    rate_hz = tables.block / tables.dt_s
+    told = {"bank_hz": 1.0 / tables.dt_s}
+    alpha = result.parameters[result.best].get("alpha")
+    if white > walk:
+        alike_hz = rate_hz * math.sqrt(max(walk, 0.0) / white)
+        told["decimate_hz"] = float(f"{min(rate_hz, max(2.0 / tables.dt_s, alike_hz)):.2g}")
+    elif alpha is not None and values.size * alpha.median > FEWEST * CORNERS * rate_hz:
+        told["decimate_hz"] = float(f"{alpha.median / CORNERS:.2g}")
+    return replace(judged, checks={**judged.checks, "drift_in_average": {**judged.checks["drift_in_average"], **told}})
 
 
 def batch_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:

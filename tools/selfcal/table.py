@@ -137,7 +137,12 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str) -> str:
             return f"lattice: {step}: noise is below that, N includes the rounding, the bias may stick"
         case "drift_in_average":
             share = f"the drift hides {100.0 * value:.0f} % of the white noise"
-            return f"drift_in_average: {share}: average less, with a higher --decimate"
+            rate_hz = outcome.get("decimate_hz")
+            if rate_hz is None:
+                return f"drift_in_average: {share}, and no rate of this record shows it: record longer"
+            less = rate_hz > outcome["bank_hz"]
+            how = "average less" if less else "the part filters it out of its readings: average more"
+            return f"drift_in_average: {share}: {how}, with --decimate {rate_hz:g}"
         case "batch":
             return f"{value:.1f} sd from the batch of the model's priors: identify it with the model without that batch"
         case "outliers":

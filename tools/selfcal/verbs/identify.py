@@ -18,7 +18,7 @@ from rich.progress import Progress
 from selfcal import _library32
 from selfcal.allan import Sampled, sample_lengths, sampled
 from selfcal.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
-from selfcal.checks import FEWEST, coefficients_of, judge, with_drift, with_readings
+from selfcal.checks import FEWEST, against, coefficients_of, judge, with_drift, with_rate, with_readings
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import OutsidePriors, UserError
 from selfcal.export import FORMS, write_export
@@ -387,6 +387,10 @@ def identify_axis(
     used = _used(mask)
     judged = judge(blocks, tables, group, results[best], used)
     judged = with_drift(judged, blocks, tables, results[best], recording, may_act(model, recording, name), used)
+    if "drift_in_average" in against(judged.checks):
+        used_readings = np.where(np.logical_or.reduce(list(kept_out(samples, group).values())), np.nan, values)
+        step = 0.0 if readings.lattice is None else readings.lattice.step
+        judged = with_rate(judged, used_readings, recording.missing_before, step, tables, results[best])
     judged = with_readings(judged, readings, group, unit, tables.dt_s)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[best]) if used else 0.0
     curve = curve_of_samples(samples - explained) if draw else None
