@@ -25,11 +25,13 @@ from selfcal.errors import UserError
 from selfcal.loaders import FORMATS, child, format_of
 from selfcal.loaders.table import Hints
 from selfcal.recording import Recording, load, parse_pairs, parse_scales
-from selfcal.verbs.convert import convert
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 
 from conftest import ROOT, case_records, run
+
+#: Every log that a test here opens, `convert` writes without loss.
+pytestmark = pytest.mark.usefixtures("reads_back")
 
 #: Interval of the writers' least exact stamps against a clock: the rate is asked for to 1e-4.
 RATE = 1e-4
@@ -411,22 +413,6 @@ def test_a_library_that_is_absent(drawn: logs.Drawn, tmp_path: Path, monkeypatch
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(UserError, match=r"is a ULog file, and pyulog is not installed: .* install selfcal"):
         load(log)
-
-
-@pytest.mark.parametrize(("name", "output"), [("ros2", "x.npz"), ("phyphox", "x.csv")])
-def test_convert(name: str, output: str, drawn: logs.Drawn, tmp_path: Path) -> None:
-    """What is written reads back: the same axes at the same rates."""
-    log = logs.WRITERS[name](drawn, tmp_path)
-    done = run("convert", log, "-o", tmp_path / output)
-    assert done.returncode == 0, done.stderr
-    assert "800 rows, 100 Hz, 8 s" in done.stdout
-    before, after = load(log), load(tmp_path / output)
-    assert list(before.columns) == list(after.columns)
-    for column in before.columns:
-        assert after.clock_of(column).rate_hz == pytest.approx(before.clock_of(column).rate_hz, rel=1e-9)
-        assert after.columns[column].values == pytest.approx(before.columns[column].values, rel=1e-8)
-    with pytest.raises(UserError, match="is the log itself"):
-        convert(log, log)
 
 
 def test_the_page_your_log(tmp_path: Path) -> None:
