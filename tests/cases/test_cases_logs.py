@@ -13,7 +13,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Sequence
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 
 import logs
@@ -22,11 +22,13 @@ import pytest
 from scipy.stats import binom
 
 from selfcal.errors import UserError
-from selfcal.loaders import FORMATS, child, format_of
+from selfcal.framelog import FrameWriter
+from selfcal.loaders import FORMATS, check_library, child, format_of
 from selfcal.loaders.table import Hints
 from selfcal.recording import Recording, load, parse_pairs, parse_scales
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
+from selfcal.wire import open_bus
 
 from conftest import ROOT, case_records, run
 
@@ -409,10 +411,26 @@ def test_a_driver_that_takes_turns(drawn: logs.Drawn, tmp_path: Path) -> None:
 
 
 def test_a_library_that_is_absent(drawn: logs.Drawn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = logs.write_ulog(drawn, tmp_path)
+    """The line names an extra of this package, for every format whose library is none of its dependencies. Truth: the
+    package's metadata."""
+    declared = metadata.metadata("selfcal").get_all("Provides-Extra") or []
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(UserError, match=r"is a ULog file, and pyulog is not installed: .* install selfcal"):
-        load(log)
+    for one in FORMATS:
+        if one.library and one.library != "can":
+            assert one.extra in declared
+            with pytest.raises(
+                UserError, match=rf"{one.library} is not installed: .* install 'selfcal\[{one.extra}\]'$"
+            ):
+                check_library(tmp_path, one)
+    with pytest.raises(UserError, match=r"is a ULog file, and pyulog is not installed: .* install 'selfcal\[px4\]'$"):
+        load(logs.write_ulog(drawn, tmp_path))
+    monkeypatch.setattr("selfcal.framelog.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"run.mcap: mcap is not installed: .* install 'selfcal\[mcap\]'$"):
+        FrameWriter(tmp_path / "run.mcap")
+    assert not (tmp_path / "run.mcap").exists()
+    monkeypatch.setattr("selfcal.wire.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"msgpack is not installed: .* install 'selfcal\[multicast\]'$"):
+        open_bus("udp_multicast", "239.74.163.2")
 
 
 def test_the_page_your_log(tmp_path: Path) -> None:

@@ -9,10 +9,11 @@ import struct
 import time
 import zlib
 from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, cast
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, install
 from selfcal.streams import McapFrames, McapLog
 
 if TYPE_CHECKING:
@@ -120,9 +121,11 @@ class FrameWriter:
 
 
 def check_suffix(path: Path | str) -> None:
-    """Raise UserError for a name that chooses no format."""
+    """Raise UserError for a name that chooses no format, or one whose library is not installed."""
     if Path(path).suffix.lower() not in WRITTEN:
         raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
+    if str(path).lower().endswith(".mcap") and find_spec("mcap") is None:
+        raise UserError(f"{path}: mcap is not installed: {install('selfcal[mcap]')}")
 
 
 class FrameLog:
