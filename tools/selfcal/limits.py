@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,8 +19,9 @@ MOST_NUMBERS = 400_000_000
 MOST_COLUMNS, LONGEST_HEADING = 1000, 256
 #: A text recording is read by as many bytes; no line is longer.
 BLOCK_BYTES = 1 << 22
-#: What a packed text recording may unpack to, times its size: readings of a sensor pack to a twentieth at best.
-MOST_GROWTH = 200
+#: What a packed recording may unpack to, times its size: readings of a sensor pack to a twentieth at best. Of a text
+#: less, as a number of eight bytes has two there.
+MOST_GROWTH, MOST_TEXT_GROWTH = 200, 50
 #: Lines before the header of a text recording.
 MOST_LEADING_LINES = 1000
 #: Cells of these lines that are looked at for a known heading.
@@ -54,6 +57,8 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
     except OSError as error:
         # A library's own OSError has no number.
         what = f"cannot be read: {error.strerror}" if error.strerror else f"{otherwise}: {first_line(error)}"
+        if error.errno == errno.ENOSPC:
+            what = f"no space left in {tempfile.gettempdir()} to unpack it: TMPDIR names another folder"
         raise UserError(f"{path}: {what}") from error
     except MemoryError as error:
         raise UserError(f"{path}: too large for this machine's memory") from error

@@ -28,7 +28,9 @@ def read(path: Path, hints: Hints) -> list[Table]:
     messages = {one.frame_id: one for one in database.messages if not one.is_multiplexed()}
     stamps: dict[int, Any] = {}
     values: dict[int, Any] = {}
-    with can.LogReader(path) as log:
+    # can.LogReader takes more by a name: plug-ins, SQLite, MDF with its formulas
+    readers = {".asc": can.ASCReader, ".blf": can.BLFReader, ".csv": can.CSVReader, ".trc": can.TRCReader}
+    with readers.get(path.suffix.lower(), can.CanutilsLogReader)(path) as log:
         for frame in log:
             message = messages.get(frame.arbitration_id)
             if message is None or frame.is_remote_frame or frame.is_error_frame or len(frame.data) < message.length:
