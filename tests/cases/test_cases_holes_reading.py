@@ -27,7 +27,10 @@ from selfcal.framelog import WRITTEN
 from selfcal.limits import reading
 from selfcal.loaders import FORMATS, TEXT, ZIP, child
 from selfcal.loaders.table import Hints
-from selfcal.recording import load
+from selfcal.recording import load, save
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.fleet import fleet
+from selfcal.verbs.response import response
 
 from conftest import COMMAND, run
 
@@ -255,6 +258,15 @@ def test_a_pipe_or_a_device_is_one_line(suffix: str, tmp_path: Path) -> None:
                 load(log, dbc=dbc)
 
 
+def test_a_database_that_is_a_pipe(tmp_path: Path) -> None:
+    """Or that is not there: the line names the database, not the log."""
+    log, _ = logs.write_frames(logs.Drawn(seconds=0.1), tmp_path, ".asc")
+    os.mkfifo(tmp_path / "pipe.dbc")
+    for dbc in (tmp_path / "pipe.dbc", tmp_path / "none.dbc"):
+        with pytest.raises(UserError, match=f"^{dbc}: there is no such file, or it is a pipe or a device"):
+            load(log, dbc=dbc)
+
+
 def test_a_pipe_beside_a_log(tmp_path: Path, short: logs.Drawn) -> None:
     """In the place of metadata, in a ROS 2 folder, in a batch: refused or left out, at once."""
     bag = logs.write_ros2(short, tmp_path)
@@ -427,6 +439,17 @@ def packed(path: Path, count: int) -> Path:
     return path
 
 
+def test_members_that_are_one_are_refused(tmp_path: Path) -> None:
+    """A zip that lists one member 700 times: its rows are read for an hour, and never were there."""
+    path = tmp_path / "log.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        rows = np.random.default_rng(8).integers(0, 2, 3000).tolist()
+        archive.writestr("Gyroscope.csv", "gz[deg/s]\n" + "".join(f"{row}\n" for row in rows))
+        archive.filelist *= 700
+    with pytest.raises(UserError, match="not a whole zip file: its members overlap"):
+        load(path, rate=10.0)
+
+
 @pytest.mark.parametrize("name", ["log.csv.gz", "log.zip", "log.npz", "log.h5", "log.parquet"])
 def test_a_small_file_takes_little_memory(name: str, tmp_path: Path) -> None:
     """16 million rows in a file of less than a megabyte: refused with less memory than a fifth of their numbers."""
@@ -444,3 +467,23 @@ def test_a_small_file_takes_little_memory(name: str, tmp_path: Path) -> None:
     assert "times its size, as no sensor's readings do" in line
     print(name, grown_kb)
     assert int(grown_kb) < 16_000_000 * 16 / 5 / 1024 + 90_000  # and pyarrow
+
+
+# ---------------------------------------------------------------------------------------------- what verbs stumble over
+
+
+@pytest.mark.parametrize("factor", [1.0, -20.0])
+def test_a_temperature_that_copies_an_axis(factor: float, tmp_path: Path) -> None:
+    """A logger wrote one column twice: it acts on nothing, and nothing is left of the axis beside it."""
+    values = np.random.default_rng(9).normal(size=500)
+    save(tmp_path / "log.csv", {"gy": ("deg/s", 0.1 * values), "temp": ("degC", 20.0 + factor * values)}, 5.0, {})
+    assert not any("temp" in str(one) for one in diagnose(tmp_path / "log.csv")["axes"]["gy"]["findings"])
+    with pytest.raises(UserError, match="column 'temp' does not change, or is a copy of an axis"):
+        response(tmp_path / "log.csv", input="temp", output="gy")
+
+
+def test_a_zero_byte_in_a_table_of_units(tmp_path: Path) -> None:
+    save(tmp_path / "log.csv", {"gy": ("deg/s", np.arange(9.0))}, 5.0, {})
+    (tmp_path / "units.csv").write_bytes(b"file,device\n\0,7\n")
+    with pytest.raises(UserError, match=r"units\.csv: not a table of units: a byte 0x00 is in it"):
+        fleet([tmp_path / "log.csv"], tmp_path / "f.csv", units_table=tmp_path / "units.csv")

@@ -74,4 +74,6 @@ def read_text(path: Path, most: int, otherwise: str) -> str:
         data = stream.read(most + 1)
         if len(data) > most:
             raise UserError(f"{path}: larger than {most} bytes")
+        if b"\0" in data:
+            raise ValueError("a byte 0x00 is in it")
         return data.decode("utf-8")

@@ -19,6 +19,8 @@ def read(path: Path, hints: Hints) -> list[Table]:
     """The tables of a log. Raises UserError and what the libraries raise."""
     if "dbc" not in hints:
         raise UserError(f"{path}: is a log of CAN frames: name the database of its signals with --dbc FILE.dbc")
+    if not Path(hints["dbc"]).is_file():
+        raise UserError(f"{hints['dbc']}: there is no such file, or it is a pipe or a device")
     import can
     import cantools
 

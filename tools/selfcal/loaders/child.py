@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.errors import UserError
+from selfcal.errors import UserError, printable
 from selfcal.limits import MOST_COLUMNS, MOST_NUMBERS, reading
 from selfcal.loaders import Format
 from selfcal.loaders.table import Hints, Table, of_arrays
@@ -168,7 +168,7 @@ def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[st
             raise ValueError(f"column '{name}' holds no numbers")
         arrays.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
         columns.append((name, array.dtype.str, array.shape))
-    return {"source": table.source, "columns": columns, "meta": dict(table.meta), "notes": list(table.notes)}
+    return {"source": printable(table.source), "columns": columns, "meta": dict(table.meta), "notes": list(table.notes)}
 
 
 def main() -> None:

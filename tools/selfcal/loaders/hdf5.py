@@ -35,7 +35,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         for name, dataset in datasets:
             if dataset.external or dataset.is_virtual:
                 raise UserError(f"{path}: dataset '{short(name)}' lies in other files: write it into this one")
-            if name == "meta" and dataset.size <= MOST_META_BYTES:
+            if name == "meta" and dataset.nbytes <= MOST_META_BYTES:
                 meta = _text(dataset)
                 continue
             if name.startswith("#refs#") or dataset.ndim not in (1, 2) or dataset.dtype.kind not in "iufV":

@@ -135,7 +135,11 @@ def _inputs(recording: Recording, record: Record, name: str) -> list[Input]:
         return [_about(Input(bridged(record.axes[name].y) + record.axes[name].level, record.axes[name].unit))]
     if name not in record.channel_names.values():
         known = name in dict(SIDE_CHANNELS.values())
-        reason = "does not change" if known else "is neither temp, nor supply, nor an axis of the model"
+        reason = (
+            "does not change, or is a copy of an axis"
+            if known
+            else "is neither temp, nor supply, nor an axis of the model"
+        )
         raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
     unit = recording.columns[name].unit
     values = units.convert(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
