@@ -278,8 +278,21 @@ def test_a_pipe_beside_a_log(tmp_path: Path, short: logs.Drawn) -> None:
     assert load(log).samples == short.t.size
     os.mkfifo(tmp_path / "pipe.csv")
     done = run("fleet", tmp_path / "pipe.csv", log, "-o", tmp_path / "f.csv", "--workers", "1", cwd=tmp_path)
+    assert f"{tmp_path / 'pipe.csv'}: is a pipe or a device: skipped" in done.stderr
     assert "Traceback" not in done.stderr
     assert (tmp_path / "f.csv").exists()
+
+
+@pytest.mark.usefixtures("forked")
+def test_a_hole_is_no_time(tmp_path: Path, short: logs.Drawn, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A log of a few KB with a terabyte of hole behind: it gets the time of a few KB, not of 50 days."""
+    monkeypatch.setattr(child, "_LEAST_S", 1.0)
+    log = logs.write_ulog(short, tmp_path)
+    os.truncate(log, 1 << 40)
+    begun = time.monotonic()
+    with pytest.raises(UserError, match=f"^{log}: "):
+        load(log)
+    assert time.monotonic() - begun < 30.0
 
 
 def slow_bag(path: Path, rows: int) -> Path:
