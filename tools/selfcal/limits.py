@@ -20,8 +20,8 @@ MOST_COLUMNS, LONGEST_HEADING = 1000, 256
 #: A text recording is read by as many bytes; no line is longer.
 BLOCK_BYTES = 1 << 22
 #: What a packed recording may unpack to, times its size: readings of a sensor pack to a twentieth at best. Of a text
-#: less, as a number of eight bytes has two there.
-MOST_GROWTH, MOST_TEXT_GROWTH = 200, 50
+#: less: a number of eight bytes has two there.
+MOST_GROWTH, MOST_TEXT_GROWTH = 200, 25
 #: Lines before the header of a text recording.
 MOST_LEADING_LINES = 1000
 #: Cells of these lines that are looked at for a known heading.

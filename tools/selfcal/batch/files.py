@@ -54,7 +54,8 @@ def matching(patterns: Sequence[str], own: Sequence[Path]) -> list[str]:
     """The files that the patterns name, each once, in the order of their names. A folder is one of ROS 2.
 
     `own`: outputs of this command, files or folders, which a pattern may match as well. They are no recordings.
-    A line names each link to nothing, pipe and device. It names a folder only where `patterns` names it, as a shell's pattern does.
+    A line names each link to nothing, pipe and device. It names a folder only where `patterns` names it, as a shell's
+    pattern does.
     Raises UserError for a pattern that matches none.
     """
     found: dict[str, None] = {}
