@@ -129,11 +129,13 @@ def test_a_tlog_in_bin_is_read(tmp_path: Path, short: logs.Drawn) -> None:
     assert recording.columns["gx"].values == pytest.approx(np.rint(short.gyro[:, 0] * 1e3) * 1e-3, abs=1e-3)
 
 
-@pytest.mark.parametrize("verb", [("identify", "--plot", "a.png"), ("fleet", "-o", "f.csv", "--workers", "1")])
+@pytest.mark.parametrize(
+    "verb", [("identify", "--axis", "gx", "--plot", "a.png"), ("fleet", "-o", "f.csv", "--workers", "1")]
+)
 def test_nothing_of_the_folder_is_run(verb: tuple[str, ...], tmp_path: Path) -> None:
     """A folder of logs that has Python modules and settings of matplotlib in it: the user who is there reads a log as
     elsewhere."""
-    log = logs.write_tdms(logs.Drawn(seconds=60.0, seed=6), tmp_path)
+    log = logs.write_tdms(logs.Drawn(seconds=30.0, seed=6), tmp_path)
     for module in ("numpy", "json", "nptdms", "selfcal", "evil", "sitecustomize"):
         (tmp_path / f"{module}.py").write_text("open('RUN', 'w').close()\n")
     (tmp_path / "matplotlibrc").write_text("text.usetex: True\nbackend: module://evil\n")
