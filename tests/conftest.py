@@ -170,7 +170,7 @@ def _multicast() -> bool:
 needs_multicast = pytest.mark.skipif(not _multicast(), reason="NO MULTICAST: ip route add 239.74.163.2 dev lo")
 
 
-def _forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
+def _forked(one: Format, path: Path, hints: Hints, answer: int) -> int:
     """As the product's child, without the start of a new Python and of the reader's library for each file."""
     for module in (f"selfcal.loaders.{one.module}", one.library):
         if module:
@@ -181,11 +181,11 @@ def _forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
         try:
             for stream in (1, 2):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-            child.answer(one.module, path, place, hints)
+            child.answer(one.module, path, hints, answer)
             code = 0
         finally:
             os._exit(code)
-    return _ended(number)
+    return number
 
 
 @pytest.fixture

@@ -161,7 +161,7 @@ class FrameLog:
                 if self._lines is not None
                 else McapFrames(self.path)
                 if suffix == ".mcap"
-                else can.LogReader(self.path)
+                else can.BLFReader(self.path)
             )
             self._frames: Iterator[can.Message] = iter(self._reader)
             self._waiting = self._next()

@@ -413,8 +413,9 @@ def _load(
             parts = [part for table in tables for part in _table_parts(path, rate, header, table, len(tables) > 1)]
         if not parts or (len(tables) > 1 and not any(part.axes for part in parts)):
             there = ", ".join(f"{one.source}: {', '.join(one.members)}" for one in tables)
+            why = next((f"; {one}" for table in tables for one in table.notes), "")
             raise UserError(
-                f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(there)}'; {_NAME_YOURS}"
+                f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(there)}'; {_NAME_YOURS}{why}"
             )
         if wanted and not any(part.source for part in parts):
             raise UserError(f"{path}: it has one source alone: leave --source out")
@@ -1024,10 +1025,7 @@ class _Text:
 
 def _meta_beside(path: Path) -> Mapping[str, Any]:
     beside = meta_place(path)
-    try:
-        return parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text"))
-    except (FileNotFoundError, NotADirectoryError):  # the latter in a zip
-        return {}
+    return parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text")) if beside.is_file() else {}
 
 
 def _table_parts(path: Path, rate: float | None, header: _Header, table: Table, several: bool) -> list[Part]:

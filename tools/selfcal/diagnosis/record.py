@@ -244,7 +244,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     for cause, (column, unit) in SIDE_CHANNELS.items():
         if column in recording.columns:
             values = recording.in_unit(column, unit)
-            if np.ptp(values) > 0.0:
+            if np.ptp(values) > 0.0 and _original(recording, column, tuple(states)) is None:
                 channels[cause] = bridged(on_grid(recording.clock, values)[0])
                 names[cause] = column
     return Record(
@@ -305,7 +305,7 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
 
 
 def _original(recording: Recording, name: str, others: Sequence[str]) -> str | None:
-    """The axis of `others` that this one is a copy of: no noise of its own."""
+    """The axis of `others` that this column is a copy of: no noise of its own."""
     own = np.diff(recording.columns[name].values)
     for other in others:
         theirs = np.diff(recording.columns[other].values)

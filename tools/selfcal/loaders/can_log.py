@@ -19,6 +19,8 @@ def read(path: Path, hints: Hints) -> list[Table]:
     """The tables of a log. Raises UserError and what the libraries raise."""
     if "dbc" not in hints:
         raise UserError(f"{path}: is a log of CAN frames: name the database of its signals with --dbc FILE.dbc")
+    if not Path(hints["dbc"]).is_file():
+        raise UserError(f"{hints['dbc']}: there is no such file, or it is a pipe or a device")
     import can
     import cantools
 
@@ -28,7 +30,9 @@ def read(path: Path, hints: Hints) -> list[Table]:
     messages = {one.frame_id: one for one in database.messages if not one.is_multiplexed()}
     stamps: dict[int, Any] = {}
     values: dict[int, Any] = {}
-    with can.LogReader(path) as log:
+    # can.LogReader takes more by a name: plug-ins, SQLite, MDF with its formulas
+    readers = {".asc": can.ASCReader, ".blf": can.BLFReader, ".csv": can.CSVReader, ".trc": can.TRCReader}
+    with readers.get(path.suffix.lower(), can.CanutilsLogReader)(path) as log:
         for frame in log:
             message = messages.get(frame.arbitration_id)
             if message is None or frame.is_remote_frame or frame.is_error_frame or len(frame.data) < message.length:

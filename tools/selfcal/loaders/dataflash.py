@@ -118,7 +118,8 @@ def _tlog(path: Path) -> Iterator[tuple[str, str, list[str], list[float]]]:
     """The same of a ground station's log."""
     from pymavlink import mavutil
 
-    log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega", notimestamps=False)
+    mavutil.set_dialect("ardupilotmega")
+    log = mavutil.mavmmaplog(str(path))  # mavlink_connection() takes devices, and runs programs, by the name
     ardupilot: set[int] = set()
     while (message := log.recv_match(type=["HEARTBEAT", *_TLOG])) is not None:
         kind, vehicle = message.get_type(), message.get_srcSystem()

@@ -16,6 +16,7 @@ from selfcal.limits import (
     BLOCK_BYTES,
     MOST_COLUMNS,
     MOST_GROWTH,
+    MOST_NUMBERS,
     MOST_UNPACKED_BYTES,
     MOST_UNPACKED_SMALL,
     reading,
@@ -82,6 +83,14 @@ def content(path: Path) -> bytes:
 def room(data: bytes) -> int:
     """Bytes that a whole file may unpack to."""
     return min(MOST_UNPACKED_BYTES, max(MOST_UNPACKED_SMALL, MOST_GROWTH * len(data)))
+
+
+def check_numbers(path: Path, numbers: int) -> None:
+    """Raise UserError for more numbers than are read, or than a packed file of this size may hold."""
+    if numbers > MOST_NUMBERS:
+        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts")
+    if 8 * numbers > max(MOST_UNPACKED_SMALL, MOST_GROWTH * path.stat().st_size):
+        raise UserError(f"{path}: unpacks to more than {MOST_GROWTH} times its size, as no sensor's readings do")
 
 
 def inflated(path: Path, inflater: Any, data: bytes, most: int, before: int = 0) -> bytes:

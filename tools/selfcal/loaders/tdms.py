@@ -24,7 +24,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
     clocks: dict[tuple[str, int], NDArray[Any]] = {}
     numbers = 0
-    with TdmsFile.open(path) as file:
+    with path.open("rb") as stream, TdmsFile.open(stream) as file:  # of a path it would read the _index beside it too
         for group in file.groups():
             for channel in group.channels():
                 numbers += len(channel)

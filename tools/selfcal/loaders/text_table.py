@@ -29,9 +29,9 @@ from selfcal.limits import (
     BLOCK_BYTES,
     LONGEST_HEADING,
     MOST_COLUMNS,
-    MOST_GROWTH,
     MOST_LEADING_LINES,
     MOST_NUMBERS,
+    MOST_TEXT_GROWTH,
     reading,
 )
 from selfcal.loaders.headings import RECEIVED
@@ -635,9 +635,9 @@ class _Lines:
                     self._text(self._carry)  # says so
                 raise UserError(f"{self.path}: line {self._next + 1}: longer than {BLOCK_BYTES:,} bytes")
             self._unpacked += len(block)
-            if self._packed and self._unpacked > MOST_GROWTH * self._packed + BLOCK_BYTES:
-                more = f"unpacks to more than {MOST_GROWTH} times its size"
-                raise UserError(f"{self.path}: {more}: no sensor's readings do")
+            if self._packed and self._unpacked > MOST_TEXT_GROWTH * self._packed + BLOCK_BYTES:
+                more = f"unpacks to more than {MOST_TEXT_GROWTH} times its size, as no sensor's readings do"
+                raise UserError(f"{self.path}: {more}: unpack it if you know it")
             if end:
                 lines = self._text(data[:end]).replace("\r\n", "\n").removesuffix("\n").split("\n")
                 if self.number == 0 == self._next:

@@ -32,7 +32,8 @@ def read(path: Path, _: Hints) -> list[Table]:
     """The tables of a ULog file. Raises UserError and what pyulog raises."""
     from pyulog import ULog
 
-    log = ULog(str(path), [*_SOURCES, "sensor_selection"])
+    with path.open("rb") as stream:
+        log = ULog(stream, [*_SOURCES, "sensor_selection"])
     found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
     order = list(_SOURCES)
     for one in sorted((one for one in log.data_list if one.name in _SOURCES), key=lambda one: order.index(one.name)):

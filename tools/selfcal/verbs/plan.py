@@ -31,7 +31,7 @@ from selfcal.document import check_writable, write_json
 from selfcal.errors import UserError, printable, short
 from selfcal.laws import PLACES, Law
 from selfcal.model import Model, Regressor
-from selfcal.plot import COLORS, check_picture, save_picture
+from selfcal.plot import COLORS, check_picture, plotter, save_picture
 from selfcal.regressors import coefficient_unit, offered
 from selfcal.result import HALF_90
 from selfcal.spread import Row, record_seeds, spread
@@ -380,13 +380,9 @@ def _half_interval(
 
 def _picture(document: Mapping[str, Any], path: Path | str) -> None:
     """What is reached over the length: median and middle four fifths of the records, and the wish."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot
-
     wishes = [wish for wish in document["wishes"] if wish["curve"]]
-    figure, panels = pyplot.subplots(len(wishes), 1, figsize=(7.0, 2.9 * len(wishes)), squeeze=False, sharex=True)
+    size = (7.0, 2.9 * len(wishes))
+    figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)
     for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
         hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
         q10, q50, q90 = (np.maximum([one[key] for one in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
