@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -24,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import units
-from selfcal.errors import UserError, note, short, shown
+from selfcal.errors import UserError, cell, note, short, shown
 from selfcal.limits import (
     LEAST_RATE_HZ,
     LONGEST_HEADING,
@@ -554,7 +555,7 @@ def save(
     n = len(next(iter(columns.values()))[1])
     stamps = np.arange(n) / rate_hz if t is None else t
     values = np.column_stack([stamps, *(values for _, values in columns.values())])
-    names = ",".join(["t[s]", *(f"{name}[{unit}]" for name, (unit, _) in columns.items())])
+    names = ",".join(["t[s]", *(re.sub('[,"]', "_", cell(f"{name}[{unit}]")) for name, (unit, _) in columns.items())])
     with together(path, meta_place(path)) as (table, beside):
         np.savetxt(table, values, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
         if meta is None:
