@@ -13,6 +13,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ import numpy as np
 from selfcal.errors import UserError
 from selfcal.limits import MOST_COLUMNS, MOST_NUMBERS, reading
 from selfcal.loaders import Format
+from selfcal.loaders.damage import Damaged, bytes_of
 from selfcal.loaders.table import Hints, Table, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
@@ -60,16 +62,11 @@ def _table(place: Path, number: int, entry: dict[str, Any]) -> Table:
         name: np.load(place / f"{number}.{column}.npy", allow_pickle=False)
         for column, name in enumerate(entry["names"])
     }
-    return of_arrays(entry["source"], arrays, entry["meta"], tuple(entry["notes"]))
-
-
-def _bytes(path: Path) -> int:
-    parts = path.iterdir() if path.is_dir() else [path]
-    return sum(part.stat().st_size for part in parts)
+    return of_arrays(entry["source"], arrays, entry["meta"], tuple(entry["notes"]), Damaged(**entry["damaged"]))
 
 
 def _seconds(path: Path) -> float:
-    return _LEAST_S + _S_PER_BYTE * _bytes(path)
+    return _LEAST_S + _S_PER_BYTE * bytes_of(path)
 
 
 def _spawned(one: Format, path: Path, hints: Hints, place: Path) -> int | None:
@@ -98,7 +95,7 @@ def _spawned(one: Format, path: Path, hints: Hints, place: Path) -> int | None:
 def answer(module: str, path: Path, place: Path, hints: Hints) -> None:
     """In the child: read, within the bounds, and write the answer into the folder `place`."""
     seconds = int(_seconds(path)) + 1
-    most = min(_MOST_BYTES, _LEAST_BYTES + _PER_BYTE * _bytes(path))
+    most = min(_MOST_BYTES, _LEAST_BYTES + _PER_BYTE * bytes_of(path))
     _bound(resource.RLIMIT_AS, most, most)
     _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
@@ -129,7 +126,13 @@ def _written(path: Path, place: Path, number: int, table: Table) -> dict[str, An
         if array.size > MOST_NUMBERS:
             raise UserError(f"{path}: {table.source}: more than {MOST_NUMBERS:,} numbers: cut it in parts")
         np.save(place / f"{number}.{column}.npy", array, allow_pickle=False)
-    return {"source": table.source, "names": list(table.members), "meta": dict(table.meta), "notes": list(table.notes)}
+    return {
+        "source": table.source,
+        "names": list(table.members),
+        "meta": dict(table.meta),
+        "notes": list(table.notes),
+        "damaged": asdict(table.damaged),
+    }
 
 
 def main() -> None:

@@ -16,7 +16,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     """The table of a file. Raises UserError and what pyarrow raises."""
     from pyarrow import parquet, types
 
-    file = parquet.ParquetFile(path)
+    file = parquet.ParquetFile(path, page_checksum_verification=True)
     schema = file.schema_arrow
     names = [
         field.name
