@@ -42,6 +42,16 @@ def remark(text: str) -> str:
     return f"{apart} " if apart.endswith("\\") else apart
 
 
+#: Where a spreadsheet would begin a formula: the first sign of a cell, or of one that a semicolon begins. Some programs
+#: pass by blanks, and take the wide forms of the signs.
+_FORMULA = re.compile(r"(^\s*|;)(?=[=+\-@\uff1d\uff0b\uff0d\uff20])")
+
+
+def cell(text: str) -> str:
+    """`text` from outside, for a cell of a CSV: one line that no spreadsheet takes for a formula."""
+    return _FORMULA.sub(r"\1'", printable(text))
+
+
 def short(text: str) -> str:
     """At most 60 printable characters of something found in a file."""
     clean = "".join(letter if letter.isprintable() else "?" for letter in text[:61])

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import units, written
-from selfcal.errors import UserError, note, short, shown
+from selfcal.errors import UserError, cell, note, short, shown
 from selfcal.limits import (
     LEAST_RATE_HZ,
     LONGEST_HEADING,
@@ -40,6 +40,7 @@ from selfcal.limits import (
 )
 from selfcal.loaders import WRITTEN, check_library, format_of
 from selfcal.loaders.child import tables_of
+from selfcal.loaders.damage import SOUND, Damaged, bytes_of
 from selfcal.loaders.headings import Meaning, Sensor, number_of, sensors_of, sides_of, split
 from selfcal.loaders.sources import Part, chosen
 from selfcal.loaders.table import Hints, Member, Table, parse_meta
@@ -110,6 +111,8 @@ class Recording:
     started_s: float | None = None
     since_power_on_s: float = 0.0
     notes: tuple[str, ...] = ()
+    #: What of the files could not be read.
+    damaged: Damaged = SOUND
     #: The files, where there are several: `path` has them all for messages.
     paths: tuple[Path, ...] = ()
     #: Options of the command line that it was read with, and their values, empty for a switch.
@@ -423,7 +426,12 @@ def _load(
         several = len(found) > 1
         recordings = [part.read(several, part in sides) for part in found]
     sound = [one for one in recordings if one is not None]
-    return [replace(sound[0], notes=(*notes, *sound[0].notes)), *sound[1:]]
+    damaged = sum((one.damaged for one in [*tables[:1], *sound]), SOUND)
+    if damaged:
+        damaged = replace(damaged, whole=damaged.whole or bytes_of(path))
+        notes[:0] = [damaged.words] if tables else []  # a text's lines have lines of their own
+    first = replace(sound[0], notes=(*notes, *sound[0].notes), damaged=damaged)
+    return [first, *(replace(one, damaged=SOUND) for one in sound[1:])]
 
 
 def _named(*names: str) -> str:
@@ -480,6 +488,7 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: _Header) 
         path=paths,
         columns=columns,
         notes=tuple(dict.fromkeys(notes)),
+        damaged=sum((one.damaged for one in found), SOUND),
         paths=tuple(files) if len(files) > 1 else (),
     )
 
@@ -565,7 +574,7 @@ def save(
     n = len(next(iter(columns.values()))[1])
     stamps = np.arange(n) / rate_hz if t is None else t
     values = np.column_stack([stamps, *(values for _, values in columns.values())])
-    names = ",".join(["t[s]", *(_SIGNS.sub("_", _heading(name, unit)) for name, (unit, _) in columns.items())])
+    names = ",".join(["t[s]", *(_SIGNS.sub("_", cell(_heading(name, unit))) for name, (unit, _) in columns.items())])
     with together(path, meta_place(path)) as (table, beside):
         if exact:
             _save_exact(table, names, values)
@@ -665,6 +674,7 @@ class _Header:
         #: The table is not alone: a column may be in another.
         self.several = False
         self.notes: list[str] = []
+        self.damaged = SOUND
         #: Heading of a column of dates that is not taken for the time.
         self.dated = ""
         #: Columns whose unit the user states, or scales.
@@ -681,6 +691,7 @@ class _Header:
         """The same for one of the file's parts."""
         one = copy(self)
         one.several, one.notes, one.without_unit, one.without_size = several, [], [], []
+        one.damaged = SOUND
         one.whole = set()
         return one
 
@@ -1003,6 +1014,7 @@ class _Text:
         if meta.get("rows", columns[0].size + table.skipped) != columns[0].size + table.skipped:
             what = f"{columns[0].size} rows where {meta_place(path).name} says {shown(meta['rows'])}"
             raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
+        header.damaged += table.damaged
         if table.skipped:
             one = table.skipped == 1
             header.notes.append(
@@ -1156,6 +1168,7 @@ def _checked(
         if kept.size < places.size:
             count, places = places.size - kept.size, places[kept]
             table[:] = [column[kept] for column in table]
+            header.damaged += Damaged(0, count)
             were = "s were" if count > 1 else " was"
             header.notes.append(f"{count} line{were} skipped for a damaged time stamp")
             fail_whole = fail
@@ -1370,6 +1383,7 @@ def _on_clocks(
         main.off_grid_s,
         started_s=started_s,
         notes=notes,
+        damaged=header.damaged,
     )
 
 

@@ -57,6 +57,15 @@ def _shape(one: Any) -> type:
     return Mapping if isinstance(one, type) and issubclass(one, Object) else one if isinstance(one, type) else object
 
 
+class Damaged(Object):
+    """What of the files could not be read: bytes, and the messages, frames or lines that they were, at least; and one
+    line that says it."""
+
+    bytes: int
+    messages: int
+    words: str
+
+
 class Recording(Object):
     """What was read. `start_s`: where in the recording its first sample is; `notes`: what was found in the file."""
 
@@ -69,6 +78,7 @@ class Recording(Object):
     paths: list[str] | None
     options: list[Any] | None
     notes: list[str] | None
+    damaged: Damaged | None
 
 
 class Posterior(Object):

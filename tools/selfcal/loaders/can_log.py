@@ -1,4 +1,4 @@
-"""Logs of CAN frames by python-can, decoded by cantools with the database of `--dbc`: a table a message.
+"""Logs of CAN frames by framelog.py, decoded by cantools with the database of `--dbc`: a table a message.
 
 Signals are columns by their names and units. Stamps are the adapter's.
 """
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.errors import UserError
+from selfcal.framelog import FrameLog
 from selfcal.loaders.table import Hints, Table, of_arrays
 
 
@@ -21,7 +22,6 @@ def read(path: Path, hints: Hints) -> list[Table]:
         raise UserError(f"{path}: is a log of CAN frames: name the database of its signals with --dbc FILE.dbc")
     if not Path(hints["dbc"]).is_file():
         raise UserError(f"{hints['dbc']}: there is no such file, or it is a pipe or a device")
-    import can
     import cantools
 
     database = cantools.database.load_file(hints["dbc"], strict=False)
@@ -30,10 +30,8 @@ def read(path: Path, hints: Hints) -> list[Table]:
     messages = {one.frame_id: one for one in database.messages if not one.is_multiplexed()}
     stamps: dict[int, Any] = {}
     values: dict[int, Any] = {}
-    # can.LogReader takes more by a name: plug-ins, SQLite, MDF with its formulas
-    readers = {".asc": can.ASCReader, ".blf": can.BLFReader, ".csv": can.CSVReader, ".trc": can.TRCReader}
-    with readers.get(path.suffix.lower(), can.CanutilsLogReader)(path) as log:
-        for frame in log:
+    with FrameLog(path) as log:
+        while (frame := log.recv(0.0)) is not None:
             message = messages.get(frame.arbitration_id)
             if message is None or frame.is_remote_frame or frame.is_error_frame or len(frame.data) < message.length:
                 continue
@@ -52,5 +50,5 @@ def read(path: Path, hints: Hints) -> list[Table]:
         columns = {"t[s]": np.array(times)}
         for place, signal in enumerate(message.signals):
             columns[f"{signal.name}[{signal.unit}]" if signal.unit else signal.name] = rows[:, place]
-        tables.append(of_arrays(message.name, columns))
+        tables.append(of_arrays(message.name, columns, damaged=log.damaged))
     return tables

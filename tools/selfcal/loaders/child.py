@@ -17,6 +17,7 @@ import struct
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 from selfcal.errors import UserError, printable
 from selfcal.limits import MOST_COLUMNS, MOST_NUMBERS, reading
 from selfcal.loaders import Format
+from selfcal.loaders.damage import Damaged
 from selfcal.loaders.table import Hints, Table, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
@@ -85,7 +87,7 @@ def _answered(pipe: int, ends: float) -> list[Table]:
             dtype = np.dtype(kind)
             data = _received(pipe, math.prod(shape) * dtype.itemsize, ends)
             arrays[name] = np.frombuffer(data, dtype).reshape(shape)
-        tables.append(of_arrays(one["source"], arrays, one["meta"], tuple(one["notes"])))
+        tables.append(of_arrays(one["source"], arrays, one["meta"], tuple(one["notes"]), Damaged(**one["damaged"])))
     return tables
 
 
@@ -169,7 +171,13 @@ def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[st
             raise ValueError(f"column '{name}' holds no numbers")
         arrays.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
         columns.append((name, array.dtype.str, array.shape))
-    return {"source": printable(table.source), "columns": columns, "meta": dict(table.meta), "notes": list(table.notes)}
+    return {
+        "source": printable(table.source),
+        "columns": columns,
+        "meta": dict(table.meta),
+        "notes": list(table.notes),
+        "damaged": asdict(table.damaged),
+    }
 
 
 def main() -> None:

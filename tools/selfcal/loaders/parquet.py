@@ -17,7 +17,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     from pyarrow import parquet, types
 
     with path.open("rb") as stream:  # a name may be a URI
-        file = parquet.ParquetFile(stream)
+        file = parquet.ParquetFile(stream, page_checksum_verification=True)
         schema = file.schema_arrow
         names = [
             field.name

@@ -21,6 +21,7 @@ from selfcal.limits import (
     MOST_UNPACKED_SMALL,
     reading,
 )
+from selfcal.loaders.damage import SOUND, Damaged
 
 #: What the user states beside the file: `dbc`, the path of a CAN database.
 Hints = Mapping[str, str]
@@ -40,20 +41,25 @@ class Table:
     """Columns of one clock. `members` by heading: `name[unit]`, or a plain name whose unit `meta` has.
 
     `source`: the topic, message or group that it is, empty where a file has no parts. `notes`: what a reader of the
-    results must know of it.
+    results must know of it. `damaged`: what of the whole file could not be read.
     """
 
     source: str
     members: Mapping[str, Member]
     meta: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    damaged: Damaged = SOUND
 
 
 def of_arrays(
-    source: str, arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any] | None = None, notes: tuple[str, ...] = ()
+    source: str,
+    arrays: Mapping[str, NDArray[Any]],
+    meta: Mapping[str, Any] | None = None,
+    notes: tuple[str, ...] = (),
+    damaged: Damaged = SOUND,
 ) -> Table:
     """The table of arrays [n] that are in memory."""
-    return Table(source, {name: in_memory(array) for name, array in arrays.items()}, meta or {}, notes)
+    return Table(source, {name: in_memory(array) for name, array in arrays.items()}, meta or {}, notes, damaged)
 
 
 def in_memory(array: NDArray[Any]) -> Member:

@@ -19,7 +19,7 @@ from selfcal.ending import held
 from selfcal.errors import UserError
 from selfcal.framelog import FrameLog, FrameWriter, check_suffix
 from selfcal.known_models import KnownModels
-from selfcal.live import SILENT_S, Contact, View
+from selfcal.live import SILENT_S, Contact, View, patient
 from selfcal.plot import check_picture, plot_run
 from selfcal.streams import check as check_stream
 from selfcal.streams import content, open_streams
@@ -121,7 +121,7 @@ def monitor(
     streams = Streams(node=node)
     contacts: dict[int, Contact] = {}
     histories: dict[int, dict[str, list[AxisReport]]] = {}
-    with held() as ending, ExitStack() as stack:
+    with held() as ending, patient(), ExitStack() as stack:
         source: Link | FrameLog
         if channel is None:
             source = stack.enter_context(FrameLog(name, speed))

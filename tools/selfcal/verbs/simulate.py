@@ -20,6 +20,7 @@ from selfcal.laws import NAMED, PARAMETERS, PLACES, Law
 from selfcal.model import Group, Model
 from selfcal.one_over_f import FLICKER, beside_its_law
 from selfcal.output import check_place
+from selfcal.spread import checked_seed
 from selfcal.tables import bank_block
 
 #: Readings, samples times axes, of a recording, which is made in memory: 4 GB.
@@ -42,8 +43,7 @@ def simulate(
     """
     model = Model.load(model_path)
     check_place(output)
-    if not 0 <= seed < 2**64:
-        raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {seed}")
+    checked_seed(seed)
     scene = _scene(model, seed)
     scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
     truth = truth_of(model, seed)
