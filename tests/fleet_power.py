@@ -45,7 +45,7 @@ KINDS = {
     "gauss_markov": ("N", "sigma_m", "bias", "step", "temperature"),
 }
 #: Natural logarithm of the factor of an odd unit, spreads of its bias, nats of another law, deg/s of a step.
-FACTOR = {"N": math.log(1.5), "K": math.log(2.5), "sigma_m": math.log(2.5)}
+FACTOR = {"N": math.log(1.5), "K": math.log(2.5), "sigma_m": math.log(2.5), "group": math.log(1.6)}
 SPREADS, NATS, STEP = 6.0, 20.0, 0.2
 #: Standard deviations beyond its limit from which on the oracle names a unit in 99 % of draws.
 SURE = float(ndtri(0.99))
@@ -99,7 +99,7 @@ def unit_of(random: np.random.Generator, batch: Drawn, k: int, kind: str) -> Uni
     """The k-th unit, with its fault."""
     own = {name: middle + spread * random.standard_normal() for name, (middle, spread) in batch.truth.items()}
     if kind in FACTOR:
-        own[kind] += FACTOR[kind]
+        own["N" if kind == "group" else kind] += FACTOR[kind]
     if kind == "bias":
         own[kind] += SPREADS * batch.truth["bias"][1] * random.choice((-1.0, 1.0))
     if kind == "temperature":
@@ -125,8 +125,8 @@ def behind(axis: dict[str, Any], law: str) -> float:
     return float(max(axis["log_evidence"].values()) - axis["log_evidence"][law])
 
 
-def drawn(random: np.random.Generator, size: int) -> Drawn:
-    """A batch."""
+def drawn(random: np.random.Generator, size: int, *, two_groups: bool = False) -> Drawn:
+    """A batch; with `two_groups` a third to a half of its units has N times 1.6, and no other is odd."""
     law = str(random.choice(list(KINDS)))
     batch = Drawn(law, int(random.choice(SECONDS)))
     batch.truth = {
@@ -141,6 +141,9 @@ def drawn(random: np.random.Generator, size: int) -> Drawn:
         batch.truth["alpha"] = math.log(0.02), random.uniform(0.05, 0.15)
     places = random.permutation(size)[: random.integers(7)]
     batch.odd = {int(k): str(random.choice(KINDS[law])) for k in places}
+    if two_groups:
+        share = random.uniform(1.0 / 3.0, 0.5)
+        batch.odd = {int(k): "group" for k in random.permutation(size)[: round(share * size)]}
     batch.units = [unit_of(random, batch, k, batch.odd.get(k, "")) for k in range(size)]
     return batch
 
@@ -195,6 +198,22 @@ def study(model: Model, size: int, batches: int, seed: int, *, verbose: bool = F
     return counts, false
 
 
+def groups_named(model: Model, size: int, batches: int, seed: int) -> tuple[int, int]:
+    """Batches of two groups that are said to be, each member right or listed as odd by itself; and those where at least
+    one unit of the smaller group is named."""
+    random = np.random.default_rng([seed, size, 2])
+    whole = some = 0
+    for _ in range(batches):
+        batch = drawn(random, size, two_groups=True)
+        found = summed_up(batch.units, model)
+        (heap,) = [one.members for of in found.populations for one in of.apart if one.quantity == "gx.N"] or [()]
+        named = {int(name[1:]) for name in found.unlike} | set(heap)
+        others = set(range(size)) - set(batch.odd)
+        whole += named in (set(batch.odd), others)
+        some += bool(named)
+    return whole, some
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--batches", type=int, default=200)
@@ -209,6 +228,8 @@ def main() -> None:
         for kind, (odd, named, sure, ideal, hit) in [*counts.items(), ("all", np.sum(list(counts.values()), axis=0))]:
             share = f"{100.0 * hit / sure:.1f} %" if sure else ""
             print(f"{kind:12} {odd:3} {named:5} {sure:6} {ideal:9} {hit:5}  {share}", flush=True)
+        whole, some = groups_named(model_of(), size, few := max(1, options.batches // 4), options.seed)
+        print(f"two groups: of {few} batches {whole} with each member, {some} with a name")
 
 
 if __name__ == "__main__":

@@ -46,8 +46,8 @@ _ORDINARY = 0.01
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
 #: Rounds of fit and choice at most.
 _ROUNDS = 20
-#: Nats by which two heaps must be better than one: 1 in 1000 normal batches of 6 to 300 units has 6.3.
-_HEAPS = 7.0
+#: Nats by which two heaps must be better than one: 1 in 1000 normal batches of 8 to 24 units has so many, fewer larger.
+_HEAPS = 8.0
 #: Distance of two heaps in standard deviations of a unit: nearer ones, as of a uniform population, share units.
 _BETWEEN = 4.5
 
