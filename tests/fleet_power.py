@@ -206,8 +206,8 @@ def groups_named(model: Model, size: int, batches: int, seed: int) -> tuple[int,
     for _ in range(batches):
         batch = drawn(random, size, two_groups=True)
         found = summed_up(batch.units, model)
-        (heap,) = [one.members for of in found.populations for one in of.apart if one.quantity == "gx.N"] or [()]
-        named = {int(name[1:]) for name in found.unlike} | set(heap)
+        (split,) = [one.members for of in found.populations for one in of.apart if one.quantity == "gx.N"] or [()]
+        named = {int(name[1:]) for name in found.unlike} | set(split)
         others = set(range(size)) - set(batch.odd)
         whole += named in (set(batch.odd), others)
         some += bool(named)

@@ -20,7 +20,7 @@ from fleet_power import model_of, study
 from numpy.typing import NDArray
 
 from selfcal.batch.drift import Series, drifts_of
-from selfcal.batch.population import FALSE_ALARM, FALSE_NAME, HEAPS, Measured, Population, populations
+from selfcal.batch.population import FALSE_ALARM, FALSE_NAME, TWO_GROUPS, Measured, Population, populations
 from selfcal.batch.summary import apart_words, seen_from_words
 from selfcal.engines.library import Bank
 from selfcal.model import DEFAULT, Model, read_yaml
@@ -263,7 +263,7 @@ def test_two_groups_without_a_label_are_named() -> None:
         [drawn(random, 18, 0.07, 0.02, name="gz.N", add=add)], [("lot", ["ab"[k % 2] for k in range(18)])]
     )
     (apart,) = found.apart
-    assert apart.kind == HEAPS and not found.unlike and found.kept.all()
+    assert apart.kind == TWO_GROUPS and not found.unlike and found.kept.all()
     # either half may be the smaller one where they are equal
     others = sorted(set(range(18)) - set(inside.tolist()))
     assert list(apart.members) in (sorted(inside.tolist()), others)

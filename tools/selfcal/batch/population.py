@@ -12,7 +12,7 @@ the median are odd if the nearest of them is unlike the population of all others
 other. A unit that is odd in one quantity of an axis is in no population of that axis.
 A group is a station, a day or a lot whose units all differ by one amount: the group's own, not the parts'. Of two
 groups alone nobody can say which is off: each is then half the difference away from the mean. Units that lie in two
-heaps are two groups without a label.
+groups are two groups without a label.
 """
 
 from __future__ import annotations
@@ -46,9 +46,9 @@ _ORDINARY = 0.01
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
 #: Rounds of fit and choice at most.
 _ROUNDS = 20
-#: Nats by which two heaps must be better than one: 1 in 1000 normal batches of 8 to 24 units has so many, fewer larger.
-_HEAPS = 8.0
-#: Distance of two heaps in standard deviations of a unit: nearer ones, as of a uniform population, share units.
+#: Nats by which two groups must be better than one: 1 in 1000 normal batches of 8 to 24 units has so many.
+_SPLIT = 8.0
+#: Distance of two groups in standard deviations of a unit: nearer ones, as of a uniform population, share units.
 _BETWEEN = 4.5
 
 
@@ -209,7 +209,7 @@ def robust(y: Array, s: Array) -> tuple[float, float]:
 
 
 #: The kind of a group that has no label.
-HEAPS = "two groups"
+TWO_GROUPS = "two groups"
 #: A grouping: its kind, and for each unit the name of its group, "" for none.
 Grouping = tuple[str, Sequence[str]]
 
@@ -223,14 +223,9 @@ def populations(
     quantities, FALSE_ALARM among all groups and quantities."""
     tested = [one for one in measured if one.y.size >= FEWEST]
     limit = math.log(FALSE_NAME / max(1, sum(one.y.size for one in tested)))
-    groups = {
-        frozenset(inside)
-        for _, names in groupings
-        for name in set(names) - {""}
-        if (inside := [k for k, own in enumerate(names) if own == name]) and _groups(len(inside), len(names))
-    }
+    groups = _groups(groupings)
     group_limit = math.log(FALSE_ALARM / max(1, len(groups) * len(tested)))
-    groups_of = {one.name: _apart(one, groupings, limit, group_limit) for one in tested}
+    groups_of = {one.name: _apart(one, groups, limit, group_limit) for one in tested}
     found: dict[str, Population] = {}
     for _ in range(_ROUNDS):
         before = {name: {one.at for one in of.unlike} for name, of in found.items()}
@@ -246,22 +241,39 @@ def populations(
     return list(found.values())
 
 
-def _groups(inside: int, units: int) -> bool:
+def _is_group(inside: int, units: int) -> bool:
     """Whether so many of the units are a group beside the others: not the larger part, and neither too few."""
     return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
 
 
-def _apart(one: Measured, groupings: Sequence[Grouping], limit: float, group_limit: float) -> list[Apart]:
+#: Groups that a test can tell, by the places of their units: kind, name and the only other name of each.
+Groups = Mapping[tuple[int, ...], Sequence[tuple[str, str, str | None]]]
+
+
+def _groups(groupings: Sequence[Grouping]) -> Groups:
+    found: dict[tuple[int, ...], list[tuple[str, str, str | None]]] = {}
+    for kind, names in groupings:
+        members: dict[str, list[int]] = {}
+        for at, name in enumerate(names):
+            members.setdefault(name, []).append(at)
+        for name, inside in members.items():
+            if name and _is_group(len(inside), len(names)):
+                against = next(other for other in members if other != name) if len(members) == 2 else None
+                found.setdefault(tuple(inside), []).append((kind, name, against))
+    return found
+
+
+def _apart(one: Measured, groups: Groups, limit: float, group_limit: float) -> list[Apart]:
     """The groups of a quantity that differ, the one that differs most first."""
     apart: list[Apart] = []
-    offset = np.zeros(one.y.size)
+    y = one.y.copy()
     for _ in range(_ROUNDS):
-        known = {(group.kind, group.name) for group in apart}
-        found = _most_apart(one, offset, groupings, known, limit, group_limit)
+        left = {members: labels for members, labels in groups.items() if members not in {of.members for of in apart}}
+        found = _most_apart(one, y, left, limit, group_limit)
         if found is None:
             break
         apart.append(found)
-        offset += found.shift(one.at)
+        y -= found.shift(one.at)
     return apart
 
 
@@ -277,10 +289,10 @@ def _population(one: Measured, apart: Sequence[Apart], others: Set[int], limit: 
         own |= fit(centred[own], one.s[own]).log_p(centred, one.s) > math.log(_ORDINARY)
         kept = own.copy()
         kept[own] = _kept(centred[own], one.s[own], limit)
-        heap = None if apart and apart[-1].kind == HEAPS else _heap(one, centred, kept)
-        if heap is None:
+        split = None if apart and apart[-1].kind == TWO_GROUPS else _split(one, centred, kept)
+        if split is None:
             break
-        apart.append(heap)
+        apart.append(split)
     population = fit(centred[kept], one.s[kept])
     log_p = population.log_p(centred, one.s)
     off = centred - population.middle.median
@@ -318,17 +330,17 @@ def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
     return np.ones(y.size, np.bool_)
 
 
-def _heap(one: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
-    """The smaller of two heaps in which the units lie, if two are better than one by _HEAPS.
+def _split(one: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
+    """The smaller of two groups in which the units lie, if two are better than one by _SPLIT.
 
-    Each cut of the sorted units gives two normals of one spread. Their likelihood counts a unit's heap as drawn."""
+    Each cut of the sorted units gives two normals of one spread. Their likelihood counts the group of a unit as drawn."""
     order = np.flatnonzero(kept)[np.argsort(y[kept])]
-    n = order.size
+    x, s, n = y[order] - y[kept].mean(), one.s[order], order.size
     if n < 2 * FEWEST_OF_GROUP:
         return None
-    spread = float(np.std(y[order])) * np.geomspace(0.03, 3.0, _POINTS)
-    w = 1.0 / (spread[:, None] ** 2 + one.s[order] ** 2)
-    sums = np.stack([np.cumsum(w * y[order] ** power, axis=1) for power in range(3)])
+    spread = float(np.std(x)) * np.geomspace(0.03, 3.0, _POINTS)
+    w = 1.0 / (spread[:, None] ** 2 + s**2)
+    sums = np.stack([np.cumsum(w * x**power, axis=1) for power in range(3)])
     low, whole = sums[..., FEWEST_OF_GROUP - 1 : n - FEWEST_OF_GROUP], sums[..., -1:]
     squares = [part[2] - part[1] ** 2 / part[0] for part in (low, whole - low, whole)]
     ln = 0.5 * np.log(w).sum(axis=1)
@@ -337,48 +349,36 @@ def _heap(one: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
     gain = two.max(axis=0) - (ln - 0.5 * squares[2][:, 0]).max()
     gain += below * np.log(below / n) + (n - below) * np.log1p(-below / n)
     cut = int(np.argmax(gain))
-    variance = spread[np.argmax(two[:, cut])] ** 2 + float(np.median(one.s)) ** 2
-    heaps = order[: below[cut]], order[below[cut] :]
-    apart = float(np.mean(y[heaps[1]]) - np.mean(y[heaps[0]]))
-    if gain[cut] < _HEAPS or apart < _BETWEEN * math.sqrt(variance):
+    low_ones = int(below[cut])
+    apart = float(np.mean(x[low_ones:]) - np.mean(x[:low_ones]))
+    unit = math.hypot(spread[np.argmax(two[:, cut])], float(np.median(s)))
+    if gain[cut] < _SPLIT or apart < _BETWEEN * unit:
         return None
-    small = int(heaps[1].size < heaps[0].size)
-    members = tuple(sorted(one.at[heaps[small]].tolist()))
-    return Apart(HEAPS, "", one.name, apart if small else -apart, -float(gain[cut]), members, against="")
+    smaller, off = (order[low_ones:], apart) if 2 * low_ones > n else (order[:low_ones], -apart)
+    members = tuple(sorted(one.at[smaller].tolist()))
+    return Apart(TWO_GROUPS, "", one.name, off, -float(gain[cut]), members, against="")
 
 
-def _most_apart(
-    one: Measured,
-    offset: Array,
-    groupings: Sequence[Grouping],
-    known: Set[tuple[str, str]],
-    limit: float,
-    group_limit: float,
-) -> Apart | None:
-    """The group that differs most from the others, None without one beyond ln probability `group_limit`.
+def _most_apart(one: Measured, y: Array, groups: Groups, limit: float, group_limit: float) -> Apart | None:
+    """The group that differs most from the others, None without one beyond ln probability `group_limit`. `y` [n]: the
+    units without the groups that are known.
 
     Medians, which a few odd units move little, choose; the exact test of the units without odd ones decides. Medians
     see less: half the logarithm of the probability makes a candidate."""
-    centred = one.y - offset
-    same: dict[bytes, list[str]] = {}
-    candidates: list[tuple[float, str, str, NDArray[np.bool_], str | None]] = []
-    for kind, names in groupings:
-        there = dict.fromkeys(names[at] for at in one.at.tolist())
-        for name in there:
-            inside = np.array([names[at] == name for at in one.at.tolist()])
-            if not name or (kind, name) in known or not _groups(int(inside.sum()), inside.size):
-                continue
-            others = [other for other in there if other != name]
-            same.setdefault(inside.tobytes(), []).append(f"{kind} {name}")
-            against = others[0] if len(others) == 1 else None
-            candidates.append((_by_medians(centred, one.s, inside), kind, name, inside, against))
-    for log_p, kind, name, inside, against in sorted(candidates, key=lambda candidate: candidate[0]):
-        if log_p > 0.5 * group_limit:
+    inside_of = {members: np.isin(one.at, members) for members in groups}
+    log_p = {
+        members: _by_medians(y, one.s, inside)
+        for members, inside in inside_of.items()
+        if _is_group(int(inside.sum()), inside.size)
+    }
+    for members in sorted(log_p, key=lambda members: log_p[members]):
+        if log_p[members] > 0.5 * group_limit:
             break
-        difference, exact = _difference(centred, one.s, inside, limit)
+        difference, exact = _difference(y, one.s, inside_of[members], limit)
         if exact <= group_limit:
-            also = [other for other in same[inside.tobytes()] if other != f"{kind} {name}"]
-            return Apart(kind, name, one.name, difference, exact, tuple(one.at[inside].tolist()), tuple(also), against)
+            (kind, name, against), *others = groups[members]
+            also = tuple(f"{kind} {name}" for kind, name, _ in others)
+            return Apart(kind, name, one.name, difference, exact, members, also, against)
     return None
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 
 from selfcal import units
-from selfcal.batch.population import HEAPS, Population
+from selfcal.batch.population import TWO_GROUPS, Population
 from selfcal.batch.summary import Batch, axes_of, sound_of
 from selfcal.errors import UserError
 from selfcal.model import LOG_NORMAL_SD, Model, Prior, read_yaml
@@ -88,7 +88,7 @@ def _of_lots(population: Population, batch: Batch) -> np.ndarray:
     """By how much each unit [n] is off for its lot, or for the one of two groups: its own, unlike a station's part."""
     shift = np.zeros(population.measured.at.size)
     for apart in population.apart:
-        if apart.kind in ("lot", HEAPS) or any(name.startswith("lot ") for name in apart.also):
+        if apart.kind in ("lot", TWO_GROUPS) or any(name.startswith("lot ") for name in apart.also):
             shift += apart.shift(population.measured.at)
     return shift
 

@@ -16,8 +16,8 @@ from selfcal.batch.population import (
     FALSE_ALARM,
     FEWEST,
     FEWEST_OF_GROUP,
-    HEAPS,
     MOST_ODD,
+    TWO_GROUPS,
     Apart,
     Grouping,
     Interval,
@@ -425,9 +425,11 @@ def plain(measured: Measured, of: Interval) -> Interval:
     return of.through(math.exp) if measured.logarithm else of
 
 
-def _blind(population: Population) -> bool:
-    """Whether no unit can be so far off that it is named."""
-    return population.measured.logarithm and population.seen_from > math.log(MOST_TIMES)
+def _seen_from(population: Population) -> float | None:
+    """How far off a unit must be to be unlike, a factor or in the unit; None: no part is as far off."""
+    if not population.measured.logarithm:
+        return population.seen_from
+    return math.exp(population.seen_from) if population.seen_from <= math.log(MOST_TIMES) else None
 
 
 def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
@@ -439,13 +441,7 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
         "of": "ln" if measured.logarithm else "value",
         "middle": vars(plain(measured, population.fit.middle)),
         "spread": vars(population.fit.spread),
-        "unlike_from": (
-            None
-            if _blind(population)
-            else math.exp(population.seen_from)
-            if measured.logarithm
-            else population.seen_from
-        ),
+        "unlike_from": _seen_from(population),
         "left_out": [names[at] for at in measured.at[~population.kept].tolist()],
         "apart": [{**vars(one), "members": [names[at] for at in one.members]} for one in population.apart],
     }
@@ -494,10 +490,10 @@ def unidentified_lines(batch: Batch) -> Iterator[str]:
 
 def seen_from_words(population: Population) -> str:
     """How far off a unit must be to be unlike."""
-    measured, off = population.measured, population.seen_from
-    if _blind(population):
+    measured, off = population.measured, _seen_from(population)
+    if off is None:
         return f"more than {MOST_TIMES:.0f} times: too few units, or too short recordings"
-    return f"{math.exp(off):.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
+    return f"{off:.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
 
 
 def _drift_words(one: Drift) -> str:
@@ -511,7 +507,7 @@ def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> 
     how = f"{math.exp(apart.offset):.3g} times" if measured.logarithm else f"{apart.offset:+.3g} {measured.unit} from"
     if apart.against is None:
         return f"{measured.name} is {how} the other units', {sd_of(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
-    if apart.kind == HEAPS:
+    if apart.kind == TWO_GROUPS:
         of = _some([names[at] for at in apart.members])
         return f"{measured.name} of {of} is {how} the others': no column of the batch explains it"
     other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
