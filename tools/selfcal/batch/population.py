@@ -9,10 +9,10 @@ m has a flat prior and is integrated out in closed form. t has Jeffreys' prior, 
 So a few units give tails as Student's: "far off" means the same in a batch of 5 as in one of 500.
 Odd units are found by the generalized test of extremes (Rosner, Technometrics 25, 1983): the k that are farthest from
 the median are odd if the nearest of them is unlike the population of all others. So several odd units do not hide each
-other. A unit that is odd in one quantity of an axis is in no population of that axis.
+other. A unit that is odd in one quantity of an axis counts in another one of the axis only where it is ordinary.
 A group is a station, a day or a lot whose units all differ by one amount: the group's own, not the parts'. Of two
-groups alone nobody can say which is off: each is then half the difference away from the mean. Units that lie in two
-groups are two groups without a label.
+groups alone nobody can say which is off: each is then half the difference away from the mean. Two groups need no label
+where two normals fit the units better than one.
 """
 
 from __future__ import annotations
@@ -333,7 +333,7 @@ def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
 def _split(one: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
     """The smaller of two groups in which the units lie, if two are better than one by _SPLIT.
 
-    Each cut of the sorted units gives two normals of one spread. Their likelihood counts the group of a unit as drawn."""
+    Each cut of the sorted units gives two normals of one spread. Their likelihood counts each unit's group as drawn."""
     order = np.flatnonzero(kept)[np.argsort(y[kept])]
     x, s, n = y[order] - y[kept].mean(), one.s[order], order.size
     if n < 2 * FEWEST_OF_GROUP:
