@@ -215,6 +215,7 @@ def test_forms_of_one_channel_are_one_finding() -> None:
 @pytest.mark.parametrize("kind", ["lag", "square", "filtered"])
 def test_the_written_model_carries_over(kind: str, tmp_path: Path) -> None:
     """The model of one record gains, on a second one of the same truth, half of what it gained on the first or more.
+    With it the first record shows the channel no more.
 
     Both hold about as much: the temperature is cycled alike."""
     effect, *_ = KINDS[kind]
@@ -228,6 +229,9 @@ def test_the_written_model_carries_over(kind: str, tmp_path: Path) -> None:
             log = drawn.write(tmp_path / f"{number}.csv")
             if number == 0:
                 diagnose(log, axes=["gx"], write_model=tmp_path / "model.yaml")
+                again = diagnose(log, axes=["gx"], model=tmp_path / "model.yaml", write_model=tmp_path / "again.yaml")
+                assert "temperature" not in {one["cause"] for one in again["axes"]["gx"]["findings"]}
+                assert "temperature:" in (tmp_path / "again.yaml").read_text(encoding="utf-8")
             evidence = [
                 max(identify(log, axes=["gx"], model=model)["axes"]["gx"]["log_evidence"].values())
                 for model in (None, tmp_path / "model.yaml")
