@@ -104,8 +104,12 @@ def diagnose(
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)
         if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
-            first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
-            _show_first(recording, first, [name for name in names if name in record.axes], ending)
+            means = None
+            with suppress(UserError):  # a recording that is too short for means is looked at once
+                means = of_recording(recording, loaded, FIRST_HZ, names)
+            if means is not None:
+                first = _look(means, names, ending, doing)
+                _show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = _look(record, names, ending, doing) if not ending.asked else {}
         looked = {
             name: first.get(name)
