@@ -131,7 +131,8 @@ class Cause:
     law          adds a law to a model file's tree without which N is wrong: `identify` reports by it.
     extend       writes what is no column into the model file.
     of_column    keys of `--effect` for columns of the model file: the first one and the coefficients of all.
-    of_estimate  keys of `--effect` for a finding; None: the simulator cannot make it.
+    of_estimate  keys of `--effect` for a finding where they are not the medians of its estimate; None, or none of them:
+                 the simulator cannot make it.
     keys         keys of `simulate --effect`; empty: it cannot be simulated.
     follows      the effect follows another axis: the key `other`.
     common       the effect is of the whole recording and has no axis.
@@ -170,6 +171,12 @@ class Cause:
     common: bool = False
     add: Callable[[Mapping[str, Any], Channels], Array] | None = None
     spoil: Callable[[Array, Mapping[str, Any], float, float, Random], None] | None = None
+
+    def effect(self, look: Look) -> dict[str, Any] | None:
+        """Keys of `--effect` for a finding; None: the simulator cannot make it."""
+        if self.of_estimate is not None:
+            return self.of_estimate(look)
+        return {key: value for key, value in medians(look).items() if key in self.keys} or None
 
     @property
     def several(self) -> bool:

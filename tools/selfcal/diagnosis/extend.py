@@ -273,7 +273,7 @@ def _of_findings(one: Diagnosed) -> Iterator[_Effect]:
     """Of the findings. The lattice and the range are in the groups."""
     for finding in one.findings:
         cause = CAUSES[finding.look.cause]
-        keys = cause.of_estimate(finding.look) if cause.of_estimate is not None else None
+        keys = cause.effect(finding.look)
         if keys is not None:
             channel = _channel_of(finding.columns[0]) if finding.columns else ()
             yield _Effect(cause, finding.look.gain, keys, channel)

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.cause import Cause, Extension, Key, shown
 from selfcal.diagnosis.causes import quantization_noise
 from selfcal.diagnosis.fit import Fit, best, fit, moved
 from selfcal.diagnosis.model_tree import add_law, digits
@@ -88,6 +88,5 @@ CAUSE = Cause(
     pictures=shown("correlation"),
     least=_least,
     extend=_extend,
-    of_estimate=medians,
     keys={"lag1": Key(lambda s: 0.5, "noise_lag1", lambda v: -1.0 < v < 1.0, "between -1 and 1")},
 )

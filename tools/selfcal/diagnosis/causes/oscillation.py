@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Channels, Extension, Key, medians, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Extension, Key, positive, shown
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.fit import Fit, Series, best, fit, ln_likelihood, run
 from selfcal.diagnosis.model_tree import add_law, digits
@@ -199,7 +199,6 @@ CAUSE = Cause(
     alike=_alike,
     pictures=shown("allan", "spectrum"),
     extend=_extend,
-    of_estimate=medians,
     add=_add,
     keys={
         "period_s": positive(lambda s: s.duration_s / 20.0),

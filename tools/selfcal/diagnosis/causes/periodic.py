@@ -12,7 +12,7 @@ from scipy.fft import next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 
-from selfcal.diagnosis.cause import Cause, Key, medians
+from selfcal.diagnosis.cause import Cause, Key
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.fit import Fit, finish, fit, moved
 from selfcal.diagnosis.record import Record
@@ -295,7 +295,6 @@ CAUSE = Cause(
     trained=_trained,
     least=_least,
     of_column=_of_column,
-    of_estimate=lambda look: medians(look, "frequency_hz", "amplitude"),
     keys={
         "frequency_hz": Key(lambda s: 0.05, "periodic_frequency_hz"),
         "amplitude": Key(lambda s: 0.5 * s.n, "periodic_amplitude"),
