@@ -101,7 +101,7 @@ def _never(a: Look, b: Look) -> bool:
 def sized(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
     """The entry of a column, of which a look knows numbers better than the search that chose it."""
     known = {} if look is None else medians(look)
-    return {**entry, **{key: digits(value) for key, value in known.items() if key in entry}}
+    return {**entry, **{key: digits(value, 9) for key, value in known.items() if key in entry}}
 
 
 @dataclass(frozen=True)

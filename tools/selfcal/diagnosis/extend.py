@@ -24,7 +24,7 @@ from selfcal.ending import Stopped
 from selfcal.errors import UserError, remark
 from selfcal.forms import NUMBER, formed
 from selfcal.laws import averaged
-from selfcal.model import MOST_COLUMNS, SMALLEST, Model
+from selfcal.model import MOST_COLUMNS, MOST_STATED, SMALLEST, Model
 from selfcal.priors import state_own
 from selfcal.regressors import trailing_mean
 
@@ -78,42 +78,58 @@ def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
             nodes["cortex-m0"].update({law: nodes["cortex-m0-small"][law] for law in plain})
 
 
-def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[dict[str, float], list[tuple[str, Finding]]]:
-    """Regressors that the model file has room for, with their evidence, the most first; findings that it has none for,
-    with their axes. A finding fits whole or not at all."""
+def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], list[tuple[str, Finding]]]:
+    """Regressors that the model file has room for: those that a bank has columns for first, and the most evidence
+    first. Findings that a bank has none for, with their axes: a finding fits whole or not at all."""
     stated = {column for one in model.regressors for column in one.columns}
+    beyond = {column for one in model.beyond for column in one.columns}
     offered: list[tuple[float, str, Finding | None, dict[str, int]]] = []
     for name, one in found.items():
         places = {
             column.name: k
             for k, column in enumerate(one.state.regressors, 1)
-            if column.name not in stated and column.entry
+            if column.name not in stated | beyond and column.entry
         }
-        owned = [(finding, {column.name for column in finding.columns}) for finding in one.findings]
-        groups: list[tuple[Finding | None, list[str]]] = [
-            (finding, [column for column in places if column in own]) for finding, own in owned if own & places.keys()
-        ]
-        # A harmonic's finding is its fundamental's.
-        groups += [(None, [column]) for column in places if not any(column in own for _, own in owned)]
-        for finding, columns in groups:
+        owner = {column.name: finding for finding in one.findings for column in finding.columns}
+        groups: dict[object, list[str]] = {}
+        for column in places:
+            of = owner.get(column)
+            groups.setdefault(regressor_key(column) if of is None else id(of), []).append(column)
+        for columns in groups.values():
+            finding = owner.get(columns[0])
             c, sd = (getattr(one.state.best, of)[[places[column] for column in columns]] for of in ("c", "sd"))
             gain = finding.look.gain if finding else 0.5 * float(np.sum((c / np.maximum(sd, 1e-300)) ** 2))
-            offered.append((gain, name, finding, dict(Counter(map(regressor_key, columns)))))
-    kept: dict[str, float] = {}
+            offered.append(
+                (gain, name, finding or _fundamental(one, columns[0]), dict(Counter(map(regressor_key, columns))))
+            )
+    kept: dict[str, bool] = {}
     out: list[tuple[str, Finding]] = []
-    used = len(stated)
-    for gain, name, finding, keys in sorted(offered, key=lambda one: -one[0]):
+    of_bank, of_file = len(stated), len(stated | beyond)
+    for _, name, finding, keys in sorted(offered, key=lambda one: -one[0]):
         more = {key: count for key, count in keys.items() if key not in kept}
-        if used + sum(more.values()) <= MOST_COLUMNS:
-            kept |= dict.fromkeys(more, gain)
-            used += sum(more.values())
-        elif finding is not None:
+        fits = of_bank + sum(more.values()) <= MOST_COLUMNS
+        of_bank += fits * sum(more.values())
+        if finding is not None and not fits and (name, finding) not in out:
             out.append((name, finding))
-    return kept, out
+        if of_file + sum(more.values()) <= MOST_STATED:
+            of_file += sum(more.values())
+            kept |= dict.fromkeys(more, fits)
+    return sorted(kept, key=lambda key: not kept[key]), out
+
+
+def _fundamental(one: Diagnosed, harmonic: str) -> Finding | None:
+    """The finding that a harmonic's column belongs to."""
+    hz = next(float(column.entry["frequency_hz"]) for column in one.state.regressors if column.name == harmonic)
+
+    def off(finding: Finding) -> float:
+        turns = hz / float(finding.look.estimate["frequency_hz"]["median"])
+        return abs(turns - round(turns))
+
+    return min((each for each in one.findings if "harmonics" in each.look.estimate), key=off, default=None)
 
 
 def left_out(model: Model, found: Mapping[str, Diagnosed]) -> list[tuple[str, Finding]]:
-    """Findings whose columns the model file has no room for, each with its axis. Those of most evidence are in it."""
+    """Findings whose columns a bank has no room for, each with its axis. Those of most evidence have it."""
     return _fitting(model, found)[1]
 
 

@@ -106,6 +106,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     """
     if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
+    model = replace(model, regressors=(*model.regressors, *model.beyond))
     known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
     recording, changes = evened(recording)
     recording, held = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))

@@ -153,7 +153,7 @@ def diagnose(
                 write_text(write_model, as_text(tree, recording.path))
                 if out:
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
-                    note(f"{write_model} leaves out {told}: {NO_ROOM}")
+                    note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
             if report is not None:
                 from selfcal.diagnosis.page import write_page
 
@@ -218,9 +218,9 @@ def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> d
 
 
 def _by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
-    """Axes without a cause must pass the checks of `identify`."""
+    """Axes without a cause must pass the checks of `identify`, whose bank has the whole model."""
     for name, one in found.items():
-        if one.findings or one.state.below_lattice:
+        if one.findings or one.state.below_lattice or model.beyond:
             continue
         with suppress(UserError):  # no report, no checks
             look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)
