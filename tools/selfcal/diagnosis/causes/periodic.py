@@ -199,8 +199,9 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
 
 
 def _harmonics(one: Diagnosed) -> None:
-    """Lines at multiples of a stronger one's frequency are one finding with it: their gains are added."""
-    lines = sorted((f for f in one.findings if f.look.cause == "periodic"), key=lambda f: -f.look.gain)
+    """Lines at multiples of a slower one's frequency are one finding with it: their gains are added."""
+    found = (f for f in one.findings if f.look.cause == "periodic")
+    lines = sorted(found, key=lambda f: f.look.estimate["frequency_hz"]["median"])
     for base in lines:
         if base not in one.findings:
             continue
