@@ -130,6 +130,7 @@ class Cause:
     from_zero    the simulator's effect begins at 0, its column is about the middle.
     law          adds a law to a model file's tree without which N is wrong: `identify` reports by it.
     extend       writes what is no column into the model file.
+    stated       whether a model file has it already: then it is no finding. A column is in the model from the start.
     of_column    keys of `--effect` for columns of the model file: the first one and the coefficients of all.
     of_estimate  keys of `--effect` for a finding where they are not the medians of its estimate; None, or none of them:
                  the simulator cannot make it.
@@ -164,6 +165,7 @@ class Cause:
     from_zero: bool = False
     law: Callable[[dict[str, Any], Look], None] | None = None
     extend: Callable[[Extension], None] | None = None
+    stated: Callable[[Finding, Model], bool] = field(default=lambda finding, model: False)
     of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None
     of_estimate: Callable[[Look], dict[str, Any] | None] | None = None
     keys: Mapping[str, Key] = field(default_factory=dict)

@@ -59,6 +59,7 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
         "judged_at_hz": record.rate_hz,
         "verdict": "adequate" if one.adequate else "inadequate",
         **({"unfinished": one.unfinished} if one.unfinished else {}),
+        **({"stated": [finding.look.cause for finding in one.stated]} if one.stated else {}),
         "findings": [
             _finding(finding, record, factor, unit)
             | ({"left_out_of_model": NO_ROOM} if any(finding is each for each in out) else {})

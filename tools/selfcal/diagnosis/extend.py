@@ -109,7 +109,7 @@ def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], l
         more = {key: count for key, count in keys.items() if key not in kept}
         fits = of_bank + sum(more.values()) <= MOST_COLUMNS
         of_bank += fits * sum(more.values())
-        if finding is not None and not fits and (name, finding) not in out:
+        if finding is not None and not fits and all(finding is not each for _, each in out):
             out.append((name, finding))
         if of_file + sum(more.values()) <= MOST_STATED:
             of_file += sum(more.values())
@@ -148,11 +148,8 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             look = None if finding is None else finding.look
             own = CAUSES[regressor.cause].entry(regressor.entry, look, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
-            if (
-                CAUSES[regressor.cause].smoothed
-                and entry["kind"] == "column"
-                and entry.get("form") not in ("lag", "rate")
-            ):
+            form = entry.get("form")
+            if entry["kind"] == "column" and (form == "rate" or (CAUSES[regressor.cause].smoothed and form != "lag")):
                 smoothed.add(key)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
@@ -167,8 +164,8 @@ def finding_of(one: Diagnosed, column: Column) -> Finding | None:
 
 
 def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) -> None:
-    """The window whose trailing mean explains the axes best. A centred mean, which the diagnosis takes, needs values
-    that a module does not have yet; a trailing one lags, so a shorter window suits it."""
+    """The window whose trailing mean, or slope, explains the axes best. A centred one, which the diagnosis takes, needs
+    values that a module does not have yet; a trailing one lags, so a shorter window suits it."""
     explained = [one for one in found.values() if any(column.name == name for column in one.state.regressors)]
     record = max((one.record for one in explained), key=lambda record: record.rate_hz)
     gains: dict[float, float] = {}
@@ -176,23 +173,29 @@ def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) ->
         window = max(1, round(width * record.rate_hz))
         if window > record.present.size // 10:
             break
+        if window == 1 and entry.get("form") == "rate":  # a slope has two readings at least
+            continue
         try:
             gains[width if window > 1 else 0.0] = sum(_with_values(one, name, width, entry) for one in explained)
         except Stopped:  # the shortest, which suits any
             break
-    best = max(gains, key=lambda width: gains[width], default=0.0)
-    entry.pop("window_s", None)
+    best = max(gains, key=lambda width: gains[width], default=None)
+    if best is not None:
+        entry.pop("window_s", None)
     if best:
         entry["window_s"] = best
 
 
 def _with_values(one: Diagnosed, name: str, width: float, entry: Mapping[str, Any]) -> float:
-    """ln likelihood of the axis with a column of trailing means of `width` s, at the drift found."""
+    """ln likelihood of the axis with a column of trailing means, or slopes, of `width` s, at the drift found."""
     record = one.record
     channel = record.channel_of(str(entry["column"]), str(entry.get("input", "value")))
-    means = trailing_mean(channel, max(1, round(width * record.rate_hz)))
-    form, about = str(entry.get("form", "static")), float(entry["reference"])
-    values = formed(means - about, form, float(entry.get(NUMBER.get(form, ""), math.nan)))
+    form, about = str(entry.get("form", "static")), float(entry.get("reference", 0.0))
+    if form == "rate":
+        values = formed(channel - about, form, width, 0.0, 1.0 / record.rate_hz)
+    else:
+        means = trailing_mean(channel, max(1, round(width * record.rate_hz)))
+        values = formed(means - about, form, float(entry.get(NUMBER.get(form, ""), math.nan)))
     columns = tuple(
         replace(column, values=values) if column.name == name else column for column in one.state.regressors
     )
@@ -286,8 +289,8 @@ def _channel_of(column: Column) -> tuple[str, ...]:
 
 
 def _of_findings(one: Diagnosed) -> Iterator[_Effect]:
-    """Of the findings. The lattice and the range are in the groups."""
-    for finding in one.findings:
+    """Of the findings, also of those that the model file states. The lattice and the range are in the groups."""
+    for finding in (*one.findings, *one.stated):
         cause = CAUSES[finding.look.cause]
         keys = cause.effect(finding.look)
         if keys is not None:

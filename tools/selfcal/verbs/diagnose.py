@@ -13,6 +13,7 @@ from typing import Any, Unpack
 from rich.console import Console
 
 from selfcal.diagnosis import words, work
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
@@ -117,7 +118,7 @@ def diagnose(
             else joined(seen.get(name), first.get(name), INTERRUPTED)
             for name in names
         }
-        found = {name: one for name, one in looked.items() if one is not None}
+        found = {name: _less_stated(one, loaded) for name, one in looked.items() if one is not None}
         if not ending.asked:
             doing.now("checks")
             _by_identify(found, recording, loaded)
@@ -217,6 +218,13 @@ def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> d
     return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
 
 
+def _less_stated(one: Diagnosed, model: Model) -> Diagnosed:
+    """The axis without findings that the model file states already: they are `stated`."""
+    stated = [finding for finding in one.findings if CAUSES[finding.look.cause].stated(finding, model)]
+    findings = [finding for finding in one.findings if not any(finding is each for each in stated)]
+    return replace(one, findings=findings, stated=stated, before=one.before if findings else one.after)
+
+
 def _by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
     """Axes without a cause must pass the checks of `identify`, whose bank has the whole model."""
     for name, one in found.items():
@@ -308,6 +316,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         reason = f": {axis['unfinished']}" if axis.get("unfinished") else ""
         colour = "bold red" if axis["verdict"] != "adequate" else "yellow" if reason else "green"
         heading = f"{name} [{axis['unit']}]: {words.verdict(axis)}{reason}"
+        heading += f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else ""
         console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
         for finding in axis["findings"]:
             for line in _lines(finding):

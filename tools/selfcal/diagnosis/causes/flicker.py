@@ -76,5 +76,6 @@ CAUSE = Cause(
     slow=True,
     pictures=shown("allan"),
     extend=_extend,
+    stated=lambda finding, model: any(law.drift_name == "B" for law in model.laws.values()),
     keys={"B": Key(lambda s: 0.5 * s.n, "flicker_B")},
 )

@@ -89,6 +89,7 @@ CAUSE = Cause(
     least=_least,
     law=_law,
     extend=_extend,
+    stated=lambda finding, model: any(law.coloured_noise for law in model.laws.values()),
     keys={"Q": positive(lambda s: s.n * math.sqrt(s.duration_s / s.samples))},
     add=_add,
 )
