@@ -231,11 +231,11 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
         sigma_m = fit.sigma_m / math.sqrt(gain)
         drift = {"hypothesis": "gauss_markov", "sigma_m": digits(sigma_m), "alpha": digits(fit.alpha)}
         lacking = rest * sigma_m**2
-    # The simulator's ramp and temperature begin at 0.
+    # The simulator's ramp and temperature begin at 0, but for a rate.
     at_first = sum(
         float(c * column.values[0])
         for c, column in zip(fit.c[1:], one.state.regressors, strict=True)
-        if column.cause in CAUSES and CAUSES[column.cause].from_zero
+        if column.cause in CAUSES and CAUSES[column.cause].from_zero and form_of(column)[2] != "rate"
     )
     return {
         "hypothesis": drift.pop("hypothesis"),
