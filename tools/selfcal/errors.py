@@ -7,6 +7,7 @@ import reprlib
 import shlex
 import shutil
 import sys
+from functools import cache
 from pathlib import Path
 
 _SHOWN = reprlib.Repr()
@@ -89,3 +90,10 @@ def first_line(error: BaseException) -> str:
 def note(text: str) -> None:
     """Tell the user, on stderr, something that is no error."""
     print(f"selfcal: {printable(text)}", file=sys.stderr)
+
+
+@cache
+def say_once(text: str) -> None:
+    """Tell the user, unless this process has told it."""
+    if text:
+        note(text)

@@ -176,12 +176,14 @@ class Finding(Object):
 
 
 class DiagnosedAxis(Object):
-    """One axis of `diagnose`, or `error` alone. `verdict`: "adequate" or "inadequate", of the extended model."""
+    """One axis of `diagnose`, or `error` alone. `verdict`: "adequate" or "inadequate", of the extended model. `stated`:
+    causes that it shows and the model file has already."""
 
     error: str | None
     unit: str
     judged_at_hz: float
     verdict: str
+    stated: list[str] | None
     findings: list[Finding]
     only_in_means: list[Finding] | None
     not_found: list[dict[str, Any]]

@@ -20,7 +20,7 @@ from selfcal.allan import Sampled, sample_lengths, sampled
 from selfcal.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.checks import FEWEST, against, coefficients_of, judge, with_drift, with_rate, with_readings
 from selfcal.document import Identified, check_writable, to_document, write_json
-from selfcal.errors import OutsidePriors, UserError
+from selfcal.errors import OutsidePriors, UserError, say_once
 from selfcal.export import FORMS, write_export
 from selfcal.fail_on import check
 from selfcal.gate import gated
@@ -108,6 +108,7 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
+    say_once(loaded_model.left_out)
     bounds = None if limits is None else Limits.load(limits, loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)

@@ -28,7 +28,7 @@ from selfcal.checks import Judged, judge, with_drift, with_readings
 from selfcal.dbc_file import HYPOTHESES
 from selfcal.document import Identified, as_typed, check_writable, to_document, write_json
 from selfcal.ending import held
-from selfcal.errors import OutsidePriors, UserError, called, note
+from selfcal.errors import OutsidePriors, UserError, called, note, say_once
 from selfcal.firmware import Played
 from selfcal.gate import table_of as gate_of
 from selfcal.live import View, frame_counts
@@ -160,6 +160,7 @@ def replay(
         check_picture(plot)
     check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)
+    say_once(loaded_model.left_out)
     known = None if start is None else load_start(start, loaded_model)
     if len(loaded_model.hypotheses) > HYPOTHESES:
         raise UserError(
