@@ -43,7 +43,8 @@ def log_of(path: Path, N: float, K: float, seed: tuple[int, ...], crossings: flo
     n = min(round(duration_s), MOST)
     dt_s = duration_s / n
     random = np.random.default_rng(seed)
-    np.savez(path, **{"t[s]": np.arange(n) * dt_s, "gx[deg/s]": 0.1 * N * 100 + drawn(random, N, K, n, dt_s)})  # type: ignore[arg-type]
+    columns = {"t[s]": np.arange(n) * dt_s, "gx[deg/s]": 10.0 * N + drawn(random, N, K, n, dt_s)}
+    np.savez(path, **columns)  # type: ignore[arg-type]
     return path
 
 
