@@ -180,7 +180,8 @@ def with_readings(
     """The same with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
 
     `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
-    noise of a reading; `step` in the recording's unit; `distinct` readings.
+    noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the
+    rate of means whose remainders are white.
     `saturation`, if some are clipped: their share, and the `at` of the limit.
     `outliers`, if one value recurs too often: the share of these readings, and the value `at` which.
     `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
@@ -193,7 +194,8 @@ def with_readings(
     found = readings.lattice
     if found is not None:
         told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse_over(dt_s)}
-        checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct}
+        white = {"counter_hz": found.white_hz} if found.carried and not told["passed"] else {}
+        checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct, **white}
     if readings.clipped is not None:
         share = float(readings.clipped.mask.mean())
         checks["saturation"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.clipped.limit * factor}

@@ -128,6 +128,7 @@ class IdentifiedAxis(Object):
     suspicion: str | None
     more_laws: dict[str, float] | None
     added_law: str | None
+    own_priors: dict[str, Any] | None
     halved_after_s: dict[str, float | None] | None
     allan: dict[str, Any] | None
     regressors: dict[str, Any] | None

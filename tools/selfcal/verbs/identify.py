@@ -19,6 +19,7 @@ from selfcal import _library32
 from selfcal.allan import Sampled, sample_lengths, sampled
 from selfcal.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.checks import FEWEST, against, coefficients_of, judge, with_drift, with_rate, with_readings
+from selfcal.counted import weigh_counted
 from selfcal.document import Identified, check_writable, to_document, write_json
 from selfcal.errors import OutsidePriors, UserError, say_once
 from selfcal.export import FORMS, write_export
@@ -395,7 +396,9 @@ def identify_axis(
     judged = with_readings(judged, readings, group, unit, tables.dt_s)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[best]) if used else 0.0
     curve = curve_of_samples(samples - explained) if draw else None
-    beside = weigh(tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset)
+    fed = tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset
+    beside, counted = weigh(*fed), weigh_counted(readings.lattice, results[best], *fed)
+    more_laws = [one.laws(known.probability) for one in (beside, counted) if one is not None]
     return Identified(
         unit,
         group.unit,
@@ -404,9 +407,9 @@ def identify_axis(
         kept,
         scored,
         curve,
-        summarize(inside, group, *at, beside),
+        summarize(inside, group, *at, beside, counted),
         halved_after(inside, group, *at),
-        beside.laws(known.probability) if beside else {},
+        next(filter(None, more_laws), {}),
     )
 
 
