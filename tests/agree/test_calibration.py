@@ -41,7 +41,7 @@ FALSE_ALARM = 1e-4
 #: Bins of all laws, lengths and parameters, at most: what FALSE_ALARM is shared among.
 TESTS = 6 * 4 * 3 * 4
 SEED = 7
-SUMS_MODEL = ROOT / "tools" / "selfcal" / "models" / "sums.yaml"
+SUMS_MODEL = ROOT / "tools" / "selfcal" / "model" / "models" / "sums.yaml"
 
 
 def ranks(rows: list[Row], name: str) -> np.ndarray:

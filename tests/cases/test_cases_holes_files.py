@@ -233,7 +233,7 @@ def test_a_recording_with_a_line_feed_in_its_name(tmp_path: Path) -> None:
 KILLED = """
 import os, signal, sys
 import numpy as np
-from selfcal.recording import save
+from selfcal.logs.recording import save
 at, calls = int(sys.argv[2]), 0
 def until(name):
     real = getattr(os, name)
@@ -317,7 +317,8 @@ def test_set_up_names_the_browser_or_leaves_it_out(tmp_path: Path, browser: str,
         "PYTHON": sys.executable,
         "BROWSER": browser,
     }
-    done = subprocess.run(["sh", "-c", machine], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    command = ["sh", "-c", machine, "system.sh", "dev"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     calls = (tmp_path / "calls").read_text() if (tmp_path / "calls").exists() else ""
     assert ("chromium" in calls) == ("chromium" in done.stdout) == (browser == "1" and root)

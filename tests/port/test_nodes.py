@@ -34,7 +34,7 @@ from selfcal.wire.known_models import KnownModels
 from conftest import needs_multicast, run
 from wire_stream import lines, message, serial_line, stream
 
-SUMS = ROOT / "tools" / "selfcal" / "models" / "sums.yaml"
+SUMS = ROOT / "tools" / "selfcal" / "model" / "models" / "sums.yaml"
 
 
 def text_of(sent_lines: list[str]) -> bytes:

@@ -215,7 +215,7 @@ def test_the_sizes_of_the_images_are_those_of_the_bench() -> None:
 def test_the_python_example_runs(tmp_path: Path) -> None:
     """As printed, with the number that stands behind its `print`."""
     (tmp_path / "tests").symlink_to(ROOT / "tests")
-    shutil.copy(ROOT / "tools" / "selfcal" / "models" / "default.yaml", tmp_path / "my.yaml")
+    shutil.copy(ROOT / "tools" / "selfcal" / "model" / "models" / "default.yaml", tmp_path / "my.yaml")
     example = blocks(ROOT / "tools" / "README.md", "python")[-1]
     done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
     told = re.search(r"^print.*# ([0-9.]+)$", example, re.MULTILINE)
@@ -332,7 +332,7 @@ def test_verbs_of_the_documents_exist() -> None:
 
 
 def test_lines_of_the_documents_fit() -> None:
-    models = [str(path.relative_to(ROOT)) for path in (ROOT / "tools" / "selfcal" / "models").glob("*.yaml")]
+    models = [str(path.relative_to(ROOT)) for path in (ROOT / "tools" / "selfcal" / "model" / "models").glob("*.yaml")]
     for name in (*DOCUMENTS, *models):
         for number, line in enumerate((ROOT / name).read_text(encoding="utf-8").splitlines(), 1):
             assert len(line) <= WIDTH, f"{name}:{number}: {len(line)} columns"

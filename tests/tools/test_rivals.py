@@ -31,7 +31,7 @@ from selfcal.studies.rivals import longest_stretch, problem_of, rivals, show
 
 from conftest import ROOT, run, shared_recording
 
-ENSEMBLE = ROOT / "tools" / "selfcal" / "models" / "ensemble.yaml"
+ENSEMBLE = ROOT / "tools" / "selfcal" / "model" / "models" / "ensemble.yaml"
 SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
 #: The truths of the issue: sigma_v 0.5, drift 0.05 a step or sigma_m 0.3, alpha 0.03, at 1 s.
 TRUTH = {

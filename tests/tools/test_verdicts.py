@@ -155,7 +155,7 @@ def test_files_that_are_no_limits(tmp_path: Path) -> None:
         ("gq.N: {max: 1 deg/s}", "begins with no group or axis of the model"),
         ("gx.Q: {max: 1 deg/s}", "ends with none of bias, N"),
         ("{}", "no limit is in it"),
-        ("schema: selfcal.model.file/1", "schema: must be selfcal.base.limits/1"),
+        ("schema: selfcal.model/1", "schema: must be selfcal.limits/1"),
         ("gx.N: {max: 1 deg/s/sqrt(Hz), max: 2 deg/s/sqrt(Hz)}", "appears twice"),
         ("- 1", "not a limits file"),
     ):

@@ -130,7 +130,9 @@ Unit = Annotated[
 ]
 Scale = Annotated[
     list[str] | None,
-    typer.Option("--scale", metavar="[gx=]SIZE[unit]", help="Size of one LSB of LSB columns (repeat for more)"),
+    typer.Option(
+        "--scale", metavar="[gx=]SIZE[unit]", help="Size of one LSB, or of a unit that is not known (repeat for more)"
+    ),
 ]
 Start = Annotated[
     float | None, typer.Option("--start", metavar="S", help="Begin here, seconds of the recording; default: its start")

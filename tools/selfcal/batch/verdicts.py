@@ -29,7 +29,7 @@ from selfcal.logs.recording import list_of
 from selfcal.model.file import Model, read_yaml
 from selfcal.model.laws import PLACES, RATIOS
 
-SCHEMA = "selfcal.base.limits/1"
+SCHEMA = "selfcal.limits/1"
 PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
 #: A law of less probability is no law of the axis.
 LEAST_PROBABILITY = 0.05

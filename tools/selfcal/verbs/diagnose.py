@@ -28,6 +28,7 @@ from selfcal.base.results import Diagnosis
 from selfcal.batch.fail_on import check
 from selfcal.batch.verdicts import Limits, add_verdicts, check_options, on_a_line
 from selfcal.diagnosis import words
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
 from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
@@ -112,8 +113,12 @@ def diagnose(
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)
         if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
-            first = _look(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
-            _show_first(recording, first, [name for name in names if name in record.axes], ending)
+            means = None
+            with suppress(UserError):  # a recording that is too short for means is looked at once
+                means = of_recording(recording, loaded, FIRST_HZ, names)
+            if means is not None:
+                first = _look(means, names, ending, doing)
+                _show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = _look(record, names, ending, doing) if not ending.asked else {}
         looked = {
             name: first.get(name)
@@ -121,7 +126,7 @@ def diagnose(
             else joined(seen.get(name), first.get(name), INTERRUPTED)
             for name in names
         }
-        found = {name: one for name, one in looked.items() if one is not None}
+        found = {name: _less_stated(one, loaded) for name, one in looked.items() if one is not None}
         if not ending.asked:
             doing.now("checks")
             _by_identify(found, recording, loaded)
@@ -157,7 +162,7 @@ def diagnose(
                 write_text(write_model, as_text(tree, recording.path))
                 if out:
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
-                    note(f"{write_model} leaves out {told}: {NO_ROOM}")
+                    note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
             if report is not None:
                 from selfcal.show.page import write_page
 
@@ -221,10 +226,17 @@ def _look(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> d
     return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
 
 
+def _less_stated(one: Diagnosed, model: Model) -> Diagnosed:
+    """The axis without findings that the model file states already: they are `stated`."""
+    stated = [finding for finding in one.findings if CAUSES[finding.look.cause].stated(finding, model)]
+    findings = [finding for finding in one.findings if not any(finding is each for each in stated)]
+    return replace(one, findings=findings, stated=stated, before=one.before if findings else one.after)
+
+
 def _by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
-    """Axes without a cause must pass the checks of `identify`."""
+    """Axes without a cause must pass the checks of `identify`, whose bank has the whole model."""
     for name, one in found.items():
-        if one.findings or one.state.below_lattice:
+        if one.findings or one.state.below_lattice or model.beyond:
             continue
         with suppress(UserError):  # no report, no checks
             look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)
@@ -312,6 +324,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         reason = f": {axis['unfinished']}" if axis.get("unfinished") else ""
         colour = "bold red" if axis["verdict"] != "adequate" else "yellow" if reason else "green"
         heading = f"{name} [{axis['unit']}]: {words.verdict(axis)}{reason}"
+        heading += f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else ""
         console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
         for finding in axis["findings"]:
             for line in _lines(finding):

@@ -17,13 +17,14 @@ from rich.progress import Progress
 
 from selfcal import _library32
 from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
-from selfcal.adequacy.checks import FEWEST, coefficients_of, judge, with_drift, with_readings
+from selfcal.adequacy.checks import FEWEST, against, coefficients_of, judge, with_drift, with_rate, with_readings
+from selfcal.adequacy.counted import weigh_counted
 from selfcal.adequacy.document import Identified, check_writable, to_document, write_json
 from selfcal.adequacy.one_over_f import weigh, with_white
 from selfcal.adequacy.summary import halved_after, summarize
 from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.bank.result import AxisResult, in_unit
-from selfcal.base.errors import OutsidePriors, UserError
+from selfcal.base.errors import OutsidePriors, UserError, say_once
 from selfcal.base.results import Identification
 from selfcal.batch.fail_on import check
 from selfcal.batch.verdicts import Limits, add_verdicts, check_options, on_a_line
@@ -108,6 +109,7 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
+    say_once(loaded_model.left_out)
     bounds = None if limits is None else Limits.load(limits, loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
@@ -387,10 +389,16 @@ def identify_axis(
     used = _used(mask)
     judged = judge(blocks, tables, group, results[best], used)
     judged = with_drift(judged, blocks, tables, results[best], recording, may_act(model, recording, name), used)
+    if "drift_in_average" in against(judged.checks):
+        used_readings = np.where(np.logical_or.reduce(list(kept_out(samples, group).values())), np.nan, values)
+        step = 0.0 if readings.lattice is None else readings.lattice.step
+        judged = with_rate(judged, used_readings, recording.missing_before, step, tables, results[best])
     judged = with_readings(judged, readings, group, unit, tables.dt_s)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[best]) if used else 0.0
     curve = curve_of_samples(samples - explained) if draw else None
-    beside = weigh(tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset)
+    fed = tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset
+    beside, counted = weigh(*fed), weigh_counted(readings.lattice, results[best], *fed)
+    more_laws = [one.laws(known.probability) for one in (beside, counted) if one is not None]
     return Identified(
         unit,
         group.unit,
@@ -399,9 +407,9 @@ def identify_axis(
         kept,
         scored,
         curve,
-        summarize(inside, group, *at, beside),
+        summarize(inside, group, *at, beside, counted),
         halved_after(inside, group, *at),
-        beside.laws(known.probability) if beside else {},
+        next(filter(None, more_laws), {}),
     )
 
 

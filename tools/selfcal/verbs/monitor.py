@@ -34,7 +34,7 @@ from selfcal.wire.frames import (
     serial_ports,
 )
 from selfcal.wire.known_models import KnownModels
-from selfcal.wire.live import SILENT_S, Contact, View
+from selfcal.wire.live import SILENT_S, Contact, View, patient
 from selfcal.wire.streams import check as check_stream
 from selfcal.wire.streams import content, open_streams
 
@@ -121,7 +121,7 @@ def monitor(
     streams = Streams(node=node)
     contacts: dict[int, Contact] = {}
     histories: dict[int, dict[str, list[AxisReport]]] = {}
-    with held() as ending, ExitStack() as stack:
+    with held() as ending, patient(), ExitStack() as stack:
         source: Link | FrameLog
         if channel is None:
             source = stack.enter_context(FrameLog(name, speed))

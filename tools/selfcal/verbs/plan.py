@@ -36,7 +36,7 @@ from selfcal.model.file import Model, Regressor
 from selfcal.model.laws import PLACES, Law
 from selfcal.model.regressors import coefficient_unit, offered
 from selfcal.model.tables import make_tables
-from selfcal.show.plot import COLORS, check_picture, save_picture
+from selfcal.show.plot import COLORS, check_picture, plotter, save_picture
 from selfcal.studies.montecarlo import has_nodes, simulate_bank_samples
 from selfcal.verbs.simulate import truth_of
 
@@ -380,13 +380,9 @@ def _half_interval(
 
 def _picture(document: Mapping[str, Any], path: Path | str) -> None:
     """What is reached over the length: median and middle four fifths of the records, and the wish."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot
-
     wishes = [wish for wish in document["wishes"] if wish["curve"]]
-    figure, panels = pyplot.subplots(len(wishes), 1, figsize=(7.0, 2.9 * len(wishes)), squeeze=False, sharex=True)
+    size = (7.0, 2.9 * len(wishes))
+    figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)
     for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
         hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
         q10, q50, q90 = (np.maximum([one[key] for one in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))

@@ -30,7 +30,7 @@ from selfcal.bank.blocks import usable_blocks
 from selfcal.bank.firmware import Played
 from selfcal.bank.result import AxisResult, in_unit
 from selfcal.base.ending import held
-from selfcal.base.errors import OutsidePriors, UserError, called, note
+from selfcal.base.errors import OutsidePriors, UserError, called, note, say_once
 from selfcal.base.results import Identification
 from selfcal.base.units import factor as factor_of
 from selfcal.base.units import same_kind
@@ -160,6 +160,7 @@ def replay(
         check_picture(plot)
     check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)
+    say_once(loaded_model.left_out)
     known = None if start is None else load_start(start, loaded_model)
     if len(loaded_model.hypotheses) > HYPOTHESES:
         raise UserError(

@@ -17,6 +17,7 @@ from selfcal.adequacy.one_over_f import FLICKER, beside_its_law
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
 from selfcal.base.output import check_place
+from selfcal.batch.spread import checked_seed
 from selfcal.diagnosis.cause import Cause, Channels, Key, Setting, is_count
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.logs import recording
@@ -44,8 +45,7 @@ def simulate(
     """
     model = Model.load(model_path)
     check_place(output)
-    if not 0 <= seed < 2**64:
-        raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {seed}")
+    checked_seed(seed)
     scene = _scene(model, seed)
     scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
     truth = truth_of(model, seed)

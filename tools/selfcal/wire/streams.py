@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import base64
 import json
+import os
+import select
 import socket
 import sys
 import time
@@ -18,6 +20,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from selfcal.adequacy.document import finite
+from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, install
 from selfcal.base.units import parameter_unit
 from selfcal.wire.dbc_file import PLACE_NAMES, Names
@@ -118,10 +121,22 @@ class _Udp:
 
 
 class _Lines:
-    """A line each on stdout, at once."""
+    """A line each on stdout, at once. It waits for a reader, but no longer than until a signal asks for the end."""
 
     def send(self, report: Mapping[str, Any], at_s: float) -> None:
-        print(line_of(report, at_s), flush=True)
+        line = line_of(report, at_s)
+        try:
+            stdout = sys.stdout.fileno()
+        except OSError:  # a program's own stdout is no file
+            print(line, flush=True)
+            return
+        sys.stdout.flush()
+        data = f"{line}\n".encode()
+        while data:
+            if select.select([], [stdout], [], 0.25)[1]:
+                data = data[os.write(stdout, data[: select.PIPE_BUF]) :]
+            elif Held().asked:
+                return
 
     def close(self) -> None:
         sys.stdout.flush()
