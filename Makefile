@@ -25,8 +25,8 @@
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util
 #   make bench [ACCEPT=1]       instructions on emulated Cortex-M, bytes, ns here; fails on growth unless it is accepted
 #   make setup                  the set-up alone: what `make run` takes
-#   make setup-dev              what checks and tests take as well; they run it
-#   make setup-all              every extra too: readers of other programs' logs (400 MB); `make test` runs it
+#   make setup-dev              what checks and tests take as well, of the system too; they run it
+#   make setup-all              every extra too: readers of other programs' logs (450 MB); `make test` runs it
 #   make setup-rivals, make setup-cluster   packages that few need: filterpy; dask.distributed and pyarrow (60 MB)
 #   make setup-packages         what packs lib/ for the registries of PlatformIO and ESP-IDF (70 MB)
 #   make docs                   these pages, the header and the Python functions as a site, build/docs/site/index.html

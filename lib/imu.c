@@ -39,10 +39,12 @@ static void carve_all(selfcal_imu_t *imu, room_t *room) {
     }
 }
 
-/* All but the bank begins anew. */
+/* All but the bank begins anew: no axis has a report. */
 static selfcal_status_t begin_all(selfcal_imu_t *imu) {
     const selfcal_pipe_t *pipe = imu->pipe;
     selfcal_status_t status = SELFCAL_OK;
+    imu->computing = false;
+    imu->due = 0U;
     if (imu->columns != NULL) {
         status = pipe->columns->begin(imu);
     }
@@ -54,6 +56,7 @@ static selfcal_status_t begin_all(selfcal_imu_t *imu) {
     }
     for (uint8_t axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
         imu->reason[axis] = SELFCAL_REASON_NO_REPORT;
+        imu->bias[axis] = NAN;
     }
     return status;
 }
@@ -79,9 +82,6 @@ selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe
         return SELFCAL_BAD_MEMORY;
     }
     imu->memory = room.next;
-    for (size_t axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
-        imu->bias[axis] = NAN;
-    }
     selfcal_status_t status = selfcal_init(&imu->bank, pipe->model, imu->memory, room.left);
     status = status == SELFCAL_OK ? begin_all(imu) : status;
     if (status == SELFCAL_OK && imu->gate != NULL && !selfcal_imu_watch(imu, true)) {
@@ -219,8 +219,11 @@ selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu) {
 
 const selfcal_report_t *selfcal_imu_report(const selfcal_imu_t *imu, uint8_t axis) {
     SELFCAL_ASSERT(axis < imu->bank.model->axes);
+    if (imu->reason[axis] == SELFCAL_REASON_NO_REPORT) {
+        return NULL;
+    }
     if (imu->kept != NULL) {
-        return imu->reason[axis] != SELFCAL_REASON_NO_REPORT ? &imu->kept->report[axis] : NULL;
+        return &imu->kept->report[axis];
     }
     return imu->whole && imu->report.axis == axis ? &imu->report : NULL;
 }
@@ -290,11 +293,8 @@ selfcal_status_t selfcal_imu_forget(selfcal_imu_t *imu) {
     const selfcal_status_t status = selfcal_init(&imu->bank, model, imu->memory, SIZE_MAX);
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         (void)selfcal_shift(&imu->bank, axis, shifted[axis]);
-        imu->bias[axis] = NAN;
     }
     (void)begin_all(imu);
-    imu->computing = false;
-    imu->due = 0U;
     if (imu->watching) { /* its windows go on: the bank must start with one of them */
         (void)selfcal_imu_watch(imu, true);
     }
@@ -313,6 +313,8 @@ selfcal_status_t selfcal_imu_restore(selfcal_imu_t *imu, const void *snapshot, s
         (void)selfcal_moving(bank);
         const uint64_t block = bank->block, past = (bank->position + gap) % block;
         (void)selfcal_skip(bank, gap + (past > 0U ? block - past : 0U));
+    }
+    if (status == SELFCAL_OK || status == SELFCAL_CORRUPT) { /* the latter leaves a bank without a sample */
         (void)begin_all(imu);
     }
     return status;

@@ -2,7 +2,12 @@
 #include "imu.h"
 
 static void begin_judging(selfcal_imu_t *imu) {
-    (void)selfcal_adequacy_init(&imu->judge->adequacy, &imu->bank);
+    selfcal_imu_judge_t *self = imu->judge;
+    (void)selfcal_adequacy_init(&self->adequacy, &imu->bank);
+    memset(self->judged, 0, sizeof self->judged);
+    for (uint8_t axis = 0; axis < imu->bank.model->axes; axis++) {
+        self->judged[axis] = selfcal_judgement(&self->adequacy, &imu->bank, axis);
+    }
 }
 
 static void sample(selfcal_imu_t *imu, const float side[], const float values[]) {

@@ -276,7 +276,7 @@ selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu);
  * one of the axis (without selfcal_imu_keep(): of any axis) is worked on. */
 const selfcal_report_t *selfcal_imu_report(const selfcal_imu_t *imu, uint8_t axis);
 
-/* The judgement at that report; NULL: the model is not judged. */
+/* The judgement at that report; before the first, SELFCAL_NOT_JUDGED and the reason. NULL: the model is not judged. */
 const selfcal_judgement_t *selfcal_imu_judgement(const selfcal_imu_t *imu, uint8_t axis);
 
 /* The coefficients at that report, by column; NULL: the model has no regressors. */

@@ -26,7 +26,7 @@ define FIRMWARE_IMAGE
 image-$(1): $(IMAGES)/model/selfcal_model.c
 	@$$(MAKE) --no-print-directory -s -f port/$(1)/$(1).mk $(1) SENSOR=$(SENSOR) \
 	    TARGET=$(1) MODEL_DIR=$(IMAGES)/model OUT=$(IMAGES)
-$(IMAGES)/model/selfcal_model.c: $(MODEL)/selfcal_model.c $(SENSOR_MODEL)
+$(IMAGES)/model/selfcal_model.c: $(MODEL)/selfcal_model.c $(SENSOR_MODEL) | setup-dev
 	$(BIN)/selfcal codegen $(SENSOR_MODEL) -o $$(@D) --target $(CORE_$(1))
 endef
 $(foreach target,$(BOARDS),$(eval $(call FIRMWARE_IMAGE,$(target))))

@@ -4,6 +4,7 @@
 CHECKS := check-tidy check-gcc check-clang check-arm check-c++ check-tokens check-house check-format check-ruff \
           check-mypy
 .PHONY: $(CHECKS)
+$(CHECKS): setup-dev
 check: setup-dev
 	@$(MAKE) --no-print-directory --keep-going $(CHECKS)
 
@@ -41,8 +42,8 @@ check-c++:
 TIDY := clang-tidy --quiet
 TIDY_ARM := --checks=-performance-no-int-to-ptr
 HASH := \#
-STRING_H := $(shell echo "$(HASH)include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h")
-TIDY_ARM_FLAGS := -std=c99 --target=arm-none-eabi -isystem $(dir $(STRING_H))
+STRING_H = $(shell echo "$(HASH)include <string.h>" | arm-none-eabi-gcc -M -E - | grep -om1 "/[^ ]*/string.h")
+TIDY_ARM_FLAGS = -std=c99 --target=arm-none-eabi -isystem $(dir $(STRING_H))
 tidy = @$(1) 2>&1 | { ! grep -vE '^[0-9]+ warnings? generated|^Suppressed|^Use -header-filter'; }
 TIDY_CPU_cortex-m4f := -mcpu=cortex-m4
 TIDY_CPU_cortex-m0 := -mcpu=cortex-m0
@@ -64,7 +65,7 @@ check-tokens:
 	    then echo "$$file: banned in lib/"; failed=1; fi; done; exit $$failed
 
 # Lines, conditionals, circles, lengths of functions, names.
-check-house: setup-dev
+check-house:
 	@$(BIN)/python tests/count_house.py
 
 # The layout of C, C++ and Python.
@@ -73,14 +74,14 @@ FORMATTED = $(shell find lib port host_sim tests tools -name '*.[ch]' -o -name '
 format: setup-dev
 	@$(BIN)/clang-format -i $(FORMATTED)
 	@$(BIN)/ruff format --quiet --config tools/pyproject.toml tools tests host_sim
-check-format: setup-dev
+check-format:
 	@$(BIN)/clang-format --dry-run -Werror $(FORMATTED)
 	@$(BIN)/ruff format --quiet --check --config tools/pyproject.toml tools tests host_sim
 
-check-ruff: setup-dev
+check-ruff:
 	@$(BIN)/ruff check --quiet --config tools/pyproject.toml tools tests host_sim
 
-check-mypy: setup-dev
+check-mypy:
 	@cd tools && ../$(BIN)/mypy --no-error-summary
 	@MYPYPATH=host_sim $(BIN)/mypy --no-error-summary --config-file tools/pyproject.toml tests/run.py tests/long_run.py \
 	    tests/count_house.py tests/bench/bench.py tests/bench/image_sizes.py

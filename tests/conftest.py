@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import io
 import os
 import select
 import shlex
@@ -16,6 +17,7 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Generator
+from contextlib import redirect_stderr
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -27,9 +29,12 @@ import pytest
 import selfcal
 from selfcal import cli
 from selfcal.bank.result import AxisResult
+from selfcal.logs import recording as recording_module
 from selfcal.logs.loaders import Format, child
 from selfcal.logs.loaders.table import Hints
-from selfcal.logs.recording import Recording, load
+from selfcal.logs.recording import Recording, load, save
+from selfcal.logs.written import laid_out
+from selfcal.model.file import SENSORS
 
 # A shell's background job ignores an interrupt, and so would every program that a test starts and interrupts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -175,7 +180,7 @@ def _multicast() -> bool:
 needs_multicast = pytest.mark.skipif(not _multicast(), reason="NO MULTICAST: ip route add 239.74.163.2 dev lo")
 
 
-def _forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
+def _forked(one: Format, path: Path, hints: Hints, answer: int) -> int:
     """As the product's child, without the start of a new Python and of the reader's library for each file."""
     for module in (f"selfcal.logs.loaders.{one.module}", one.library):
         if module:
@@ -186,17 +191,58 @@ def _forked(one: Format, path: Path, hints: Hints, place: Path) -> int:
         try:
             for stream in (1, 2):
                 os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
-            child.answer(one.module, path, place, hints)
+            child.answer(one.module, path, hints, answer)
             code = 0
         finally:
             os._exit(code)
-    return _ended(number)
+    return number
 
 
 @pytest.fixture
 def forked(monkeypatch: pytest.MonkeyPatch) -> None:
     """Binary files are read in a fork of this process."""
     monkeypatch.setattr(child, "_spawned", _forked)
+
+
+def assert_alike(one: Recording, other: Recording) -> None:
+    """Both hold the same, to the bit: columns, units, readings, clocks."""
+    assert list(one.columns) == list(other.columns)
+    assert one.started_s == other.started_s
+    for name, column in one.columns.items():
+        again = other.columns[name]
+        assert again.unit == column.unit
+        assert np.array_equal(again.values, column.values, equal_nan=True), name
+        assert (again.clock is None) == (column.clock is None)
+        clock, found = one.clock_of(name), other.clock_of(name)
+        assert (found.rate_hz, found.start_s) == (clock.rate_hz, clock.start_s)
+        assert np.array_equal(found.missing_before, clock.missing_before)
+        assert (found.off_grid_s is None) == (clock.off_grid_s is None)
+        assert clock.off_grid_s is None or np.array_equal(found.off_grid_s, clock.off_grid_s)
+
+
+#: Readings of a recording up to which a test of `reads_back` writes it as a text as well, and at all.
+FEW, MANY = 3000, 200_000
+
+
+@pytest.fixture
+def reads_back(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Every recording that the test loads is written as `convert` does, and reads back as the same."""
+    notes_of = recording_module._rates
+
+    def checked(loaded: Recording) -> list[str]:
+        held = sum(one.values.size for one in loaded.columns.values())
+        # A model file may name axes of its own; `convert` reads the usual ones.
+        if loaded.meta.get("read back") is None and held <= MANY and set(loaded.columns) & set(SENSORS):
+            folder = tmp_path_factory.mktemp("again")
+            laid = laid_out(loaded)
+            for name in ("again.npz", "again.csv")[: 2 if held <= FEW else 1]:
+                with redirect_stderr(io.StringIO()):
+                    save(folder / name, laid.columns, loaded.rate_hz, {**laid.meta, "read back": 1}, laid.t, exact=True)
+                    assert_alike(loaded, load(folder / name))
+            shutil.rmtree(folder)
+        return notes_of(loaded)
+
+    monkeypatch.setattr(recording_module, "_rates", checked)
 
 
 def shared_recording(name: str) -> Recording:

@@ -129,7 +129,7 @@ def calls(texts: Mapping[str, str]) -> dict[str, set[str]]:
 
 
 def imports(package: Path) -> dict[str, dict[str, bool]]:
-    """Which module of a Python package imports which, anywhere in its file; whether at its head."""
+    """Which module of a Python package imports which, anywhere in its file but for types; whether at its head."""
     files = {
         ".".join(path.relative_to(package.parent).with_suffix("").parts).removesuffix(".__init__"): path
         for path in package.rglob("*.py")
@@ -138,13 +138,19 @@ def imports(package: Path) -> dict[str, dict[str, bool]]:
     for name, path in files.items():
         tree = ast.parse(path.read_text(encoding="utf-8"))
         head = {id(node) for node in tree.body}
+        typed = {
+            id(one)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+            for one in node.body
+        }
         edges = found.setdefault(name, {})
         for node in ast.walk(tree):
             if isinstance(node, ast.ImportFrom) and node.module is not None:
                 for one in node.names:
                     module = f"{node.module}.{one.name}"
                     module = module if module in files else node.module
-                    if module in files and module != name:
+                    if module in files and module != name and id(node) not in typed:
                         edges[module] = edges.get(module, False) or id(node) in head
     return found
 

@@ -64,7 +64,7 @@ cases: setup-dev setup-all
 	    $(PYTEST) -s -n 2 tests --ignore=tests/port --ignore=tests/tools/test_hostile.py
 
 # All trials, ten times; and the tests of the firmware that make test leaves out.
-campaigns: setup-dev
+campaigns: setup-dev setup-all
 	@rm -f $(BUILD)/campaigns.txt
 	SELFCAL_CAMPAIGN=$(or $(TIMES),10) $(LONG) $(PYTEST) \
 	    tests/port tests/tools/test_hostile.py tests/tools/test_monitor_hostile.py

@@ -19,7 +19,7 @@ bench-counts: bench-images firmware-images
 BENCH_LINK := arm-none-eabi-gcc -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections
 define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
-$(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c
+$(BENCH)/$(1)/selfcal_model.c: $(MODEL)/selfcal_model.c | setup-dev
 	$(BIN)/selfcal codegen tools/selfcal/model/models/default.yaml -o $$(@D) --target $(1)
 $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(ARM_SOURCES_$(1)) $(BENCH)/$(1)/selfcal_model.c port/arm.mk \
                              port/library.mk

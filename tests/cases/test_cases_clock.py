@@ -23,6 +23,9 @@ from selfcal.verbs.identify import identify
 
 from conftest import case_records
 
+#: Every log that a test here opens, `convert` writes without loss.
+pytestmark = pytest.mark.usefixtures("reads_back")
+
 Floats = NDArray[np.float64]
 Random = np.random.Generator
 RATE_HZ, ROWS = 53.0, 7000

@@ -14,12 +14,10 @@ from scipy.stats import binom
 
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import save
-from selfcal.model.file import Model
 from selfcal.readings.codes import uneven_of
 from selfcal.readings.held import slower
 from selfcal.readings.lattice import lattice_of
 from selfcal.verbs.diagnose import diagnose
-from selfcal.verbs.simulate import simulate
 
 from conftest import case_records
 
@@ -153,21 +151,3 @@ def test_readings_that_are_equal_by_chance_are_no_stretch(kind: str) -> None:
             y[part] = level + (y[part] - level) * (random.uniform(2.0, 5.0) if kind == "louder" else 0.2)
         named += bool(slower(rounded(y, q)))
     assert named <= binom.isf(1e-3, count, 1.0 / 200.0)
-
-
-def test_the_diagnosis_names_it_alone_and_the_model_simulates_it(tmp_path: Path) -> None:
-    """A dead band is no outlier, and its drawn readings show nothing more. The model file makes it again."""
-    for seed in range(case_records(1, 12)):
-        random = np.random.default_rng([66, seed])
-        y, _ = banded(quiet(random), 0.4 * SD, random.uniform(0.6, 1.1) * SD)
-        log, model = log_of(tmp_path / "dead.npz", y, 1.0), tmp_path / "found.yaml"
-        axis = diagnose(log, write_model=model)["axes"]["gx"]
-        assert [finding["cause"] for finding in axis["findings"]] == ["quantization"]
-        known = axis["findings"][0]["estimate"]
-        assert "quantization" in " ".join(Model.load(model).simulate["effects"])
-        simulate(model, tmp_path / "again.npz", seed=seed)
-        again = diagnose(tmp_path / "again.npz", axes=["gx"])["axes"]["gx"]["findings"]
-        (found,) = [one["estimate"] for one in again if one["cause"] == "quantization"]
-        # Both know the width by a few hundred counts: to a third of a code.
-        assert abs(found["width"]["median"] - known["width"]["median"]) < 0.4 * 0.4 * SD
-        model.unlink()

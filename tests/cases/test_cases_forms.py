@@ -130,21 +130,9 @@ def lag(d: Drawn) -> None:
     d.y["gx"] += d.sign * 0.04 * late(d.temperature, 310.0, d.dt)
 
 
-def rate(d: Drawn) -> None:
-    d.y["gx"] += d.sign * 6.0 * np.gradient(d.temperature, d.dt)
-
-
 def filtered(d: Drawn) -> None:
     """The rate of the temperature behind a lag: neither of the simple forms."""
     d.y["gx"] += d.sign * 8.0 * (d.temperature - late(d.temperature, 150.0, d.dt)) / 150.0
-
-
-def hysteresis(d: Drawn) -> None:
-    d.y["gx"] += d.sign * 0.04 * play(d.temperature, 2.6)
-
-
-def static(d: Drawn) -> None:
-    d.y["gx"] += d.sign * 0.03 * d.temperature
 
 
 def leak(d: Drawn) -> None:
@@ -152,54 +140,11 @@ def leak(d: Drawn) -> None:
     d.y["gx"] += d.sign * 5.0 * late(d.y["ay"], 13.0, d.dt)
 
 
-def fan(d: Drawn) -> None:
-    """A fan that switches shakes ax, and the shaking rectifies into gx."""
-    on, k, running = np.zeros(d.t.size), 0, False
-    while k < d.t.size:
-        length = round(d.random.uniform(90.0, 400.0) / d.dt)
-        on[k : k + length], k, running = float(running), k + length, not running
-    swing = 0.004 + 0.012 * late(on, 10.0, d.dt)
-    d.y["ax"] += swing * d.random.standard_normal(d.t.size)
-    d.y["gx"] += d.sign * 900.0 * swing**2
-
-
-Effect = Callable[[Drawn], None]
-#: Effect, cause, form, and estimate keys with the truth.
-KINDS: dict[str, tuple[Effect, str, str, dict[str, float]]] = {
-    "static": (static, "temperature", "static", {"coefficient": 0.03}),
-    "square": (bend, "temperature", "square", {"square": 0.004}),
-    "lag": (lag, "temperature", "lag", {"coefficient": 0.04, "lag_s": 310.0}),
-    "rate": (rate, "temperature", "rate", {"rate": 6.0}),
-    "filtered": (filtered, "temperature", "first_order", {"coefficient": 0.0, "rate": 8.0, "lag_s": 150.0}),
-    "play": (hysteresis, "temperature", "play", {"width": 2.6}),
-    "leak": (leak, "cross_axis", "lag", {"coefficient": 5.0, "lag_s": 13.0}),
-    "fan": (fan, "vibration", "static", {}),
-}
+EFFECTS: dict[str, Callable[[Drawn], None]] = {"lag": lag, "square": bend, "filtered": filtered}
 
 
 def looked(drawn: Drawn, axis: str = "gx") -> Diagnosed:
     return diagnose_record(drawn.record(), [axis])[axis]
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_the_form_is_named(kind: str) -> None:
-    """Nine of ten first findings have the cause and the form, or the form among those not told apart, and their
-    numbers lie within four posterior deviations of the truth: far out of 3 in 10 000."""
-    effect, cause, form, truth = KINDS[kind]
-    count = case_records(1, 20)
-    right = 0
-    for seed in range(count):
-        drawn = Drawn(7100 + seed)
-        effect(drawn)
-        first = looked(drawn).findings[0].look
-        estimate = first.estimate
-        named = first.cause == cause and form in (estimate["form"], *estimate.get("form_also_possible", ()))
-        if named and estimate["form"] == form:
-            for key, size in truth.items():
-                signed = size if key in ("lag_s", "width") else drawn.sign * size
-                named &= abs(estimate[key]["median"] - signed) < 4.0 * estimate[key]["sd"]
-        right += named
-    assert right >= math.floor(0.9 * count)
 
 
 def test_forms_of_one_channel_are_one_finding() -> None:
@@ -212,12 +157,13 @@ def test_forms_of_one_channel_are_one_finding() -> None:
     assert single >= math.floor(0.9 * count)
 
 
-@pytest.mark.parametrize("kind", ["lag", "square", "filtered"])
+@pytest.mark.parametrize("kind", EFFECTS)
 def test_the_written_model_carries_over(kind: str, tmp_path: Path) -> None:
     """The model of one record gains, on a second one of the same truth, half of what it gained on the first or more.
+    With it the first record shows the channel no more.
 
     Both hold about as much: the temperature is cycled alike."""
-    effect, *_ = KINDS[kind]
+    effect = EFFECTS[kind]
     count = case_records(1, 10)
     half = 0
     for seed in range(count):
@@ -228,6 +174,9 @@ def test_the_written_model_carries_over(kind: str, tmp_path: Path) -> None:
             log = drawn.write(tmp_path / f"{number}.csv")
             if number == 0:
                 diagnose(log, axes=["gx"], write_model=tmp_path / "model.yaml")
+                again = diagnose(log, axes=["gx"], model=tmp_path / "model.yaml", write_model=tmp_path / "again.yaml")
+                assert "temperature" not in {one["cause"] for one in again["axes"]["gx"]["findings"]}
+                assert "temperature:" in (tmp_path / "again.yaml").read_text(encoding="utf-8")
             evidence = [
                 max(identify(log, axes=["gx"], model=model)["axes"]["gx"]["log_evidence"].values())
                 for model in (None, tmp_path / "model.yaml")

@@ -128,7 +128,7 @@ from functools import partial
 from pathlib import Path
 sys.path[:] = {path!r}
 from selfcal import ending
-from selfcal.spread import spread
+from selfcal.batch.spread import spread
 from test_cases_holes import slow
 ending.install()
 spread(partial(slow, Path(sys.argv[1])), range(4), settings={{}}, piece=1)

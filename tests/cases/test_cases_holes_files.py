@@ -318,7 +318,8 @@ def test_set_up_names_the_browser_or_leaves_it_out(tmp_path: Path, browser: str,
         "PYTHON": sys.executable,
         "BROWSER": browser,
     }
-    done = subprocess.run(["sh", "-c", machine], cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
+    command = ["sh", "-c", machine, "system.sh", "dev"]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     calls = (tmp_path / "calls").read_text() if (tmp_path / "calls").exists() else ""
     assert ("chromium" in calls) == ("chromium" in done.stdout) == (browser == "1" and root)

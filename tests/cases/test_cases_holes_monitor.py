@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
+import fcntl
 import io
+import json
+import os
 import random
 import signal
+import struct
 import subprocess
+import termios
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -15,8 +22,9 @@ import pytest
 from rich.console import Console
 
 from selfcal.base.errors import UserError
+from selfcal.logs.framelog import WRITTEN, FrameLog
 from selfcal.verbs import monitor as verb
-from selfcal.wire.framelog import FLUSH_S, WRITTEN, FrameLog, FrameWriter
+from selfcal.wire.frame_writer import FLUSH_S, FrameWriter
 from selfcal.wire.frames import Decoder, Streams, frame_crc
 from selfcal.wire.live import Contact, View
 
@@ -468,3 +476,61 @@ def test_a_full_disk_is_one_line() -> None:
         writer.write(message(lines(stream(45, 1))[0]))
         writer._do(writer._flush)
     assert "\n" not in str(caught.value)
+
+
+# ------------------------------------------------------------------------------------------ readers that stop reading
+
+
+@contextmanager
+def terminal() -> Iterator[tuple[int, int]]:
+    """A terminal of 40 lines whose other end nobody reads: both ends."""
+    ours, its = os.openpty()
+    fcntl.ioctl(its, termios.TIOCSWINSZ, struct.pack("HHHH", 40, 120, 0, 0))
+    try:
+        yield ours, its
+    finally:
+        os.close(ours)
+        os.close(its)
+
+
+@pytest.mark.parametrize("number", [None, signal.SIGTERM])
+def test_a_terminal_that_stops_reading_holds_nothing(number: signal.Signals | None) -> None:
+    """It takes 4096 bytes, some four frames of the view. The command ends when its time is up, or at a signal."""
+    sent = "".join(f"{line}\r" for line in lines(stream(41, 30)) * 6).encode()
+    with serial_line(sent) as path, terminal() as (ours, its):
+        duration = ["--duration", "4"] if number is None else []
+        command = [*COMMAND, "monitor", "--channel", path, *duration]
+        program = subprocess.Popen(command, stdin=its, stdout=its, stderr=its)
+        try:
+            if number is not None:
+                while struct.unpack("i", fcntl.ioctl(ours, termios.FIONREAD, bytes(4)))[0] < 3500:
+                    assert program.poll() is None
+                    time.sleep(0.1)
+                time.sleep(1.0)  # more frames than it takes
+                program.send_signal(number)
+            assert program.wait(20.0) == 0
+        finally:
+            program.kill()
+            program.wait()
+
+
+def test_lines_go_to_stdout_beside_a_view(tmp_path: Path) -> None:
+    """With stderr a terminal: each report on stdout, none in the view. A pipe that nobody reads ends by a signal."""
+    sent = "".join(f"{line}\r" for line in lines(stream(42, 20)) * 3).encode()
+    with serial_line(sent) as path, terminal() as (_, its):
+        reader, writer = os.pipe()
+        fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
+        program = subprocess.Popen(
+            [*COMMAND, "monitor", "--channel", path, "--stream", "jsonl"], stdin=its, stdout=writer, stderr=its
+        )
+        os.close(writer)
+        try:
+            with os.fdopen(reader, "rb") as pipe:
+                told = [json.loads(pipe.readline()) for _ in range(5)]
+                time.sleep(1.5)  # it is full by now
+                program.send_signal(signal.SIGTERM)
+                assert program.wait(20.0) == 0
+        finally:
+            program.kill()
+            program.wait()
+    assert all({"timestamp", "node0"} == set(one) for one in told)

@@ -13,7 +13,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Sequence
-from importlib import import_module
+from importlib import import_module, metadata
 from pathlib import Path
 
 import logs
@@ -22,15 +22,19 @@ import pytest
 from scipy.stats import binom
 
 from selfcal.base.errors import UserError
-from selfcal.logs.loaders import FORMATS, child, format_of
+from selfcal.logs.loaders import FORMATS, check_library, child, format_of
 from selfcal.logs.loaders.headings import parse_scales
 from selfcal.logs.loaders.table import Hints
 from selfcal.logs.recording import Recording, load, parse_pairs
-from selfcal.verbs.convert import convert
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
+from selfcal.wire.frame_writer import FrameWriter
+from selfcal.wire.frames import open_bus
 
 from conftest import ROOT, case_records, run
+
+#: Every log that a test here opens, `convert` writes without loss.
+pytestmark = pytest.mark.usefixtures("reads_back")
 
 #: Interval of the writers' least exact stamps against a clock: the rate is asked for to 1e-4.
 RATE = 1e-4
@@ -408,26 +412,26 @@ def test_a_driver_that_takes_turns(drawn: logs.Drawn, tmp_path: Path) -> None:
 
 
 def test_a_library_that_is_absent(drawn: logs.Drawn, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = logs.write_ulog(drawn, tmp_path)
+    """The line names an extra of this package, for every format whose library is none of its dependencies. Truth: the
+    package's metadata."""
+    declared = metadata.metadata("selfcal").get_all("Provides-Extra") or []
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(UserError, match=r"is a ULog file, and pyulog is not installed: .* install selfcal"):
-        load(log)
-
-
-@pytest.mark.parametrize(("name", "output"), [("ros2", "x.npz"), ("phyphox", "x.csv")])
-def test_convert(name: str, output: str, drawn: logs.Drawn, tmp_path: Path) -> None:
-    """What is written reads back: the same axes at the same rates."""
-    log = logs.WRITERS[name](drawn, tmp_path)
-    done = run("convert", log, "-o", tmp_path / output)
-    assert done.returncode == 0, done.stderr
-    assert "800 rows, 100 Hz, 8 s" in done.stdout
-    before, after = load(log), load(tmp_path / output)
-    assert list(before.columns) == list(after.columns)
-    for column in before.columns:
-        assert after.clock_of(column).rate_hz == pytest.approx(before.clock_of(column).rate_hz, rel=1e-9)
-        assert after.columns[column].values == pytest.approx(before.columns[column].values, rel=1e-8)
-    with pytest.raises(UserError, match="is the log itself"):
-        convert(log, log)
+    for one in FORMATS:
+        if one.library and one.library != "can":
+            assert one.extra in declared
+            with pytest.raises(
+                UserError, match=rf"{one.library} is not installed: .* install 'selfcal\[{one.extra}\]'$"
+            ):
+                check_library(tmp_path, one)
+    with pytest.raises(UserError, match=r"is a ULog file, and pyulog is not installed: .* install 'selfcal\[px4\]'$"):
+        load(logs.write_ulog(drawn, tmp_path))
+    monkeypatch.setattr("selfcal.logs.framelog.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"run.mcap: mcap is not installed: .* install 'selfcal\[mcap\]'$"):
+        FrameWriter(tmp_path / "run.mcap")
+    assert not (tmp_path / "run.mcap").exists()
+    monkeypatch.setattr("selfcal.wire.frames.find_spec", lambda _: None)
+    with pytest.raises(UserError, match=r"msgpack is not installed: .* install 'selfcal\[multicast\]'$"):
+        open_bus("udp_multicast", "239.74.163.2")
 
 
 def test_the_page_your_log(tmp_path: Path) -> None:

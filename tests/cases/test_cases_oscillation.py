@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from drifts import LAWS, assert_held, clean_ones_named, noise, recorded
+from drifts import LAWS, noise, recorded
 from scipy import stats
 from scipy.stats import binom
 from swings import Swing, plain_ones
@@ -35,40 +35,6 @@ from agreement import Nodes, assert_prediction_is_that_of_a_gap, compare, hold
 from conftest import case_records
 
 SECONDS = 3600.0
-
-
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("rate", [1.0, 10.0])
-def test_an_oscillation_of_30_nats_is_named_first(law: str, rate: float) -> None:
-    """9 of 10. A line beside it, or instead of it, would be a phase that the record does not have."""
-    random = np.random.default_rng([461, round(rate), LAWS.index(law)])
-    right = total = 0
-    for _, _, _, record in plain_ones(random, law, rate, SECONDS, case_records(1, 20)):
-        one = diagnose_record(record, ["gx"])["gx"]
-        total += 1
-        right += [finding.look.cause for finding in one.findings][:1] == ["oscillation"]
-    print(f"oscillation, {law}, {rate:g} Hz: {right} of {total}")
-    assert binom.cdf(right, total, 0.9) > 1e-3
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_period_damping_and_size_lie_in_their_intervals(law: str) -> None:
-    """90 %, the lower tail of the binomial not below 1 in 1000."""
-    random = np.random.default_rng([462, LAWS.index(law)])
-    held: dict[str, list[bool]] = {"period_s": [], "damping": [], "sd": []}
-    for swing, _, state, record in plain_ones(random, law, 1.0, SECONDS, case_records(6, 100)):
-        estimate = oscillation.looks(state, record)[0].estimate
-        for key, each in held.items():
-            each.append(estimate[key]["q05"] <= getattr(swing, key) <= estimate[key]["q95"])
-    assert_held(held, law)
-
-
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("rate", [1.0, 10.0])
-def test_clean_records_do_not_oscillate(law: str, rate: float) -> None:
-    """1 of 200 at most."""
-    named, _ = clean_ones_named(oscillation.looks, 463, law, rate, SECONDS)
-    assert named <= 1
 
 
 @pytest.mark.parametrize("law", LAWS)

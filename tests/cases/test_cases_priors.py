@@ -11,12 +11,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from beyond_priors import drawn
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 from scipy.stats import binom
 
+from selfcal.bank.priors import for_record
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
-from selfcal.readings.priors import for_record
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -190,3 +192,62 @@ def test_every_target_has_the_same_limits(tmp_path: Path) -> None:
             assert abs(probability - found[name]["hypotheses"][law]) < 1e-3
         one, other = (tree["parameters"]["random_walk"]["N"] for tree in (axis, found[name]))
         assert abs(one["median"] - other["median"]) < 0.1 * other["sd"]
+
+
+# ------------------------------------------------------------------------------- posteriors that lean on an end
+
+
+def test_a_walk_below_the_least_K_is_a_walk(tmp_path: Path) -> None:
+    """K 4e-6 of priors from 2e-5 on, 30 crossings of white noise and walk long. 4 sd; of many records nine of ten
+    intervals hold N and K (1e-4 of the binomial). Its law is the walk, or a Gauss-Markov drift of the record's time."""
+    N, K, dt_s, n = 0.012, 4e-6, 13.0, 12_000
+    count, held = case_records(2, 40), {"N": 0, "K": 0}
+    for seed in range(count):
+        y = drawn(np.random.default_rng([81, seed]), N, K, n, dt_s)
+        (axis,) = identify(write(tmp_path / "log.npz", 1.0 / dt_s, gx=("deg/s", y)), suspicion=False)["axes"].values()
+        assert axis["priors"] == "from this record" and "K" in axis["own_priors"]
+        assert axis["hypotheses"]["random_walk"] > 0.01 and axis["summary"]["rrw"]["reason"] != "the drift is 1/f noise"
+        walk = axis["parameters"]["random_walk"]
+        assert abs(deviation(walk["N"], N)) < 4.0 and abs(deviation(walk["K"], K)) < 4.0
+        for name, truth in (("N", N), ("K", K)):
+            held[name] += walk[name]["q05"] <= truth <= walk[name]["q95"]
+    assert min(held.values()) >= binom.ppf(1e-4, count, 0.9)
+
+
+@pytest.mark.parametrize(("N", "sigma_m", "time_s", "dt_s"), [(2e-3, 1.2e-4, 3000.0, 20.0), (0.02, 0.02, 9e3, 32.0)])
+def test_a_markov_drift_beyond_its_ends_has_limits_of_its_own(
+    N: float, sigma_m: float, time_s: float, dt_s: float, tmp_path: Path
+) -> None:
+    """A sigma_m below the least of 5e-4, a time beyond the longest of 5000 s that a walk does not describe. 4 sd."""
+    random, n, phi = np.random.default_rng(round(time_s)), 25_000, math.exp(-dt_s / time_s)
+    kick = sigma_m * math.sqrt(1.0 - phi * phi) * random.normal(size=n)
+    kick[0] = sigma_m * random.normal()
+    y = lfilter([1.0], [1.0, -phi], kick) + N / math.sqrt(dt_s) * random.normal(size=n)
+    (axis,) = identify(write(tmp_path / "log.npz", 1.0 / dt_s, gx=("deg/s", y)), suspicion=False)["axes"].values()
+    assert axis["priors"] == "from this record"
+    markov = axis["parameters"]["gauss_markov"]
+    assert axis["hypotheses"]["gauss_markov"] > 0.5
+    for name, truth in (("N", N), ("sigma_m", sigma_m), ("alpha", 1.0 / time_s)):
+        assert abs(deviation(markov[name], truth)) < 4.0
+
+
+def test_an_invisible_walk_has_an_upper_limit(tmp_path: Path) -> None:
+    """K 1e-7 beside N 0.02 crosses it after four days; the record is one day. No law is excluded, no limit is 0."""
+    y = drawn(np.random.default_rng(83), 0.02, 1e-7, 8640, 10.0)
+    (axis,) = identify(write(tmp_path / "log.npz", 0.1, gx=("deg/s", y)), suspicion=False)["axes"].values()
+    rrw = axis["summary"]["rrw"]
+    assert not rrw["identified"] and rrw["reason"] == "the law is not decided"
+    assert rrw["q95"] > 1e-7 and min(axis["hypotheses"].values()) > 0.01
+
+
+@pytest.mark.parametrize("seconds", [900, 3600, 14_400])
+def test_limits_that_hold_the_truth_stay(seconds: int, tmp_path: Path) -> None:
+    """Walks of the default priors, as drawn by them: limits move in at most 1 of 20 of those that lean, and 1 of 10
+    leans. So at most 1 of 200 moves."""
+    random, count, moved, model = np.random.default_rng(seconds), case_records(20, 200), 0, Model.load()
+    for _ in range(count):
+        N = math.exp(random.uniform(math.log(1.2e-3), math.log(0.42)))
+        K = min(N, math.exp(random.uniform(math.log(2e-5), math.log(2e-2))))
+        log = load(write(tmp_path / "log.npz", 1.0, gx=("deg/s", drawn(random, N, K, seconds, 1.0))))
+        moved += for_record(model, log, ("gx",)) is not model
+    assert binom.sf(moved - 1, count, 1.0 / 200.0) > 1e-3

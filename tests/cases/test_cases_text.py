@@ -22,6 +22,9 @@ from selfcal.verbs.identify import identify
 
 from conftest import case_records, shared_case
 
+#: Every log that a test here opens, `convert` writes without loss.
+pytestmark = pytest.mark.usefixtures("reads_back")
+
 Floats = NDArray[np.float64]
 
 
@@ -424,7 +427,8 @@ def test_a_column_that_nobody_asked_for_stops_nothing(tmp_path: Path) -> None:
     recording = load(log)
     assert list(recording.columns) == ["gx"]
     assert recording.columns["gx"].values == pytest.approx(GYRO, abs=1e-5)
-    assert recording.notes == ("column 'temp' has no unit and is left out: write temp[degC], or give --unit temp=degC",)
+    advice = "write temp[degC], or give --unit temp=degC, or the unit that it is in"
+    assert recording.notes == (f"column 'temp' has no unit and is left out: {advice}",)
     with pytest.raises(UserError, match="line 2: column 'note': 'start' is not a number"):
         load(log, units={"note": "V"})
     with pytest.raises(UserError, match="column 'gx': infinite"):

@@ -14,7 +14,9 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.identify import identify
 
 from conftest import case_records
 
@@ -57,17 +59,25 @@ def test_sizes_are_those_of_all_causes_together(tmp_path: Path) -> None:
             assert float(written[cause][key]) == pytest.approx(size["median"], rel=1e-7)
 
 
-def test_findings_without_room_in_the_model_file_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Four lines have eight columns, and a model file holds six: the weakest line is left out, and said to be."""
+def test_findings_without_room_on_a_module_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Four lines have eight columns, and a bank has six: a module has none of the weakest line, and each verb says so.
+    The file has all four, and `diagnose` takes them."""
     random = np.random.default_rng(6122)
     t = np.arange(3000.0)
     sizes = {0.031: 0.05, 0.083: 0.045, 0.127: 0.04, 0.211: 0.03}
     y = N * random.standard_normal(t.size) + K * random.standard_normal(t.size).cumsum()
     y += sum(size * np.sin(2.0 * np.pi * hz * t + hz) for hz, size in sizes.items())
-    model = tmp_path / "model.yaml"
-    findings = diagnose(write(tmp_path / "log.csv", t, y), axes=["gx"], write_model=model)["axes"]["gx"]["findings"]
+    log, model = write(tmp_path / "log.csv", t, y), tmp_path / "model.yaml"
+    findings = diagnose(log, axes=["gx"], write_model=model)["axes"]["gx"]["findings"]
     out = [one for one in findings if "left_out_of_model" in one]
     assert [one["estimate"]["frequency_hz"]["median"] for one in out] == pytest.approx([0.211], abs=1e-4)
-    assert f"{model.name} leaves out gx periodic" in capsys.readouterr().err
+    assert f"{model.name}: a module leaves out gx periodic" in capsys.readouterr().err
     tree = yaml.safe_load(model.read_text(encoding="utf-8"))
-    assert [entry["frequency_hz"] for entry in tree["regressors"]] == pytest.approx([0.031, 0.083, 0.127], abs=1e-4)
+    assert [entry["frequency_hz"] for entry in tree["regressors"]] == pytest.approx(list(sizes), abs=1e-4)
+    codegen(model, tmp_path / "tables")
+    assert "#define SELFCAL_MODEL_REGRESSORS 6U" in (tmp_path / "tables" / "selfcal_model.h").read_text("utf-8")
+    identify(log, model=model)
+    said = capsys.readouterr().err
+    assert said.count("a bank has 6 columns, and leaves out line_0.21") == 2
+    again = diagnose(log, axes=["gx"], model=model)["axes"]["gx"]
+    assert again["verdict"] == "adequate"

@@ -13,12 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from drifts import LAWS, assert_held, clean_ones_named, noise, recorded
-from scipy.stats import binom
+from drifts import noise, recorded
 
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.causes import turn_on
-from selfcal.diagnosis.loop import diagnose_record
 from selfcal.likelihood.state import Look
 from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import DEFAULT
@@ -26,7 +24,7 @@ from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
 
-from conftest import case_records, shared_case
+from conftest import shared_case
 
 
 def looked(y: Array, rate: float) -> Look | None:
@@ -40,58 +38,6 @@ def drawn(random: np.random.Generator, rate: float, seconds: float) -> tuple[Arr
     tau = math.exp(random.uniform(math.log(20.0), math.log(300.0)))
     amplitude = float(random.choice([-1.0, 1.0])) * random.uniform(0.35, 0.6)
     return amplitude * np.exp(-t / tau), amplitude, tau
-
-
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize("rate", [1.0, 10.0])
-def test_a_plain_turn_on_is_named_first_and_alone(law: str, rate: float) -> None:
-    """9 of 10 at 40 nats and more. No step is left of it."""
-    random = np.random.default_rng([421, round(rate), LAWS.index(law)])
-    right = total = 0
-    for _ in range(case_records(1, 40)):
-        shape, _, _ = drawn(random, rate, 3600.0)
-        _, record = recorded(noise(random, law, shape.size, rate) + shape, rate)
-        one = diagnose_record(record, ["gx"])["gx"]
-        total += 1
-        right += [finding.look.cause for finding in one.findings] == ["turn_on"]
-    print(f"turn_on, {law}, {rate:g} Hz: {right} of {total}")
-    assert binom.cdf(right, total, 0.9) > 1e-3
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_amplitude_and_time_constant_lie_in_their_intervals(law: str) -> None:
-    """90 %, neither tail of the binomial below 1 in 1000."""
-    random = np.random.default_rng([422, LAWS.index(law)])
-    held: dict[str, list[bool]] = {"amplitude": [], "tau_s": []}
-    for _ in range(case_records(8, 200)):
-        shape, amplitude, tau = drawn(random, 1.0, 3600.0)
-        look = looked(noise(random, law, shape.size, 1.0) + shape, 1.0)
-        assert look is not None
-        for key, truth in (("amplitude", amplitude), ("tau_s", tau)):
-            held[key].append(look.estimate[key]["q05"] <= truth <= look.estimate[key]["q95"])
-    assert_held(held, law)
-    for key, each in held.items():
-        assert binom.sf(sum(each) - 1, len(each), 0.9) > 1e-3, key
-
-
-def test_two_time_constants_are_one_finding() -> None:
-    """Each estimate within four of its standard deviations: 1 in 10 000 of a normal's."""
-    random = np.random.default_rng(423)
-    t = np.arange(3600.0)
-    truth = {"amplitude": 0.5, "tau_s": 20.0, "amplitude_2": -0.3, "tau_2_s": 300.0}
-    shape = 0.5 * np.exp(-t / 20.0) - 0.3 * np.exp(-t / 300.0)
-    look = looked(noise(random, "walk", t.size, 1.0) + shape, 1.0)
-    assert look is not None and set(look.estimate) == set(truth)
-    for key, value in truth.items():
-        assert abs(look.estimate[key]["mean"] - value) < 4.0 * look.estimate[key]["sd"], key
-
-
-@pytest.mark.parametrize("law", LAWS)
-@pytest.mark.parametrize(("rate", "seconds"), [(1.0, 3600.0), (1.0, 1200.0), (10.0, 1200.0)])
-def test_a_clean_record_shows_none(law: str, rate: float, seconds: float) -> None:
-    """1 of 200 at most; of so many more than 4 have a chance of 1 in 300."""
-    named, count = clean_ones_named(turn_on.looks, 424, law, rate, seconds, (6, 200))
-    assert named <= (4 if count >= 200 else 1)
 
 
 def test_the_amplitude_is_the_one_at_the_start_of_the_recording() -> None:

@@ -6,7 +6,6 @@ Truth: the numbers that each record was drawn with, sample by sample.
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +15,7 @@ from selfcal.diagnosis.causes import variance_change
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, P_LOOK, Look, State
 from selfcal.likelihood.statemodel import Array
-from selfcal.logs.recording import save
 from selfcal.model.forms import variance_of
-from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records
 
@@ -126,17 +123,3 @@ def test_an_axis_without_noise_is_no_channel(quiet: str) -> None:
     assert set(levels) == (set() if quiet == "throughout" else {"gy"})
     assert all(np.isfinite(values).all() for values in levels.values())
     variance_change.looks(axes["gx"], record)
-
-
-def test_a_recording_of_both(tmp_path: Path) -> None:
-    """The whole diagnosis names the temperature, states the size, and the noise level is explained by it."""
-    random = np.random.default_rng(73)
-    y, temperature, _, size = drawn(random, "temperature")
-    save(tmp_path / "log.npz", {"gx": ("deg/s", 0.04 * y), "temp": ("degC", temperature)}, 1.0)
-    findings = diagnose(tmp_path / "log.npz")["axes"]["gx"]["findings"]
-    (found,) = (one for one in findings if one["cause"] == "variance_change")
-    assert found["estimate"]["channel"] == "temp"
-    assert found["estimate"]["coefficient"]["unit"] == "1/degC"
-    assert found["estimate"]["coefficient"]["median"] == pytest.approx(size, abs=0.02)
-    assert found["gain"]["log_score_per_sample"]["after"] > found["gain"]["log_score_per_sample"]["before"]
-    assert "Channel temp" in found["words"]

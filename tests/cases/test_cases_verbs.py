@@ -477,6 +477,21 @@ def test_means_come_first_and_every_sample_is_final(
         diagnose(tmp_path / "log.npz", decimate=1.0, full_rate=True)
 
 
+def test_a_fast_log_too_short_for_means_is_looked_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """90 s have 90 means of 1 s, and a look takes 200. Truth: a line of 2.7 Hz. A recording of so few samples would
+    have two looks here only."""
+    monkeypatch.setattr(diagnose_module, "FIRST_FROM", 1000)
+    columns = quiet(10, 25.0, 90.0, ("gx",))
+    columns["gx"][1][:] += 0.09 * np.sin(2.0 * np.pi * 2.7 * np.arange(columns["gx"][1].size) / 25.0)
+    save(tmp_path / "log.npz", columns, 25.0)
+    axis = diagnose(tmp_path / "log.npz")["axes"]["gx"]
+    assert axis["judged_at_hz"] == 25.0 and "only_in_means" not in axis
+    assert [one["cause"] for one in axis["findings"]] == ["periodic"]
+    assert capsys.readouterr().err == ""
+
+
 def test_work_is_bounded_and_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

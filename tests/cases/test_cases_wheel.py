@@ -22,6 +22,7 @@ from pathlib import Path
 import pytest
 
 import selfcal
+from selfcal.logs.loaders import FORMATS
 from selfcal.wire import package_codegen
 from selfcal.wire.demo import SHIPPED
 
@@ -34,11 +35,14 @@ BUILD_SDIST = "import sys, scikit_build_core.build as build; build.build_sdist(s
 NEWER = re.compile(r"\t(v(?!err|erw)\w+|andn|mulx|pdep|pext|sarx|shlx|shrx|rorx)\s")
 
 
+#: With what builds the package, which lies beside the environment.
+BUILDING = {**os.environ, "PYTHONPATH": str(ROOT / ".venv" / "backend")}
+
+
 def archive(folder: Path) -> Path:
     """The source archive."""
-    done = subprocess.run(
-        [sys.executable, "-c", BUILD_SDIST, folder], cwd=ROOT / "tools", capture_output=True, text=True, check=False
-    )
+    command = [sys.executable, "-c", BUILD_SDIST, folder]
+    done = subprocess.run(command, cwd=ROOT / "tools", env=BUILDING, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     (made,) = folder.glob("*.tar.gz")
     return made
@@ -64,7 +68,7 @@ def test_a_source_archive_is_whole(tmp_path: Path) -> None:
     assert metadata["Version"] == package_codegen.version(ROOT / "lib")
     assert metadata["License-Expression"] == "MIT"
     assert metadata["Description-Content-Type"] == "text/markdown"
-    assert {"ardupilot", "automotive", "foxglove", "lab", "r"} <= set(metadata.get_all("Provides-Extra") or ())
+    assert {one.extra for one in FORMATS if one.extra} <= set(metadata.get_all("Provides-Extra") or ())
 
 
 @pytest.mark.skipif(os.uname().machine != "x86_64" or shutil.which("objdump") is None, reason="reads x86-64 code")
@@ -93,7 +97,7 @@ selfcal._fma = lambda: sys.argv[1] == "fma"
 from selfcal import _library32
 from selfcal.bank.library import Bank
 from selfcal.model import DEFAULT, Model
-from selfcal.tables import make_tables
+from selfcal.model.tables import make_tables
 for name in ("default", "sums"):
     bank = Bank(make_tables(Model.load(DEFAULT.with_name(f"{name}.yaml")), 10.0, ("gx", "ay"), bank_rate_hz=10.0))
     noise = np.random.default_rng(3).normal(size=(2, 4000, 2))
@@ -132,7 +136,8 @@ class Installed:
 
     @staticmethod
     def _pip(*arguments: str | Path) -> None:
-        done = subprocess.run([sys.executable, "-m", "pip", *arguments], capture_output=True, text=True, check=False)
+        command = [sys.executable, "-m", "pip", *arguments]
+        done = subprocess.run(command, env=BUILDING, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
 
     def start(self, *arguments: str | Path, path: str | None = None) -> subprocess.Popen[str]:

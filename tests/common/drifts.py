@@ -12,12 +12,9 @@ import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import NET_LEAST, State
+from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
-
-from conftest import case_records
 
 N, K, SIGMA_M, TIME_S = 0.04, 3e-4, 0.012, 250.0
 LAWS = ("walk", "markov")
@@ -56,19 +53,6 @@ def recorded(y: Array, rate: float) -> tuple[State, Record]:
     level = float(np.median(y))
     state = State("gx", "deg/s", y - level, 1.0 / rate, level, np.ones(y.size)).refit()
     return state, Record(rate, {"gx": state}, {}, {}, np.isfinite(y), recorded_hz=rate)
-
-
-def clean_ones_named(
-    looks: Looks, seed: int, law: str, rate: float, seconds: float, records: tuple[int, int] = (3, 200)
-) -> tuple[int, int]:
-    """Clean records in which a look is worth a finding, and all: few in `make test`, many in `make cases`."""
-    random = np.random.default_rng([seed, round(rate), round(seconds), LAWS.index(law)])
-    count, named = case_records(*records), 0
-    for _ in range(count):
-        found = looks(*recorded(noise(random, law, round(seconds * rate), rate), rate))
-        named += bool(found) and found[0].net >= NET_LEAST
-    print(f"clean, {law}, {rate:g} Hz, {seconds:g} s: {named} of {count}")
-    return named, count
 
 
 def assert_held(held: Mapping[str, Sequence[bool]], what: str) -> None:

@@ -18,7 +18,7 @@ fuzz: $(FUZZ)/fuzz_api
 	    $(if $(SECONDS),-max_total_time=$(SECONDS),-runs=$(RUNS)) $(FUZZ)/corpus tests/fuzz/found
 
 # -march=native: fused multiply-adds are no calls.
-$(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch]) | $(MODEL)/selfcal_model.c
+$(BUILD)/fuzz/%/fuzz_api: tests/fuzz/fuzz_api.c $(wildcard lib/*.[ch]) | $(MODEL)/selfcal_model.c setup-dev
 	@mkdir -p $(@D)
 	clang -std=c99 -O2 -g -march=native -ffp-contract=off -Ilib -I$(MODEL) $(FUZZ_SIZES) \
 	    $(patsubst fixed,-DSELFCAL_FIXED,$(filter fixed,$*)) \

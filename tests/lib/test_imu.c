@@ -279,6 +279,147 @@ static void test_a_pipe_without_parts_is_a_bank(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_ask(&imu, 1U << AXES)); /* no such axis */
 }
 
+/* --- before any report --- */
+
+static void fill(void *bytes, size_t count) {
+    memset(bytes, 0xB4, count);
+}
+
+/* What every getter of selfcal.h says of a pipe without a report, whatever was in its memory. */
+static void assert_nothing_known(const char *when) {
+    selfcal_corrected_t corrected;
+    const uint32_t motion = selfcal_imu_motion(&imu);
+    for (uint8_t axis = 0; axis < AXES; axis++) {
+        TEST_ASSERT_NULL_MESSAGE(selfcal_imu_report(&imu, axis), when);
+        const selfcal_judgement_t *judged = selfcal_imu_judgement(&imu, axis);
+        TEST_ASSERT_EQUAL_MESSAGE(pipe.judging != NULL, judged != NULL, when);
+        if (judged != NULL) {
+            TEST_ASSERT_EQUAL_MESSAGE(SELFCAL_NOT_JUDGED, judged->state, when);
+            TEST_ASSERT_EQUAL_MESSAGE(SELFCAL_REASON_NO_REPORT, judged->reason, when);
+            TEST_ASSERT_EQUAL_MESSAGE(SELFCAL_SUSPECT_NONE, judged->suspect, when);
+            TEST_ASSERT_EQUAL_MESSAGE(0U, judged->samples + judged->changes, when);
+            TEST_ASSERT_TRUE_MESSAGE(judged->score == 0.0F && isnan(judged->temperature_span), when);
+            TEST_ASSERT_TRUE_MESSAGE(judged->change.size == 0.0F && judged->change.ago_s == 0.0F, when);
+        }
+        const selfcal_sent_coefficient_t *sent = selfcal_imu_coefficients(&imu, axis);
+        TEST_ASSERT_EQUAL_MESSAGE(pipe.columns != NULL, sent != NULL, when);
+        TEST_ASSERT_TRUE_MESSAGE(sent == NULL || isnan(sent[0].mean), when);
+        TEST_ASSERT_EQUAL_MESSAGE(motion == SELFCAL_STATUS_MOTION_MOVING ? SELFCAL_REASON_MOVING
+                                                                         : SELFCAL_REASON_NO_REPORT,
+                                  selfcal_imu_reason(&imu, axis), when);
+        TEST_ASSERT_TRUE_MESSAGE(isnan(selfcal_imu_bias(&imu, axis)), when);
+    }
+    TEST_ASSERT_EQUAL_MESSAGE(pipe.gate_code != NULL, motion != SELFCAL_STATUS_MOTION_NOT_WATCHED, when);
+    TEST_ASSERT_FALSE_MESSAGE(selfcal_imu_corrected(&imu, &corrected), when);
+    TEST_ASSERT_TRUE_MESSAGE(selfcal_imu_room(&imu), when);
+    TEST_ASSERT_EQUAL_MESSAGE(0U, selfcal_count(&imu.bank) + selfcal_counters(&imu.bank)->samples, when);
+}
+
+static bool full(void *context, const void *bytes, size_t count) {
+    (void)context;
+    (void)bytes;
+    (void)count;
+    return false;
+}
+
+/* IEEE 802.3, bit by bit. */
+static void mend_crc(void) {
+    uint32_t crc = 0xFFFFFFFFU;
+    for (size_t at = 0; at < 8U * (saved_bytes - 4U); at++) {
+        const uint32_t bit = (crc ^ (uint32_t)saved[at / 8U] >> at % 8U) & 1U;
+        crc = crc >> 1 ^ (bit != 0U ? 0xEDB88320U : 0U);
+    }
+    for (unsigned i = 0; i < 4U; i++) {
+        saved[saved_bytes - 4U + i] = (unsigned char)(~crc >> 8U * i);
+    }
+}
+
+/* A snapshot with 0xB4 from a place on: its checksum fits where `mended`. */
+static selfcal_status_t restore_spoiled(size_t from, size_t length, bool mended) {
+    saved_bytes = 0;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_save(&imu, put, NULL));
+    fill(saved + from, saved_bytes - from);
+    if (mended) {
+        mend_crc();
+    }
+    return selfcal_imu_restore(&imu, saved, length > 0U ? length : saved_bytes, 3U);
+}
+
+static void begin_filled(void) {
+    fill(&imu, sizeof imu);
+    fill(&kept, sizeof kept);
+    fill(memory, sizeof memory);
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
+}
+
+static void use_every_getter(void) {
+    begin_filled();
+    assert_nothing_known("begun");
+    selfcal_imu_keep(&imu, &kept);
+    assert_nothing_known("reports are kept");
+    TEST_ASSERT_EQUAL(SELFCAL_TOO_SHORT, selfcal_imu_ask(&imu, SELFCAL_ALL_AXES));
+    assert_nothing_known("no report can be made");
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_work(&imu));
+    assert_nothing_known("none is due");
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_shift(&imu, AXES, 1.0F));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_shift(&imu, 0, NAN));
+    assert_nothing_known("a shift refused");
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_shift(&imu, 0, 0.25F));
+    assert_nothing_known("a shift");
+    TEST_ASSERT_EQUAL(SELFCAL_WRITE_FAILED, selfcal_imu_save(&imu, full, NULL));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_save(&imu, NULL, NULL));
+    assert_nothing_known("a save failed");
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_imu_restore(&imu, NULL, 64U, 0U));
+    TEST_ASSERT_EQUAL(SELFCAL_SNAPSHOT_FOREIGN, restore_spoiled(0U, 0U, false));
+    TEST_ASSERT_EQUAL(SELFCAL_SNAPSHOT_TRUNCATED, restore_spoiled(saved_bytes - 1U, saved_bytes - 5U, false));
+    TEST_ASSERT_EQUAL(SELFCAL_SNAPSHOT_TOO_LONG, restore_spoiled(saved_bytes - 1U, saved_bytes + 1U, false));
+    TEST_ASSERT_EQUAL(SELFCAL_SNAPSHOT_DAMAGED, restore_spoiled(saved_bytes / 2U, 0U, false));
+    TEST_ASSERT_EQUAL(SELFCAL_SNAPSHOT_VERSION, restore_spoiled(8U, 0U, true));
+    assert_nothing_known("a snapshot refused");
+    TEST_ASSERT_EQUAL(SELFCAL_CORRUPT, restore_spoiled(24U, 0U, true));
+    assert_nothing_known("a corrupt snapshot");
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_power_on(&imu, 7U));
+    assert_nothing_known("power on");
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_forget(&imu));
+    assert_nothing_known("forgotten");
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_MEMORY, selfcal_imu_init(&imu, &pipe, memory[0], 8U));
+    begin_filled();
+    assert_nothing_known("begun after a failure");
+}
+
+/* Memory that nobody has set, with all parts of a pipe and with none. */
+static void test_getters_before_any_report(void) {
+    use_every_getter();
+    model.regressors = &regressors;
+    pipe.columns = &selfcal_columns_code;
+    use_every_getter();
+    setUp();
+    pipe = (selfcal_pipe_t){.model = &model, .rate_hz = (float)BLOCK};
+    use_every_getter();
+}
+
+/* What was known is of the past: after selfcal_imu_forget(), and after a snapshot that left a bank without a sample. */
+static void test_getters_after_all_is_lost(void) {
+    for (unsigned keeps = 0; keeps < 4U; keeps++) {
+        run_both(0.0F);
+        imu.kept = keeps % 2U == 0U ? NULL : &kept;
+        TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_ask(&imu, 1U)); /* under way */
+        TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_work(&imu));
+        if (keeps < 2U) {
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_forget(&imu));
+        } else {
+            TEST_ASSERT_EQUAL(SELFCAL_CORRUPT, restore_spoiled(24U, 0U, true));
+        }
+        for (uint8_t axis = 0; axis < AXES; axis++) {
+            TEST_ASSERT_NULL(selfcal_imu_report(&imu, axis));
+            TEST_ASSERT_EQUAL(SELFCAL_NOT_JUDGED, selfcal_imu_judgement(&imu, axis)->state);
+            TEST_ASSERT_TRUE(isnan(selfcal_imu_bias(&imu, axis)));
+        }
+        TEST_ASSERT_EQUAL(0U, selfcal_count(&imu.bank));
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_work(&imu)); /* nothing is due any more */
+    }
+}
+
 int main(void) {
     UNITY_BEGIN();
     RUN_TEST(test_it_is_what_its_parts_are);
@@ -288,5 +429,7 @@ int main(void) {
     RUN_TEST(test_what_the_sensor_adds_moves_with_it);
     RUN_TEST(test_what_does_not_go_together_is_refused);
     RUN_TEST(test_a_pipe_without_parts_is_a_bank);
+    RUN_TEST(test_getters_before_any_report);
+    RUN_TEST(test_getters_after_all_is_lost);
     return UNITY_END();
 }

@@ -199,7 +199,7 @@ BAD = {
     "infinity": ("t[s],gx[deg/s]\n0,1\n1,inf\n", "bad.csv: line 3: column 'gx': infinite"),
     "time backwards": ("t[s],gx[deg/s]\n0,1\n-1,2\n", "bad.csv: line 3: column 't': time runs backwards"),
     "missing unit": ("t[s],gx\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has no unit"),
-    "unknown unit": ("t[s],gx[rpm]\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has the unknown unit 'rpm'"),
+    "unknown unit": ("t[s],gx[rpn]\n0,1\n1,2\n", "bad.csv: line 1: column 'gx' has the unknown unit 'rpn'"),
     "ragged row": ("t[s],gx[deg/s]\n0,1\n1\n", "bad.csv: line 3: 1 cells where the header has 2"),
     "binary junk": ("\0\x01\x02", "bad.csv: line 1: not text (byte 0x00)"),
     "one row": ("t[s],gx[deg/s]\n0,1\n", "bad.csv: line 2: one row only"),

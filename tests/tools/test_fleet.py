@@ -450,6 +450,43 @@ def test_an_axis_of_another_kind_is_left_out_with_a_line() -> None:
     assert units["gx.N"] - units["gy.N"] == 1 == units["gx.bias"] - units["gy.bias"]
 
 
+def test_n_of_a_unit_without_numbers_of_the_batchs_law_is_compared() -> None:
+    """A posterior of the batch's law that underflows has no number: the unit's N is that of its own law, three times
+    the batch's. Its bias, ordinary, counts in the population."""
+    batch = synthetic(14, 9)
+    axis = batch[9].record["axes"]["gx"]
+    walk = axis["parameters"]["random_walk"]
+    own = {key: 3.0 * walk["N"][key] if key in ("median", "q05", "q95") else walk["N"][key] for key in walk["N"]}
+    none = {name: {**one, "median": None, "q05": None, "q95": None} for name, one in walk.items()}
+    axis["parameters"] = {"constant": {"N": own}, "random_walk": none}
+    axis |= {
+        "hypotheses": {"constant": 1.0, "random_walk": 0.0},
+        "log_evidence": {"constant": 0.0, "random_walk": -3.0},
+    }
+    summary = summed_up(batch, Model.load())
+    words = summary.unlike["d00009"]
+    assert len(words) == 1 and words[0].startswith("gx.N ")
+    population = document_of(summary)["population"]
+    assert population["gx.N"]["left_out"] == ["d00009"] and population["gx.bias"]["left_out"] == []
+    assert population["gx.K"]["units"] == population["gx.N"]["units"] - 1
+
+
+def test_two_units_of_a_dozen_are_odd_by_their_marks() -> None:
+    """Two of twelve that clip, or are of another law, are named; eight that clip are the batch's own."""
+    for clipped in (2, 8):
+        batch = synthetic(12, 10)
+        for k, one in enumerate(unit for unit in batch if unit.error is None):
+            axis = one.record["axes"]["gy"]
+            axis["marks"] = ["saturation"] if k < clipped else []
+            if k in (5, 6):
+                axis["log_evidence"] = {"random_walk": -40.0, "constant": 0.0}
+        named = [name for name, words in summed_up(batch, Model.load()).unlike.items() if "gy saturation" in words]
+        laws = [
+            words for words in summed_up(batch, Model.load()).unlike.values() if any("nats" in one for one in words)
+        ]
+        assert len(named) == (2 if clipped == 2 else 0) and len(laws) == 2
+
+
 def test_a_quantity_that_few_units_identify_is_a_line() -> None:
     """No unit is judged by it, in whichever axis: the lines and the page state that, and how many identify it."""
     batch = synthetic(10, 6)

@@ -16,6 +16,9 @@ from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import load
 
+#: Every log that a test here opens, `convert` writes without loss.
+pytestmark = pytest.mark.usefixtures("reads_back")
+
 _RATE, _ROWS, _G = 80.0, 700, units.STANDARD_GRAVITY
 _DEG = math.pi / 180.0
 
@@ -192,7 +195,7 @@ _LINES = {
         "t[s],gx[deg/s]\n0,1\n0.1,2\n0.2,3\nt[s],gx[deg/s]\n0,1\n0.1,2\n",
         r"line 6: .*time runs backwards, where the header is repeated: .* head -n 4 log.csv > first.csv",
     ),
-    "an unknown unit": ("t[s],X Gyro [x8005]\n0,1\n0.1,2\n", r"unknown unit 'x8005' .*: give --unit gx=deg/s"),
+    "an unknown unit": ("t[s],X Gyro [x8005]\n0,1\n0.1,2\n", r"unknown unit 'x8005' .* --scale 'gx=SIZE\[deg/s\]'"),
 }  # fmt: skip
 
 

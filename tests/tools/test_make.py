@@ -74,8 +74,9 @@ def test_help_names_what_the_documents_call() -> None:
 FAKE_PYTHON = """#!/bin/sh
 case "$*" in
 "-m venv --clear .venv") mkdir -p .venv/bin; cp "$0" .venv/bin/python; said=venv ;;
+"-m pip uninstall "*) exit ;;
+"-m pip "*"--target "*) mkdir -p .venv/backend; said=pip ;;
 "-m pip "*) said=pip ;;
-"tools/setup/unity.py "*) mkdir -p "$2"; : >"$2/unity.c"; said=unity ;;
 *) exec {python} "$@" ;;
 esac
 echo $said begins >>log; sleep 0.3; echo $said ends >>log
@@ -89,6 +90,7 @@ def test_set_ups_at_once_are_one(tmp_path: Path) -> None:
         "port/boards.txt",
         *(part.relative_to(ROOT) for room in ("port", "tests") for part in (ROOT / room).rglob("*.mk")),
         "tools/requirements.txt",
+        "tools/requirements-build.txt",
         "tools/pyproject.toml",
         "tools/CMakeLists.txt",
     ):
@@ -102,7 +104,7 @@ def test_set_ups_at_once_are_one(tmp_path: Path) -> None:
     command = ["make", "-j2", f"PYTHON={fake}"]
     makes = [subprocess.Popen([*command, goal], cwd=tmp_path) for goal in ("setup", "python", "setup")]
     assert [one.wait() for one in makes] == [0, 0, 0]
-    steps = [f"{step} {end}" for step in ("venv", "pip", "pip", "unity") for end in ("begins", "ends")]
+    steps = [f"{step} {end}" for step in ("venv", "pip", "pip", "pip") for end in ("begins", "ends")]
     assert sorted((tmp_path / "log").read_text().splitlines()) == sorted(steps)
     assert make("setup", f"PYTHON={fake}", cwd=tmp_path).returncode == 0
     assert len((tmp_path / "log").read_text().splitlines()) == len(steps)
@@ -112,11 +114,11 @@ def test_every_package_is_locked() -> None:
     """Each name in tools/pyproject.toml is in a lock, and each version has a hash: `make lock` was run. A package has
     one version, or one for each of several Pythons."""
     project = tomllib.loads((ROOT / "tools" / "pyproject.toml").read_text())
-    always = [*project["build-system"]["requires"], *project["project"]["dependencies"]]
     extras = [name for extra in project["project"]["optional-dependencies"].values() for name in extra]
     groups = project["dependency-groups"]
     for file, named in (
-        ("requirements.txt", [*always, *groups["build"]]),
+        ("requirements.txt", [*project["project"]["dependencies"], *groups["run"]]),
+        ("requirements-build.txt", [*project["build-system"]["requires"], *groups["build"]]),
         ("requirements-dev.txt", groups["dev"]),
         ("requirements-all.txt", [*project["project"]["dependencies"], *extras]),
     ):
@@ -129,7 +131,7 @@ def test_every_package_is_locked() -> None:
         assert {re.sub(r"[-_.]+", "-", name).lower() for name in named} <= set(versions)
         if file == "requirements.txt":
             assert len(versions) == len(locked)
-            for name in ("pip", "setuptools", "numpy"):
+            for name in ("pip", "numpy"):
                 assert metadata.version(name) == versions[name]
 
 

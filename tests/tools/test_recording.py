@@ -22,6 +22,9 @@ from selfcal.logs.recording import load, save
 
 from conftest import shared_recording
 
+#: Every log that a test here opens, `convert` writes without loss.
+pytestmark = pytest.mark.usefixtures("reads_back")
+
 HEAD = b"t[s],gx[deg/s],temp[degC]\n"
 ROWS = HEAD + b"0.0,0.5,25\n0.1,0.25,25.5\n0.2,0.125,26\n"
 

@@ -18,7 +18,7 @@ import pytest
 
 from selfcal.base.errors import UserError
 from selfcal.batch import spread as module
-from selfcal.batch.spread import Row, spread
+from selfcal.batch.spread import Row, record_seeds, spread
 from selfcal.verbs.montecarlo import montecarlo
 
 CLUSTER = all(importlib.util.find_spec(name) for name in ("distributed", "pyarrow"))
@@ -117,3 +117,11 @@ def test_no_scheduler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(UserError, match=r"--scheduler tcp://127\.0\.0\.1:9: no Dask scheduler answers") as caught:
         spread(partial(squares, None), range(2), settings={}, scheduler="tcp://127.0.0.1:9")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("seed", [-3, 2**64, 2**70 + 11])
+def test_a_seed_that_the_simulator_does_not_take(seed: int) -> None:
+    """The simulator takes 64 bits. Seeds that run over go on from 0."""
+    with pytest.raises(UserError, match=r"^--seed must be a whole number from 0 to 2\^64 - 1"):
+        record_seeds(5, seed)
+    assert record_seeds(3, 2**64 - 1) == [2**64 - 1, 1_000_002, 2_000_005]

@@ -23,10 +23,10 @@ from test_replay_can import COMMAND, demonstration
 from websockets.sync.client import connect
 
 from selfcal.base.errors import UserError
+from selfcal.logs.framelog import LARGEST, FrameLog
 from selfcal.verbs.monitor import monitor
-from selfcal.wire.framelog import FrameLog
 from selfcal.wire.frames import Decoder
-from selfcal.wire.streams import LARGEST, McapLog, check
+from selfcal.wire.streams import McapLog, check
 
 from conftest import CASE_RECORDS
 from wire_stream import AXES, lines, stream

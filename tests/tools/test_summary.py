@@ -120,6 +120,13 @@ def test_the_limit_of_no_walk_is_above_zero() -> None:
     assert not found.estimate.identified and found.estimate.q95 == GROUP.priors["K"].min
 
 
+def test_the_limit_is_that_of_a_walk_which_counts_for_nothing() -> None:
+    parameters = {"constant": {"N": sharp(0.03)}, "random_walk": {"N": sharp(0.03), "K": sharp(7e-5)}}
+    probability = {"constant": 1.0, "random_walk": 0.0}
+    found = summarize(AxisResult(9000, probability, probability, parameters, 0.0, 1.0), GROUP, 1.0, 9000, 10)["rrw"]
+    assert not found.estimate.identified and found.estimate.q95 == pytest.approx(7e-5)
+
+
 TRUTHS = {
     "random_walk": {"N": 0.04, "K": 2e-3},
     "gauss_markov": {"N": 0.02, "sigma_m": 0.03, "alpha": 0.005},

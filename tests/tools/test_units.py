@@ -83,3 +83,67 @@ def test_unknown(name: str) -> None:
 def test_kinds_do_not_mix() -> None:
     with pytest.raises(UserError, match=r"'g' cannot be converted to 'deg/s'"):
         units.factor("g", "deg/s")
+
+
+#: Spellings of other tools, and sizes in rad/s, m/s^2, s, K, T, Pa, V by the units' definitions (SI brochure; NIST SP
+#: 811: the foot is 0.3048 m, the inch 0.0254 m, the degree Fahrenheit 5/9 K).
+SPELLED = {
+    "rpm": math.pi / 30.0,
+    "RPM": math.pi / 30.0,
+    "rev/min": math.pi / 30.0,
+    "revolutions/s": 2.0 * math.pi,
+    "krpm": 1000.0 * math.pi / 30.0,
+    "cdps": math.pi / 18_000.0,
+    "ddeg/s": math.pi / 1800.0,
+    "udps": math.pi / 180e6,
+    "µrad/s": 1e-6,
+    "nrad/s": 1e-9,
+    "millidegrees per second": math.pi / 180e3,
+    "milli-deg/s": math.pi / 180e3,
+    "deg/min": math.pi / 10_800.0,
+    "arcmin/s": math.pi / 10_800.0,
+    "°s⁻¹": math.pi / 180.0,
+    "°/sec": math.pi / 180.0,
+    "cm/s²": 1e-2,
+    "cm/s2": 1e-2,
+    "km/s^2": 1e3,
+    "m/s**2": 1.0,
+    "meters per second squared": 1.0,
+    "ft/s^2": 0.3048,
+    "inch/s^2": 0.0254,
+    "milli-g": 9.80665e-3,
+    "micro g": 9.80665e-6,
+    "gn": 9.80665,
+    "cGal": 1e-4,
+    "min": 60.0,
+    "Minutes": 60.0,
+    "d": 86_400.0,
+    "msec": 1e-3,
+    "microseconds": 1e-6,
+    "micros": 1e-6,
+    "millis": 1e-3,
+    "°F": 5.0 / 9.0,
+    "Fahrenheit": 5.0 / 9.0,
+    "mdegC": 1e-3,
+    "milliGauss": 1e-7,
+    "mbar": 100.0,
+    "kPa": 1000.0,
+    "millivolts": 1e-3,
+}
+
+
+@pytest.mark.parametrize("spelled", SPELLED)
+def test_spellings(spelled: str) -> None:
+    assert units.parse(units.plain(spelled)).size == pytest.approx(SPELLED[spelled], rel=1e-14)
+
+
+@pytest.mark.parametrize("spelled", ["knots", "kg", "r/s", "mol", "dB", "%", "mph", "ppm", "bits", "x17", "per s"])
+def test_no_unit_is_guessed(spelled: str) -> None:
+    """Words that an atom and a prefix might be read into."""
+    assert not units.known(units.plain(spelled))
+
+
+@pytest.mark.parametrize(("fahrenheit", "celsius"), [(32.0, 0.0), (212.0, 100.0), (-40.0, -40.0)])
+def test_fahrenheit(fahrenheit: float, celsius: float) -> None:
+    assert units.convert(fahrenheit, "degF", "degC") == pytest.approx(celsius, abs=1e-12)
+    assert units.convert(1000.0 * celsius, "mdegC", "degC") == pytest.approx(celsius, abs=1e-12)

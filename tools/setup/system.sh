@@ -1,7 +1,9 @@
 #!/bin/sh
-# System packages that the build needs: installs what is missing by apt as root; otherwise prints the line to type.
+# System packages that the build needs, with `dev` those of checks and tests too: installs what is missing by apt as
+# root; otherwise prints the line to type.
 set -u
 PYTHON=${PYTHON:-python3}
+WHOM=${1:-all}
 missing=
 
 need() { # need PACKAGE COMMAND...: the package unless the command succeeds
@@ -24,8 +26,12 @@ missing_packages() {
     need make have make
     need cmake have cmake
     need ninja-build have ninja
-    need pkg-config have pkg-config
     need libeigen3-dev header eigen3/Eigen/Core g++
+    need python3 have "$PYTHON"
+    need python3-venv "$PYTHON" -c 'import ensurepip, venv'
+    need python3-dev python_header
+    [ "$WHOM" = dev ] || return 0
+    need pkg-config have pkg-config
     need clang have clang
     need clang-tidy have clang-tidy
     need "libclang-rt-$(clang_major)-dev" fuzzer_runtime
@@ -33,9 +39,6 @@ missing_packages() {
     need libnewlib-arm-none-eabi header math.h arm-none-eabi-gcc
     need qemu-system-arm have qemu-system-arm
     need xz-utils have xz
-    need python3 have "$PYTHON"
-    need python3-venv "$PYTHON" -c 'import ensurepip, venv'
-    need python3-dev python_header
 }
 
 if [ "$PYTHON" != python3 ] && ! command -v "$PYTHON" >/dev/null; then
@@ -63,7 +66,7 @@ if [ -n "$missing" ]; then
 fi
 
 # Only the tests of the diagnosis page want a browser; they are skipped without one.
-if [ "${BROWSER:-1}" != 0 ] && ! have chromium >/dev/null; then
+if [ "$WHOM" = dev ] && [ "${BROWSER:-1}" != 0 ] && ! have chromium >/dev/null; then
     if [ "$(id -u)" -eq 0 ] && have apt-get >/dev/null; then
         echo "Installing by apt, for the tests of the diagnosis page alone (BROWSER=0 leaves it out): chromium"
         DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends chromium >/dev/null 2>&1

@@ -34,6 +34,8 @@ FEWEST = 20
 #: Share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at 0.9,
 #: where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84
+#: Times of a filter's corner in an average that shows the white noise before it: N of a first-order filter to 5 %.
+CORNERS = 10.0
 #: Spacing of float32 in the noise of a reading from which on it makes N too large: by 0.4 %.
 SPACING_MOST = 0.3
 
@@ -111,6 +113,41 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
 
 
+def with_rate(
+    judged: Judged,
+    values: NDArray[np.float64],
+    missing_before: NDArray[np.int64],
+    step: float,
+    tables: Tables,
+    result: AxisResult,
+) -> Judged:
+    """The same with the rates of a `drift_in_average` that failed: `bank_hz`, and `decimate_hz` of averages that show
+    the white noise.
+
+    `values` [n]: the readings, NaN where there is none; `step` of their lattice. Differences over one and two readings
+    part their white noise from a walk. Where it is the larger one, averages over the time in which both are alike show
+    it. Else the part filters its noise, which is white in averages over many times the filter's. Without such a corner
+    in the record there is no rate.
+    """  # fmt: skip
+    near = missing_before[1:] == 0
+
+    def square(differences: NDArray[np.float64]) -> float:
+        pairs = int(np.isfinite(differences).sum())
+        return float(np.nansum(differences**2)) / max(1, pairs) - step**2 / 6.0
+
+    one, two = square(np.diff(values)[near]), square((values[2:] - values[:-2])[near[1:] & near[:-1]])
+    white, walk = one - 0.5 * two, two - one
+    rate_hz = tables.block / tables.dt_s
+    told = {"bank_hz": 1.0 / tables.dt_s}
+    alpha = result.parameters[result.best].get("alpha")
+    if white > walk:
+        alike_hz = rate_hz * math.sqrt(max(walk, 0.0) / white)
+        told["decimate_hz"] = float(f"{min(rate_hz, max(2.0 / tables.dt_s, alike_hz)):.2g}")
+    elif alpha is not None and values.size * alpha.median > FEWEST * CORNERS * rate_hz:
+        told["decimate_hz"] = float(f"{alpha.median / CORNERS:.2g}")
+    return replace(judged, checks={**judged.checks, "drift_in_average": {**judged.checks["drift_in_average"], **told}})
+
+
 def batch_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
     """Is the part like the batch that log-normal priors describe? Else another law with wide priors takes its drift.
 
@@ -143,7 +180,8 @@ def with_readings(
     """The same with the checks of the readings. `unit`: the recording's. `dt_s`: the bank's interval.
 
     `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
-    noise of a reading; `step` in the recording's unit; `distinct` readings.
+    noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the
+    rate of means whose remainders are white.
     `saturation`, if some are clipped: their share, and the `at` of the limit.
     `outliers`, if one value recurs too often: the share of these readings, and the value `at` which.
     `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
@@ -156,7 +194,8 @@ def with_readings(
     found = readings.lattice
     if found is not None:
         told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse_over(dt_s)}
-        checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct}
+        white = {"counter_hz": found.white_hz} if found.carried and not told["passed"] else {}
+        checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct, **white}
     if readings.clipped is not None:
         share = float(readings.clipped.mask.mean())
         checks["saturation"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.clipped.limit * factor}

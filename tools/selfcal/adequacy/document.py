@@ -79,13 +79,17 @@ def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
         **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
         **({"options": [list(one) for one in recording.options]} if recording.options else {}),
         **({"notes": list(recording.notes)} if recording.notes else {}),
-        **(_origin(recording) if isinstance(recording, Recording) else {}),
+        **(_of_file(recording) if isinstance(recording, Recording) else {}),
     }
 
 
-def _origin(recording: Recording) -> dict[str, str]:
-    """The device's serial number and the date, where the metadata have them; the date also by stamps since 1970."""
-    found = {}
+def _of_file(recording: Recording) -> dict[str, Any]:
+    """What could not be read of it. The device's serial number and the date, where the metadata have them. The date
+    also by stamps since 1970."""
+    damaged = recording.damaged
+    found: dict[str, Any] = {}
+    if damaged:
+        found["damaged"] = {"bytes": damaged.bytes, "messages": damaged.messages, "words": damaged.words}
     for key, names in (("serial", SERIALS), ("recorded_at", DATES)):
         stated = [recording.meta[name] for name in names if isinstance(recording.meta.get(name), str | int)]
         if stated and str(stated[0]).strip():

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
-from selfcal.adequacy.checks import coefficients_of, judge, with_drift, with_readings
+from selfcal.adequacy.checks import against, coefficients_of, judge, with_drift, with_rate, with_readings
+from selfcal.adequacy.counted import weigh_counted
 from selfcal.adequacy.document import Identified
 from selfcal.adequacy.one_over_f import weigh, with_white
 from selfcal.adequacy.summary import halved_after, summarize
@@ -187,10 +188,16 @@ def identify_axis(
     used = _used(mask)
     judged = judge(blocks, tables, group, results[best], used)
     judged = with_drift(judged, blocks, tables, results[best], recording, may_act(model, recording, name), used)
+    if "drift_in_average" in against(judged.checks):
+        used_readings = np.where(np.logical_or.reduce(list(kept_out(samples, group).values())), np.nan, values)
+        step = 0.0 if readings.lattice is None else readings.lattice.step
+        judged = with_rate(judged, used_readings, recording.missing_before, step, tables, results[best])
     judged = with_readings(judged, readings, group, unit, tables.dt_s)
     explained = columns[:, used].astype(np.float64) @ coefficients_of(results[best]) if used else 0.0
     curve = curve_of_samples(samples - explained) if draw else None
-    beside = weigh(tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset)
+    fed = tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset
+    beside, counted = weigh(*fed), weigh_counted(readings.lattice, results[best], *fed)
+    more_laws = [one.laws(known.probability) for one in (beside, counted) if one is not None]
     return Identified(
         unit,
         group.unit,
@@ -199,9 +206,9 @@ def identify_axis(
         kept,
         scored,
         curve,
-        summarize(inside, group, *at, beside),
+        summarize(inside, group, *at, beside, counted),
         halved_after(inside, group, *at),
-        beside.laws(known.probability) if beside else {},
+        next(filter(None, more_laws), {}),
     )
 
 

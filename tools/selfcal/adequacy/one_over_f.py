@@ -94,8 +94,8 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
 
 @dataclass(frozen=True)
 class Beside:
-    """The law `flicker` beside a model's laws: its probability among them, and its posterior of `n` means over `block`
-    samples, one every `dt_s`, under the priors of `group`."""
+    """A `law` beside a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
+    one every `dt_s`, under the priors of `group`."""
 
     probability: float
     estimates: Mapping[str, Estimate]
@@ -103,12 +103,13 @@ class Beside:
     dt_s: float
     n: int
     block: int
+    law: str = FLICKER
 
     def laws(self, probability: Mapping[str, float]) -> dict[str, float]:
         """The probabilities of all laws where this one is sure; else none."""
         if self.probability < SURE:
             return {}
-        return {**{law: (1.0 - self.probability) * p for law, p in probability.items()}, FLICKER: self.probability}
+        return {**{law: (1.0 - self.probability) * p for law, p in probability.items()}, self.law: self.probability}
 
 
 def weigh(
@@ -124,32 +125,47 @@ def weigh(
 
     `mask`: the columns in use. `offset`: see Bank. None where the tables have the law, no room for it, or no result.
     """
+    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * _MOST)))
+    tables = replace(tables, dt_s=times * tables.dt_s, block=times * tables.block)
+    drift = group.priors["sigma_m"]
+    wider = _WIDER if drift.law == "log_normal" else 1.0
+    own = {
+        "B": Prior("log_uniform", drift.min / wider, drift.max * wider),
+        "alpha": Prior("log_uniform", *(limit / tables.dt_s for limit in _ALPHA)),
+    }
+    return weigh_law(FLICKER, own, 1.0, tables, group, samples, missing_before, columns, mask, offset)
+
+
+def weigh_law(
+    name: str,
+    priors: Mapping[str, Prior],
+    odds: float,
+    tables: Tables,
+    group: Group,
+    samples: NDArray[np.floating[Any]],
+    missing_before: NDArray[np.integer[Any]],
+    columns: NDArray[np.floating[Any]] | None = None,
+    mask: int = 0,
+    offset: float = 0.0,
+) -> Beside | None:
+    """A named law of two drift parameters as weigh() has it, with `priors` of its own. `odds`: over an average law."""
     from selfcal.bank.library import Bank
 
     count = len(tables.hypotheses)
-    if count >= MOST_HYPOTHESES or any(one.name == FLICKER for one in tables.hypotheses):
+    if count >= MOST_HYPOTHESES or any(one.name == name for one in tables.hypotheses):
         return None
-    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * _MOST)))
-    dt_s, block = times * tables.dt_s, times * tables.block
-    drift = group.priors["sigma_m"]
-    wider = _WIDER if drift.law == "log_normal" else 1.0
-    priors = {
-        **group.priors,
-        "B": Prior("log_uniform", drift.min / wider, drift.max * wider),
-        "alpha": Prior("log_uniform", *(limit / dt_s for limit in _ALPHA)),
-    }
-    own = replace(group, priors=priors, laws={**group.laws, FLICKER: NAMED[FLICKER]})
+    law = NAMED[name]
+    own = replace(group, priors={**group.priors, **priors}, laws={**group.laws, name: law})
     rho, alpha = map(make_grid, _NODES)
-    law = NAMED[FLICKER]
-    one_more = HypothesisTable(FLICKER, law, -math.log(count + 1), rho, alpha, (priors_of(own, FLICKER),))
-    share = math.log(count / (count + 1))
+    one_more = HypothesisTable(name, law, math.log(odds / (count + odds)), rho, alpha, (priors_of(own, name),))
+    share = math.log(count / (count + odds))
     others = (replace(one, ln_probability=one.ln_probability + share) for one in tables.hypotheses)
-    bank = Bank(replace(tables, dt_s=dt_s, block=block, hypotheses=(*others, one_more)), offset=offset)
+    bank = Bank(replace(tables, hypotheses=(*others, one_more)), offset=offset)
     bank.push(samples[:, None], missing_before, columns)
     try:
         found = bank.report(0, mask)
     except UserError:
         return None
-    if not math.isfinite(found.probability[FLICKER]):
+    if not math.isfinite(found.probability[name]):
         return None
-    return Beside(found.probability[FLICKER], found.parameters[FLICKER], own, dt_s, found.n, block)
+    return Beside(found.probability[name], found.parameters[name], own, tables.dt_s, found.n, tables.block, name)

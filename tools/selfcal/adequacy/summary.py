@@ -27,6 +27,8 @@ from selfcal.model.file import Group
 
 _Floats = NDArray[np.float64]
 
+#: The parameter of coloured noise.
+COLOURED = "spectral_ratio"
 #: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
 _DRAWS, _PER_OCTAVE = 256, 16
 #: Times the record that a longer rest is looked at, and halvings of its logarithm: to 2 %.
@@ -37,6 +39,7 @@ _LEAST = 1e-3
 _SURE = 0.95
 #: Why a number is not identified: words of the table and the JSON.
 NO_WALK = "no walk is sure"
+NOT_DECIDED = "the law is not decided"
 WIDE = "the record leaves it open"
 NO_MINIMUM = "the Allan deviation has no minimum up to half the record"
 BELOW = "the Allan deviation rises from the shortest averaging time on"
@@ -52,24 +55,34 @@ class Number:
 
 
 def summarize(
-    result: AxisResult, group: Group, dt_s: float, n: int, block: int, beside: Beside | None = None
+    result: AxisResult,
+    group: Group,
+    dt_s: float,
+    n: int,
+    block: int,
+    beside: Beside | None = None,
+    counted: Beside | None = None,
 ) -> dict[str, Number]:
     """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
     the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
-    record is too short for an Allan deviation. `beside`: 1/f noise beside the laws of the result."""
+    record is too short for an Allan deviation. `beside`: 1/f noise beside the laws of the result. `counted`: likewise
+    white noise beside quantization noise (counted.py)."""
     if n < 2 * LONGEST:
         return {}
     more = 0.0 if beside is None else beside.probability
+    left = 1.0 if counted is None else 1.0 - counted.probability
     laws: list[tuple[str, float, Mapping[str, Estimate], Group, float, int, int]] = [
-        (law, probability * (1.0 - more), result.parameters[law], group, dt_s, n, block)
+        (law, probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block)
         for law, probability in result.probability.items()
-        if probability >= _LEAST
+        if probability >= _LEAST  # of the model's, whatever stands beside them
     ]
     of_model = len(laws)
-    if beside is not None and more >= _LEAST:
-        laws.append((FLICKER, more, beside.estimates, beside.group, beside.dt_s, beside.n, beside.block))
-    white, walk, counted, floor, reached, weight, own = [], [], [], [], [], [], []
-    drifts, open_drifts = 0.0, 0.0  # probability of the laws with a drift, and of those that leave its size open
+    for one, probability in ((beside, more * left), (counted, 1.0 - left)):
+        if one is not None and probability >= _LEAST:
+            laws.append((one.law, probability, one.estimates, one.group, one.dt_s, one.n, one.block))
+    white, walk, remainder, floor, reached, weight, own = [], [], [], [], [], [], []
+    # Probability of the laws with a drift, of those that leave its size open, and of those that know their Q.
+    drifts, open_drifts, of_Q = 0.0, 0.0, 0.0
     for number, (law, probability, estimates, of, every_s, length, samples) in enumerate(laws):
         medians = {name: estimate.median for name, estimate in estimates.items()}
         if not all(math.isfinite(value) for value in medians.values()):
@@ -78,10 +91,11 @@ def summarize(
         fit = fit_of(law, medians, of, every_s, length, m, block=samples)
         draws = posterior_draws(estimates, fit.covariance, _DRAWS)
         sizes = [estimates[name].identified for name in ("K", "sigma_m", "B") if name in estimates]
+        of_Q += probability * (COLOURED in estimates and estimates[COLOURED].identified)
         drifts += probability * bool(sizes)
         open_drifts += probability * (bool(sizes) and not any(sizes))
         walk.append(_walk(draws))
-        counted.append(_quantization(draws, every_s))
+        remainder.append(_quantization(draws, every_s))
         weight.append(np.full(_DRAWS, probability / _DRAWS))
         own.append(np.full(_DRAWS, number < of_model))
         if law == FLICKER:
@@ -98,7 +112,7 @@ def summarize(
     if not weight:
         return {}
     w = np.concatenate(weight) / np.concatenate(weight).sum()
-    k, q, place = np.concatenate(walk), np.concatenate(counted), np.concatenate(reached)
+    k, q, place = np.concatenate(walk), np.concatenate(remainder), np.concatenate(reached)
     w_walk = w * np.concatenate(own)
     w_walk = w_walk / w_walk.sum() if w_walk.any() else w
     has_walk, has_floor = float(w_walk[k > 0.0].sum()), float(w[place == 0].sum())
@@ -108,17 +122,24 @@ def summarize(
         "bias_instability": _number(np.concatenate(floor) / units.FLICKER_FLOOR, w),
     }
     if float(w[q > 0.0].sum()) >= _SURE:
-        found["quantization_noise"] = _number(q, w)
-    prior = group.priors["K"]
-    widest = HALF_90 * prior.ln_sd  # of ln(q95 / q05): half the prior's sd
+        Q = _number(q, w)
+        found["quantization_noise"] = Q if of_Q > 0.5 * sum(law[1] for law in laws) else _without(Q, WIDE)
+    widest = HALF_90 * group.priors["K"].ln_sd  # of ln(q95 / q05): half the prior's sd
     left_open = open_drifts > 0.5 * drifts
+    rrw = found["rrw"].estimate
+    why = ""
     if more >= SURE:
-        found["rrw"] = _without(found["rrw"], ONE_OVER_F)
+        why = ONE_OVER_F
     elif has_walk < _SURE:
-        none = found["rrw"].estimate
-        found["rrw"] = _without(Number(replace(none, q95=max(none.q95, prior.min))), NO_WALK)  # a limit is above 0
-    elif left_open or math.log(found["rrw"].estimate.q95 / found["rrw"].estimate.q05) > widest:
-        found["rrw"] = _without(found["rrw"], WIDE)
+        why = NO_WALK if max(result.probability.values()) >= _SURE else NOT_DECIDED
+    elif left_open or math.log(rrw.q95 / rrw.q05) > widest:
+        why = WIDE
+    if why:
+        # Its limit holds if there is a walk, however little a law with one counts.
+        most = [one["K"].q95 for one in result.parameters.values() if "K" in one and math.isfinite(one["K"].q95)]
+        if (w_walk * k > 0.0).any():
+            most.append(_number(k, np.where(k > 0.0, w_walk, 0.0) / w_walk[k > 0.0].sum()).estimate.q95)
+        found["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
     if has_floor < _SURE:
         found["bias_instability"] = _without(
             found["bias_instability"], BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
@@ -173,9 +194,9 @@ def _walk(draws: Mapping[str, _Floats]) -> _Floats:
 
 def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
     """Q of each draw; 0 of a law whose noise has no memory, or one of the other sign."""
-    if "spectral_ratio" not in draws:
+    if COLOURED not in draws:
         return np.zeros(draws["N"].size)
-    over = np.maximum(draws["spectral_ratio"] ** -2.0 - 1.0, 0.0)
+    over = np.maximum(draws[COLOURED] ** -2.0 - 1.0, 0.0)
     return np.asarray(0.5 * draws["N"] * np.sqrt(dt_s * over))
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal import _coarse, _dense, _fixed, _library32, _library64
+from selfcal import _library32
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import OutsidePriors, UserError
 from selfcal.model.laws import PLACES
@@ -59,8 +60,9 @@ class Bank:
     """A bank over the axes of `tables`.
 
     `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `coarse` one with the cells of a
-    module's reports, `fixed` the integer kernels (SELFCAL_FIXED). `offset`: what the samples of the first axis are less
-    than the readings; its reports have it again.
+    module's reports, `fixed` the integer kernels (SELFCAL_FIXED). The first three are compiled for tests alone, by
+    `make setup-dev`. `offset`: what the samples of the first axis are less than the readings; its reports have it
+    again.
     """
 
     def __init__(
@@ -75,9 +77,9 @@ class Bank:
     ) -> None:
         self.tables = tables
         self.offset = offset
-        build = _dense if dense else _library64 if double else _coarse if coarse else _library32
-        if fixed:
-            build = _fixed
+        wanted = {"_fixed": fixed, "_dense": dense, "_library64": double, "_coarse": coarse}
+        name = next((build for build, meant in wanted.items() if meant), "")
+        build: Any = import_module(f"selfcal.{name}") if name else _library32
         self.raw: Any = build.Bank(*arguments(tables))
         if offset:
             self.raw.shift(0, -offset)

@@ -7,6 +7,7 @@ import reprlib
 import shlex
 import shutil
 import sys
+from functools import cache
 from pathlib import Path
 
 _SHOWN = reprlib.Repr()
@@ -40,6 +41,16 @@ def remark(text: str) -> str:
     apart = re.sub(r"\*(?=/)|/(?=\*)|-(?=-)", r"\g<0> ", printable(text))
     apart = apart.replace('"', "'")
     return f"{apart} " if apart.endswith("\\") else apart
+
+
+#: Where a spreadsheet would begin a formula: the first sign of a cell, or of one that a semicolon begins. Some programs
+#: pass by blanks, and take the wide forms of the signs.
+_FORMULA = re.compile(r"(^\s*|;)(?=[=+\-@\uff1d\uff0b\uff0d\uff20])")
+
+
+def cell(text: str) -> str:
+    """`text` from outside, for a cell of a CSV: one line that no spreadsheet takes for a formula."""
+    return _FORMULA.sub(r"\1'", printable(text))
 
 
 def short(text: str) -> str:
@@ -79,3 +90,10 @@ def first_line(error: BaseException) -> str:
 def note(text: str) -> None:
     """Tell the user, on stderr, something that is no error."""
     print(f"selfcal: {printable(text)}", file=sys.stderr)
+
+
+@cache
+def say_once(text: str) -> None:
+    """Tell the user, unless this process has told it."""
+    if text:
+        note(text)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import tempfile
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -17,8 +19,9 @@ MOST_NUMBERS = 400_000_000
 MOST_COLUMNS, LONGEST_HEADING = 1000, 256
 #: A text recording is read by as many bytes; no line is longer.
 BLOCK_BYTES = 1 << 22
-#: What a packed text recording may unpack to, times its size: readings of a sensor pack to a twentieth at best.
-MOST_GROWTH = 200
+#: What a packed recording may unpack to, times its size: readings of a sensor pack to a twentieth at best. Of a text
+#: less: a number of eight bytes has two there.
+MOST_GROWTH, MOST_TEXT_GROWTH = 200, 25
 #: Lines before the header of a text recording.
 MOST_LEADING_LINES = 1000
 #: Cells of these lines that are looked at for a known heading.
@@ -54,6 +57,8 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
     except OSError as error:
         # A library's own OSError has no number.
         what = f"cannot be read: {error.strerror}" if error.strerror else f"{otherwise}: {first_line(error)}"
+        if error.errno == errno.ENOSPC:
+            what = f"no space left in {tempfile.gettempdir()} to unpack it: TMPDIR names another folder"
         raise UserError(f"{path}: {what}") from error
     except MemoryError as error:
         raise UserError(f"{path}: too large for this machine's memory") from error
@@ -69,4 +74,6 @@ def read_text(path: Path, most: int, otherwise: str) -> str:
         data = stream.read(most + 1)
         if len(data) > most:
             raise UserError(f"{path}: larger than {most} bytes")
+        if b"\0" in data:
+            raise ValueError("a byte 0x00 is in it")
         return data.decode("utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import os
@@ -149,14 +150,23 @@ def check_picture(path: Path | str) -> None:
         raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 
 
-def save_picture(figure: Any, path: Path | str, dpi: int) -> None:
-    """Write a figure whole or not at all, and close it. Raises UserError where it cannot be saved."""
+def plotter() -> Any:
+    """matplotlib's pyplot, without a screen. Its settings are the user's own: those of the folder that the user is in,
+    where files of strangers may lie, would be taken first."""
+    with contextlib.chdir("/"):
+        import matplotlib
+    matplotlib.use("Agg")
     from matplotlib import pyplot
 
+    return pyplot
+
+
+def save_picture(figure: Any, path: Path | str, dpi: int) -> None:
+    """Write a figure whole or not at all, and close it. Raises UserError where it cannot be saved."""
     try:
         with whole(path) as temporary:
             figure.savefig(temporary, dpi=dpi)
     except ValueError as error:
         raise UserError(f"{path}: cannot save the plot: {error}") from error
     finally:
-        pyplot.close(figure)
+        plotter().close(figure)

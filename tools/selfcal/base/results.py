@@ -57,6 +57,15 @@ def _shape(one: Any) -> type:
     return Mapping if isinstance(one, type) and issubclass(one, Object) else one if isinstance(one, type) else object
 
 
+class Damaged(Object):
+    """What of the files could not be read: bytes, and the messages, frames or lines that they were, at least; and one
+    line that says it."""
+
+    bytes: int
+    messages: int
+    words: str
+
+
 class Recording(Object):
     """What was read. `start_s`: where in the recording its first sample is; `notes`: what was found in the file."""
 
@@ -69,6 +78,7 @@ class Recording(Object):
     paths: list[str] | None
     options: list[Any] | None
     notes: list[str] | None
+    damaged: Damaged | None
 
 
 class Posterior(Object):
@@ -118,6 +128,7 @@ class IdentifiedAxis(Object):
     suspicion: str | None
     more_laws: dict[str, float] | None
     added_law: str | None
+    own_priors: dict[str, Any] | None
     halved_after_s: dict[str, float | None] | None
     allan: dict[str, Any] | None
     regressors: dict[str, Any] | None
@@ -166,12 +177,14 @@ class Finding(Object):
 
 
 class DiagnosedAxis(Object):
-    """One axis of `diagnose`, or `error` alone. `verdict`: "adequate" or "inadequate", of the extended model."""
+    """One axis of `diagnose`, or `error` alone. `verdict`: "adequate" or "inadequate", of the extended model. `stated`:
+    causes that it shows and the model file has already."""
 
     error: str | None
     unit: str
     judged_at_hz: float
     verdict: str
+    stated: list[str] | None
     findings: list[Finding]
     only_in_means: list[Finding] | None
     not_found: list[dict[str, Any]]

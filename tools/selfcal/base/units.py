@@ -46,49 +46,43 @@ _ACCELERATION = _dimension(length=1, time=-2)
 _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "1": (_NONE, 1.0),
     "rad": (_dimension(angle=1), 1.0),
-    "mrad": (_dimension(angle=1), 1e-3),
     "deg": (_dimension(angle=1), math.pi / 180.0),
     "arcsec": (_dimension(angle=1), math.pi / 648_000.0),
+    "arcmin": (_dimension(angle=1), math.pi / 10_800.0),
+    "rev": (_dimension(angle=1), 2.0 * math.pi),
     "dps": (_dimension(angle=1, time=-1), math.pi / 180.0),
-    "mdps": (_dimension(angle=1, time=-1), math.pi / 180.0 * 1e-3),
-    "mdeg": (_dimension(angle=1), math.pi / 180.0 * 1e-3),
     "dph": (_dimension(angle=1, time=-1), math.pi / 648_000.0),
+    "rpm": (_dimension(angle=1, time=-1), math.pi / 30.0),
     "m": (_dimension(length=1), 1.0),
-    "mm": (_dimension(length=1), 1e-3),
+    "ft": (_dimension(length=1), 0.3048),
+    "in": (_dimension(length=1), 0.0254),
     "s": (_TIME, 1.0),
-    "ms": (_TIME, 1e-3),
-    "us": (_TIME, 1e-6),
-    "ns": (_TIME, 1e-9),
+    "min": (_TIME, 60.0),
     "h": (_TIME, 3600.0),
+    "day": (_TIME, 86400.0),
     "Hz": (_dimension(time=-1), 1.0),
     "g": (_ACCELERATION, STANDARD_GRAVITY),
-    "mg": (_ACCELERATION, STANDARD_GRAVITY * 1e-3),
-    "ug": (_ACCELERATION, STANDARD_GRAVITY * 1e-6),
+    "Gal": (_ACCELERATION, 1e-2),
     "K": (_dimension(temperature=1), 1.0),
     "degC": (_dimension(temperature=1), 1.0),
+    "degF": (_dimension(temperature=1), 5.0 / 9.0),
     "V": (_dimension(voltage=1), 1.0),
-    "mV": (_dimension(voltage=1), 1e-3),
     "A": (_dimension(current=1), 1.0),
-    "mA": (_dimension(current=1), 1e-3),
     "T": (_dimension(field=1), 1.0),
-    "mT": (_dimension(field=1), 1e-3),
-    "uT": (_dimension(field=1), 1e-6),
-    "nT": (_dimension(field=1), 1e-9),
     "gauss": (_dimension(field=1), 1e-4),
-    "mgauss": (_dimension(field=1), 1e-7),
-    "Gal": (_ACCELERATION, 1e-2),
-    "mGal": (_ACCELERATION, 1e-5),
-    "uGal": (_ACCELERATION, 1e-8),
     "Pa": (_dimension(pressure=1), 1.0),
-    "hPa": (_dimension(pressure=1), 100.0),
+    "bar": (_dimension(pressure=1), 1e5),
 }
+#: Parts and multiples, and what no prefix makes: of these atoms, and a mass.
+_PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1, "h": 1e2, "k": 1e3}
+_WHOLE, _MASS = ("1", "dph", "ft", "in", "min", "h", "day"), "kg"
 #: Zero of a temperature scale in K; counts only where the temperature itself is meant, not in `deg/s/degC`.
-_ZERO = {"degC": 273.15}
+_ZERO = {"degC": 273.15, "mdegC": 273.15, "degF": 273.15 - 160.0 / 9.0}
 
 #: What a recording's header may say, for error messages.
 RECORDING_UNITS = (
-    "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "m/s^2", "mm/s^2", "g", "mg", "ug", LSB, "degC", "K",
-    "V", "mV", "s", "ms", "us", "ns",
+    "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "rpm", "m/s^2", "mm/s^2", "ft/s^2", "g", "mg", "ug",
+    LSB, "degC", "degF", "K", "V", "mV", "h", "min", "s", "ms", "us", "ns",
 )  # fmt: skip
 
 
@@ -107,25 +101,34 @@ _FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d
 _LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
 #: Signs that a data sheet has, as this module writes them.
 _SIGNS = str.maketrans(
-    {"°": "deg", "º": "deg", "℃": "degC", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1", "·": " "}
-)
+    {"°": "deg", "º": "deg", "℃": "degC", "℉": "degF", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1",
+     "·": " ", "⋅": " "}
+)  # fmt: skip
 #: A power without its sign, `s-1`, `s2`, and factors with blanks or stars between them.
 _POWER, _FACTORS = re.compile(r"(?<=[a-zA-Z])(-?\d)(?![\w.])", re.ASCII), re.compile(r"\s*[\s*]\s*")
+#: A prefix that is written out: its first letter, but for `micro`.
+_SPELLED = re.compile(r"(?<![a-z])(nano|micro|milli|centi|deci|hecto|kilo)[- ]?(?=[a-z])", re.IGNORECASE)
+_PER, _SQUARED = re.compile(r"\s+per\s+", re.IGNORECASE), re.compile(r"\s+squared|\*\*2", re.IGNORECASE)
 
 #: Other spellings of an atom, in small letters: whole words of a unit. And brackets around a power, `m/(s^2)`.
 _WORDS = {
-    **dict.fromkeys(("degs", "degree", "degrees", "deg"), "deg"),
-    **dict.fromkeys(("rads", "radian", "radians", "rad"), "rad"),
-    **dict.fromkeys(("sec", "secs", "second", "seconds", "s"), "s"),
-    **dict.fromkeys(("msec", "msecs", "millisecond", "milliseconds", "millis", "ms"), "ms"),
-    **dict.fromkeys(("usec", "usecs", "microsecond", "microseconds", "micros", "us"), "us"),
-    **dict.fromkeys(("nsec", "nsecs", "nanosecond", "nanoseconds", "ns"), "ns"),
-    **dict.fromkeys(("hr", "hrs", "hour", "hours", "h"), "h"),
-    **dict.fromkeys(("g", "gs", "gee", "gees"), "g"),
+    **{name: name for name in _ATOMS if name.islower()},
+    **dict.fromkeys(("degs", "degree", "degrees"), "deg"),
+    **dict.fromkeys(("rads", "radian", "radians"), "rad"),
+    **dict.fromkeys(("revs", "revolution", "revolutions", "turn", "turns"), "rev"),
+    **dict.fromkeys(("meter", "meters", "metre", "metres"), "m"),
+    **dict.fromkeys(("foot", "feet"), "ft"),
+    **dict.fromkeys(("inch", "inches"), "in"),
+    **dict.fromkeys(("volt", "volts"), "V"),
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("mins", "minute", "minutes"), "min"),
+    **dict.fromkeys(("hr", "hrs", "hour", "hours"), "h"),
+    **dict.fromkeys(("d", "days"), "day"),
+    **dict.fromkeys(("gs", "gee", "gees", "gn"), "g"),
     **dict.fromkeys(("c", "celsius", "degc"), "degC"),
+    **dict.fromkeys(("f", "fahrenheit", "degf"), "degF"),
     **dict.fromkeys(("k", "kelvin"), "K"),
     **dict.fromkeys(("counts", "count", "lsb", "lsbs", "raw", "digit", "digits"), LSB),
-    **{name: name for name in ("dps", "mdps", "mdeg", "dph", "mrad", "m", "mm", "mg", "ug")},
 }
 _WORD, _BRACKETS = re.compile(r"(?<!\w)(?:sqrt(?=\()|[a-zA-Z]+(?=-?\d*(?!\w)))"), re.compile(r"/\s*\(([\w^]+)\)")
 
@@ -145,10 +148,12 @@ def quantity(text: str) -> tuple[float, str]:
 def plain(name: str) -> str:
     """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²`, `m s^-2`, `m/s2` -> `m/s^2`;
     `√Hz` -> `sqrt(Hz)`; other texts stay."""
-    spelled = _ROOT.sub(r"sqrt(\1)", name.strip().translate(_SIGNS))
+    spelled = _ROOT.sub(r"sqrt(\1)", name.strip().replace("°s", "deg s").translate(_SIGNS))
     if spelled == LSB or len(spelled) > _LONGEST or known(spelled):
         return spelled
-    usual = _WORD.sub(lambda word: _WORDS.get(word[0].lower(), word[0]), _BRACKETS.sub(r"/\1", spelled))
+    usual = _SPELLED.sub(lambda prefix: "u" if prefix[1].lower() == "micro" else prefix[1][0].lower(), spelled)
+    usual = _SQUARED.sub("^2", _PER.sub("/", usual))
+    usual = _WORD.sub(lambda word: _word(word[0]), _BRACKETS.sub(r"/\1", usual))
     if usual == LSB:
         return usual
     product = _FACTORS.sub("*", _POWER.sub(r"^\1", usual.replace("^", "").replace(".", " ")))
@@ -166,6 +171,24 @@ def plain(name: str) -> str:
     )
 
 
+def _word(word: str) -> str:
+    """A word of a unit in this module's spelling, with its prefix; itself if it is none."""
+    small = word.lower()
+    if small in _WORDS:
+        return _WORDS[small]
+    base = _WORDS.get(small[1:], LSB)
+    return small[0] + base if small[1:] not in ("c", "d", "f", "k") and _atom(small[0] + base) is not None else word
+
+
+def _atom(name: str) -> tuple[_Dimension, float] | None:
+    """Dimension and size of an atom, or of one with a prefix; None for other names."""
+    base = name[1:]
+    if name in _ATOMS or name[:1] not in _PREFIXES or base not in _ATOMS or base in _WHOLE or name == _MASS:
+        return _ATOMS.get(name)
+    kind, size = _ATOMS[base]
+    return kind, size * _PREFIXES[name[0]]
+
+
 @cache
 def parse(name: str) -> Unit:
     """The unit called `name`. Raises UserError if it is not one."""
@@ -175,13 +198,13 @@ def parse(name: str) -> Unit:
         raise unknown
     for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
         match = _FACTOR.match(part)
-        atom = match and (match["root"] or match["atom"])
-        if match is None or atom not in _ATOMS:
+        found = None if match is None else _atom(match["root"] or match["atom"])
+        if match is None or found is None:
             raise unknown
         power = Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1)
         if sign == "/":
             power = -power
-        kind, scale = _ATOMS[atom]
+        kind, scale = found
         dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
         size *= scale ** float(power)
         if not _LEAST < size < _MOST:

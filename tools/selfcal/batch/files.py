@@ -54,7 +54,8 @@ def matching(patterns: Sequence[str], own: Sequence[Path]) -> list[str]:
     """The files that the patterns name, each once, in the order of their names. A folder is one of ROS 2.
 
     `own`: outputs of this command, files or folders, which a pattern may match as well. They are no recordings.
-    A line names each link to nothing. It names a folder only where `patterns` names it, as a shell's pattern does.
+    A line names each link to nothing, pipe and device. It names a folder only where `patterns` names it, as a shell's
+    pattern does.
     Raises UserError for a pattern that matches none.
     """
     found: dict[str, None] = {}
@@ -67,7 +68,7 @@ def matching(patterns: Sequence[str], own: Sequence[Path]) -> list[str]:
         kept = [name for name in others if _is_recording(Path(name))]
         if not kept and not named:
             raise _unmatched(pattern)
-        skipped |= {name: "a link to nothing" for name in others if not Path(name).exists()}
+        skipped |= {name: kind for name in others if (kind := _no_file(Path(name)))}
         if named and place.is_dir() and others and not kept:
             skipped[pattern] = "a folder that is no recording of ROS 2"
         found.update(dict.fromkeys(kept))
@@ -88,6 +89,13 @@ def _unmatched(*patterns: str) -> UserError:
 def _within_any(path: Path, own: Sequence[Path]) -> bool:
     place = path.absolute()
     return any(place == one.absolute() or one.absolute() in place.parents for one in own)
+
+
+def _no_file(path: Path) -> str:
+    """What is neither file nor folder; empty for these."""
+    if not path.exists():
+        return "a link to nothing"
+    return "" if path.is_file() or path.is_dir() else "a pipe or a device"
 
 
 def _is_recording(path: Path) -> bool:

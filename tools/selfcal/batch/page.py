@@ -16,7 +16,7 @@ from selfcal.base import units as unit_module
 from selfcal.base.errors import printable
 from selfcal.base.output import write_text
 from selfcal.batch.population import Array, Population
-from selfcal.batch.summary import Batch, apart_words, plain, seen_from_words, shared_words, unidentified_lines
+from selfcal.batch.summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, number, scrolled
 from selfcal.show.page import frame
 
@@ -89,10 +89,9 @@ def _todo(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -
             yield f"<ul class=findings>{''.join(lines[OPEN_LINES:])}</ul>"
             yield "" if len(devices) <= MOST_LINES else "<p>The JSON names the others.</p>"
             yield "</details>"
-    groups = [f"{a.kind} {a.name}: {apart_words(p.measured, a)}" for p in batch.populations for a in p.apart]
-    groups += [f"{one.kind} {one.name}: {shared_words(one)}" for one in batch.shared]
+    groups = list(group_lines(batch))
     if groups:
-        yield "<h3>Shared by a station, a day or a lot</h3><ul class=findings>"
+        yield "<h3>Shared by a station, a day, a lot or a part of the units</h3><ul class=findings>"
         yield from (f"<li>{_text(one)}</li>" for one in groups[:MOST_LINES])
         yield "</ul>"
     if not groups and not any(document[key] for key, _ in kinds):
@@ -126,7 +125,7 @@ def _population(batch: Batch) -> Iterator[str]:
             f"{number(spread.median, 2)} [{number(spread.q05, 2)}, {number(spread.q95, 2)}]"
             + (" of ln" if measured.logarithm else ""),
             seen_from_words(one),
-            str(len(one.unlike)),
+            str(int((~one.kept).sum())),
         )
         rows.append(f"<tr><th scope=row>{measured.name}</th>{''.join(f'<td>{escape(c)}</td>' for c in cells)}</tr>")
     if rows:

@@ -30,7 +30,7 @@ from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, short
-from selfcal.base.output import save_picture
+from selfcal.base.output import plotter, save_picture
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.simulate import truth_of
@@ -301,13 +301,9 @@ def _half_interval(
 
 def picture(document: Mapping[str, Any], path: Path | str) -> None:
     """What is reached over the length: median and middle four fifths of the records, and the wish."""
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    from matplotlib import pyplot
-
     wishes = [wish for wish in document["wishes"] if wish["curve"]]
-    figure, panels = pyplot.subplots(len(wishes), 1, figsize=(7.0, 2.9 * len(wishes)), squeeze=False, sharex=True)
+    size = (7.0, 2.9 * len(wishes))
+    figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)
     for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
         hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
         q10, q50, q90 = (np.maximum([one[key] for one in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))

@@ -7,14 +7,18 @@ mean m and spread t. Its recording measures x with the error that its own poster
 
 m has a flat prior and is integrated out in closed form. t has Jeffreys' prior, t sqrt(sum (t^2 + s^2)^-2), on a grid.
 So a few units give tails as Student's: "far off" means the same in a batch of 5 as in one of 500.
+Odd units are found by the generalized test of extremes (Rosner, Technometrics 25, 1983): the k that are farthest from
+the median are odd if the nearest of them is unlike the population of all others. So several odd units do not hide each
+other. A unit that is odd in one quantity of an axis counts in another one of the axis only where it is ordinary.
 A group is a station, a day or a lot whose units all differ by one amount: the group's own, not the parts'. Of two
-groups alone nobody can say which is off: each is then half the difference away from the mean.
+groups alone nobody can say which is off: each is then half the difference away from the mean. Two groups need no label
+where two normals fit the units better than one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -30,14 +34,22 @@ FEWEST, FEWEST_OF_GROUP = 5, 3
 _POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
 #: A weight that counts for nothing, and has a logarithm.
 _NO_WEIGHT = 1e-300
-#: Probability that a sound unit is called unlike, and that a batch without groups is said to have one.
+#: Probability that a batch of sound units has one that is called unlike by a quantity.
+FALSE_NAME = 0.03
+#: Probability that a batch without groups is said to have one, and that a unit without drift is said to drift.
 FALSE_ALARM = 1e-3
 #: Standard deviation over the median absolute deviation, and of a median over that of a mean, of a normal.
 _MAD, _MEDIAN = 1.4826, 1.2533
-#: Robust standard deviations beyond which an estimate is not fitted at first: of n units times 1 + _OF_FEW / n.
-_FIRST, _OF_FEW = 4.0, 10.0
+#: Probability of a unit as far off, below which one that is odd in something else is in no population.
+_ORDINARY = 0.01
+#: Share of the units that are odd at most, and numbers of odd ones that are tried at most.
+MOST_ODD, _TRIED = 1.0 / 3.0, 40
 #: Rounds of fit and choice at most.
 _ROUNDS = 20
+#: Nats by which two groups must be better than one: 1 in 1000 normal batches of 8 to 24 units has so many.
+_SPLIT = 8.0
+#: Distance of two groups in standard deviations of a unit: nearer ones, as of a uniform population, share units.
+_BETWEEN = 4.5
 
 
 @dataclass(frozen=True)
@@ -140,15 +152,21 @@ class Apart:
     """A group whose units all differ: `kind` (station, day, lot) and its `name`; by `offset` (of ln y, or of y).
 
     `against`: the name of the only other group, "" for units without one; None: the others are of several groups.
-    `also`: groups of other kinds that have the same units."""
+    `also`: groups of other kinds that have the same units. `members`: the places of its units among all."""
 
     kind: str
     name: str
     quantity: str
     offset: float
     log_p: float
+    members: tuple[int, ...]
     also: tuple[str, ...] = ()
     against: str | None = None
+
+    def shift(self, at: NDArray[np.intp]) -> Array:
+        """By how much the units at the places `at` [n] are off for it."""
+        inside = np.isin(at, self.members)
+        return self.offset * (inside.astype(np.float64) - (0.0 if self.against is None else 0.5))
 
 
 @dataclass(frozen=True)
@@ -163,20 +181,22 @@ class Unlike:
 
 @dataclass(frozen=True)
 class Population:
-    """One quantity of the batch. `apart`: groups that differ. `unlike`: units that are not of it; they are left out.
+    """One quantity of the batch. `apart`: groups that differ. `unlike`: units that are not of it. `kept` [n]: whether a
+    unit counts in it; one that is unlike, in this quantity or another of the axis, does not.
     `offset` [n] of each unit by its groups. `seen_from`: how far off a unit with the usual error is unlike."""
 
     measured: Measured
     fit: Fit
     offset: Array
+    kept: NDArray[np.bool_]
     seen_from: float
     apart: tuple[Apart, ...] = ()
     unlike: tuple[Unlike, ...] = field(default=())
 
     def shrunken(self, k: int) -> Interval:
-        """The estimate of the quantity's k-th unit by the whole batch. An unlike unit keeps its own."""
+        """The estimate of the quantity's k-th unit by the whole batch. One that is left out keeps its own."""
         y, s = float(self.measured.y[k]), float(self.measured.s[k])
-        if int(self.measured.at[k]) in {one.at for one in self.unlike}:
+        if not self.kept[k]:
             return Interval(y, y - HALF_90 * s, y + HALF_90 * s)
         return self.fit.shrunken(y, s, float(self.offset[k]))
 
@@ -188,46 +208,100 @@ def robust(y: Array, s: Array) -> tuple[float, float]:
     return middle, math.sqrt(max(scale**2 - float(np.median(s**2)), (0.1 * scale) ** 2))
 
 
+#: The kind of a group that has no label.
+TWO_GROUPS = "two groups"
 #: A grouping: its kind, and for each unit the name of its group, "" for none.
 Grouping = tuple[str, Sequence[str]]
 
 
-def populations(measured: Sequence[Measured], groupings: Sequence[Grouping]) -> list[Population]:
+def populations(
+    measured: Sequence[Measured], groupings: Sequence[Grouping], odd: Mapping[str, Set[int]] | None = None
+) -> list[Population]:
     """The population of each quantity, with the groups and units that are unlike the rest.
 
-    FALSE_ALARM is shared among a unit's quantities, and among all groups and quantities."""
+    `odd`: by axis, places of units that are unlike by anything else. FALSE_NAME is shared among all units and
+    quantities, FALSE_ALARM among all groups and quantities."""
     tested = [one for one in measured if one.y.size >= FEWEST]
-    of_unit: dict[int, int] = {}
-    for one in tested:
-        for at in one.at.tolist():
-            of_unit[at] = of_unit.get(at, 0) + 1
-    groups = sum(len(set(names) - {""}) for _, names in groupings)
-    return [
-        _population(one, groupings, of_unit, math.log(FALSE_ALARM / max(1, groups * len(tested)))) for one in tested
-    ]
-
-
-def _population(
-    one: Measured, groupings: Sequence[Grouping], of_unit: Mapping[int, int], group_limit: float
-) -> Population:
-    limit = np.array([math.log(FALSE_ALARM / of_unit[at]) for at in one.at.tolist()])
-    offset = np.zeros(one.y.size)
-    apart: list[Apart] = []
+    limit = math.log(FALSE_NAME / max(1, sum(one.y.size for one in tested)))
+    groups = _groups(groupings)
+    group_limit = math.log(FALSE_ALARM / max(1, len(groups) * len(tested)))
+    groups_of = {one.name: _apart(one, groups, limit, group_limit) for one in tested}
+    found: dict[str, Population] = {}
     for _ in range(_ROUNDS):
-        found = _most_apart(one, offset, groupings, {(known.kind, known.name) for known in apart}, limit, group_limit)
+        before = {name: {one.at for one in of.unlike} for name, of in found.items()}
+        for one in tested:
+            axis = one.name.split(".")[0]
+            others = set((odd or {}).get(axis, ()))
+            others |= set().union(
+                *(of for name, of in before.items() if name != one.name and name.split(".")[0] == axis)
+            )
+            found[one.name] = _population(one, groups_of[one.name], others, limit)
+        if before == {name: {one.at for one in of.unlike} for name, of in found.items()}:
+            break
+    return list(found.values())
+
+
+def _is_group(inside: int, units: int) -> bool:
+    """Whether so many of the units are a group beside the others: not the larger part, and neither too few."""
+    return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
+
+
+#: Groups that a test can tell, by the places of their units: kind, name and the only other name of each.
+Groups = Mapping[tuple[int, ...], Sequence[tuple[str, str, str | None]]]
+
+
+def _groups(groupings: Sequence[Grouping]) -> Groups:
+    found: dict[tuple[int, ...], list[tuple[str, str, str | None]]] = {}
+    for kind, names in groupings:
+        members: dict[str, list[int]] = {}
+        for at, name in enumerate(names):
+            members.setdefault(name, []).append(at)
+        for name, inside in members.items():
+            if name and _is_group(len(inside), len(names)):
+                against = next(other for other in members if other != name) if len(members) == 2 else None
+                found.setdefault(tuple(inside), []).append((kind, name, against))
+    return found
+
+
+def _apart(one: Measured, groups: Groups, limit: float, group_limit: float) -> list[Apart]:
+    """The groups of a quantity that differ, the one that differs most first."""
+    apart: list[Apart] = []
+    y = one.y.copy()
+    for _ in range(_ROUNDS):
+        left = {members: labels for members, labels in groups.items() if members not in {of.members for of in apart}}
+        found = _most_apart(one, y, left, limit, group_limit)
         if found is None:
             break
         apart.append(found)
-        inside = _members(one, groupings, found)
-        offset = offset + found.offset * (inside - (0.0 if found.against is None else 0.5))
-    centred = one.y - offset
-    kept = _kept(centred, one.s, limit)
+        y -= found.shift(one.at)
+    return apart
+
+
+def _population(one: Measured, apart: Sequence[Apart], others: Set[int], limit: float) -> Population:
+    """The population of the units but `others`, the units that are odd elsewhere and not ordinary here."""
+    apart = list(apart)
+    while True:
+        offset = np.sum([np.zeros(one.y.size), *(group.shift(one.at) for group in apart)], axis=0)
+        centred = one.y - offset
+        own = ~np.isin(one.at, list(others))
+        if own.sum() < FEWEST:
+            own[:] = True
+        own |= fit(centred[own], one.s[own]).log_p(centred, one.s) > math.log(_ORDINARY)
+        kept = own.copy()
+        kept[own] = _kept(centred[own], one.s[own], limit)
+        split = None if apart and apart[-1].kind == TWO_GROUPS else _split(one, centred, kept)
+        if split is None:
+            break
+        apart.append(split)
     population = fit(centred[kept], one.s[kept])
     log_p = population.log_p(centred, one.s)
     off = centred - population.middle.median
-    unlike = [Unlike(int(one.at[k]), one.name, float(off[k]), float(log_p[k])) for k in np.flatnonzero(~kept).tolist()]
-    seen_from = _seen_from(centred[kept], one.s[kept], float(np.median(limit)))
-    return Population(one, population, offset, seen_from, tuple(apart), tuple(unlike))
+    unlike = [
+        Unlike(int(one.at[k]), one.name, float(off[k]), float(log_p[k]))
+        for k in np.flatnonzero(~kept & (log_p <= limit)).tolist()
+    ]
+    seen_from = _seen_from(centred[kept], one.s[kept], limit)
+    return Population(one, population, offset, kept, seen_from, tuple(apart), tuple(unlike))
 
 
 def _seen_from(y: Array, s: Array, limit: float) -> float:
@@ -241,71 +315,70 @@ def _seen_from(y: Array, s: Array, limit: float) -> float:
     return float(np.exp(np.interp(-limit, -log_p, np.log(off))))
 
 
-def _kept(y: Array, s: Array, limit: Array) -> NDArray[np.bool_]:
-    """The units [n] of the population: each as near as ln probability `limit` [n] by the population of the others.
-
-    It begins without the units that are far off in robust standard deviations, so that a few do not hide each other."""
+def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
+    """The units [n] that are not odd: `limit` is the ln probability of one that is."""
     middle, spread = robust(y, s)
-    kept = np.abs(y - middle) <= _FIRST * (1.0 + _OF_FEW / y.size) * np.sqrt(spread**2 + s**2)
-    for _ in range(_ROUNDS):
-        back = ~kept & (fit(y[kept], s[kept]).log_p(y, s) > limit)
-        if not back.any():
-            break
-        kept |= back
-    while kept.sum() > FEWEST:
-        log_p = fit(y[kept], s[kept]).log_p(y, s)
-        far = kept & (log_p <= limit)
-        if far.any() and kept.sum() - far.sum() >= FEWEST:
-            kept = kept & ~far
-            continue
-        k = int(np.argmin(np.where(kept, log_p - limit, np.inf)))
-        others = kept.copy()
-        others[k] = False
-        if fit(y[others], s[others]).log_p(y[k : k + 1], s[k : k + 1])[0] > limit[k]:
-            break
-        kept = others
-    return kept
+    order = np.argsort(-np.abs(y - middle) / np.hypot(spread, s))
+    most = min(math.ceil(MOST_ODD * y.size), y.size - FEWEST)
+    for k in sorted({round(count) for count in np.geomspace(1.0, max(most, 1), _TRIED)} if most > 0 else [])[::-1]:
+        rest = order[k:]
+        others = fit(y[rest], s[rest])
+        if others.log_p(y[order[k - 1 : k]], s[order[k - 1 : k]])[0] <= limit:
+            kept: NDArray[np.bool_] = others.log_p(y, s) > limit
+            kept[rest] = True
+            return kept
+    return np.ones(y.size, np.bool_)
 
 
-def _members(one: Measured, groupings: Sequence[Grouping], group: Apart) -> Array:
-    names = next(names for kind, names in groupings if kind == group.kind)
-    return np.array([float(names[at] == group.name) for at in one.at.tolist()])
+def _split(one: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
+    """The smaller of two groups in which the units lie, if two are better than one by _SPLIT.
+
+    Each cut of the sorted units gives two normals of one spread. Their likelihood counts each unit's group as drawn."""
+    order = np.flatnonzero(kept)[np.argsort(y[kept])]
+    x, s, n = y[order] - y[kept].mean(), one.s[order], order.size
+    if n < 2 * FEWEST_OF_GROUP:
+        return None
+    spread = float(np.std(x)) * np.geomspace(0.03, 3.0, _POINTS)
+    w = 1.0 / (spread[:, None] ** 2 + s**2)
+    sums = np.stack([np.cumsum(w * x**power, axis=1) for power in range(3)])
+    low, whole = sums[..., FEWEST_OF_GROUP - 1 : n - FEWEST_OF_GROUP], sums[..., -1:]
+    squares = [part[2] - part[1] ** 2 / part[0] for part in (low, whole - low, whole)]
+    ln = 0.5 * np.log(w).sum(axis=1)
+    two = ln[:, None] - 0.5 * (squares[0] + squares[1])
+    below = np.arange(FEWEST_OF_GROUP, n - FEWEST_OF_GROUP + 1)
+    gain = two.max(axis=0) - (ln - 0.5 * squares[2][:, 0]).max()
+    gain += below * np.log(below / n) + (n - below) * np.log1p(-below / n)
+    cut = int(np.argmax(gain))
+    low_ones = int(below[cut])
+    apart = float(np.mean(x[low_ones:]) - np.mean(x[:low_ones]))
+    unit = math.hypot(spread[np.argmax(two[:, cut])], float(np.median(s)))
+    if gain[cut] < _SPLIT or apart < _BETWEEN * unit:
+        return None
+    smaller, off = (order[low_ones:], apart) if 2 * low_ones > n else (order[:low_ones], -apart)
+    members = tuple(sorted(one.at[smaller].tolist()))
+    return Apart(TWO_GROUPS, "", one.name, off, -float(gain[cut]), members, against="")
 
 
-def _most_apart(
-    one: Measured,
-    offset: Array,
-    groupings: Sequence[Grouping],
-    known: set[tuple[str, str]],
-    limit: Array,
-    group_limit: float,
-) -> Apart | None:
-    """The group that differs most from the others, None without one beyond ln probability `group_limit`.
+def _most_apart(one: Measured, y: Array, groups: Groups, limit: float, group_limit: float) -> Apart | None:
+    """The group that differs most from the others, None without one beyond ln probability `group_limit`. `y` [n]: the
+    units without the groups that are known.
 
     Medians, which a few odd units move little, choose; the exact test of the units without odd ones decides. Medians
     see less: half the logarithm of the probability makes a candidate."""
-    centred = one.y - offset
-    same: dict[bytes, list[str]] = {}
-    candidates: list[tuple[float, str, str, NDArray[np.bool_], str | None]] = []
-    for kind, names in groupings:
-        there = dict.fromkeys(names[at] for at in one.at.tolist())
-        for name in there:
-            inside = np.array([names[at] == name for at in one.at.tolist()])
-            if not name or (kind, name) in known or inside.sum() < FEWEST_OF_GROUP:
-                continue
-            others = [other for other in there if other != name]
-            if inside.sum() > 0.5 * inside.size or (~inside).sum() < FEWEST_OF_GROUP:
-                continue
-            same.setdefault(inside.tobytes(), []).append(f"{kind} {name}")
-            against = others[0] if len(others) == 1 else None
-            candidates.append((_by_medians(centred, one.s, inside), kind, name, inside, against))
-    for log_p, kind, name, inside, against in sorted(candidates, key=lambda candidate: candidate[0]):
-        if log_p > 0.5 * group_limit:
+    inside_of = {members: np.isin(one.at, members) for members in groups}
+    log_p = {
+        members: _by_medians(y, one.s, inside)
+        for members, inside in inside_of.items()
+        if _is_group(int(inside.sum()), inside.size)
+    }
+    for members in sorted(log_p, key=lambda members: log_p[members]):
+        if log_p[members] > 0.5 * group_limit:
             break
-        difference, exact = _difference(centred, one.s, inside, limit)
+        difference, exact = _difference(y, one.s, inside_of[members], limit)
         if exact <= group_limit:
-            also = [other for other in same[inside.tobytes()] if other != f"{kind} {name}"]
-            return Apart(kind, name, one.name, difference, exact, tuple(also), against)
+            (kind, name, against), *others = groups[members]
+            also = tuple(f"{kind} {name}" for kind, name, _ in others)
+            return Apart(kind, name, one.name, difference, exact, members, also, against)
     return None
 
 
@@ -317,7 +390,7 @@ def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
     return math.log(2.0) + float(log_ndtr(-abs(difference) / math.sqrt(sum(variance))))
 
 
-def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: Array) -> tuple[float, float]:
+def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: float) -> tuple[float, float]:
     """By how much the units `inside` [n] differ from the others, and ln of the probability that chance does it.
 
     Units that are odd on their own side count on neither."""

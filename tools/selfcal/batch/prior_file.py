@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import yaml
 
+from selfcal.bank.priors import prior_tree
 from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.base.output import write_text
-from selfcal.batch.population import Population
-from selfcal.batch.summary import Batch, axes_of, group_of, sound_of
+from selfcal.batch.population import TWO_GROUPS, Population
+from selfcal.batch.summary import Batch, axes_of, sound_of
 from selfcal.model.file import LOG_NORMAL_SD, Model, Prior, read_yaml
-from selfcal.readings.priors import prior_tree
 
 #: Significant digits of a prior.
 DIGITS = 4
@@ -85,13 +85,11 @@ def _prior(population: Population, batch: Batch) -> Prior:
 
 
 def _of_lots(population: Population, batch: Batch) -> np.ndarray:
-    """By how much each unit [n] is off for its lot: its own, unlike a station's or a day's part."""
-    last = [unit[-1] for unit in batch.devices.values()]
+    """By how much each unit [n] is off for its lot, or for the one of two groups: its own, unlike a station's part."""
     shift = np.zeros(population.measured.at.size)
     for apart in population.apart:
-        if apart.kind == "lot" or any(name.startswith("lot ") for name in apart.also):
-            inside = [group_of(apart.kind, last[at]) == apart.name for at in population.measured.at.tolist()]
-            shift += apart.offset * np.array(inside, float)
+        if apart.kind in ("lot", TWO_GROUPS) or any(name.startswith("lot ") for name in apart.also):
+            shift += apart.shift(population.measured.at)
     return shift
 
 

@@ -30,7 +30,7 @@ from typing import Any, Protocol
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from selfcal.base.errors import UserError, first_line, install, note, printable
+from selfcal.base.errors import UserError, first_line, install, note, printable, shown
 from selfcal.base.output import whole
 from selfcal.base.progress import EVERY_S
 
@@ -41,6 +41,8 @@ Row = dict[str, Any]
 Work = tuple[int, list[Job]]
 #: s until a scheduler has answered.
 PATIENCE_S = 10.0
+#: Seeds that the simulator takes.
+SEEDS = 2**64
 #: Workers that die over a piece until the piece is the reason.
 DEATHS = 4
 _KILLED = "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"
@@ -60,7 +62,14 @@ def record_seeds(records: int, seed: int) -> list[int]:
     """A seed for each record of an ensemble. Raises UserError for fewer than two, which have no scatter."""
     if records < 2:
         raise UserError("--records must be at least 2")
-    return [seed + 1_000_003 * k for k in range(records)]
+    return [(checked_seed(seed) + 1_000_003 * k) % SEEDS for k in range(records)]
+
+
+def checked_seed(seed: int) -> int:
+    """The seed. Raises UserError for one that the simulator does not take."""
+    if not 0 <= seed < SEEDS:
+        raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {shown(seed)}")
+    return seed
 
 
 def spread(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -19,6 +18,8 @@ from selfcal.batch.population import (
     FALSE_ALARM,
     FEWEST,
     FEWEST_OF_GROUP,
+    MOST_ODD,
+    TWO_GROUPS,
     Apart,
     Grouping,
     Interval,
@@ -27,17 +28,15 @@ from selfcal.batch.population import (
     populations,
     sd_of,
 )
-from selfcal.batch.table import Unit, bias_of
+from selfcal.batch.table import Unit, best, bias_of
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
 
-#: Nats that one unit may weigh in the choice of the batch's law: an odd one decides nothing.
-MOST_NATS = 10.0
+#: Rounds in which the shares of the laws are found.
+SHARE_ROUNDS = 100
 #: Nats by which a unit's law must be better than the batch's, at most one in e^12 times by chance.
 OTHER_LAW = 12.0
-#: A mark that more of the units have is the batch's own.
-COMMON = 0.1
 #: Relative difference of two lattices.
 LATTICE = 0.05
 #: Of a recording beside a normal prior, of a quantity or of its logarithm: with less it says nothing of the quantity.
@@ -47,6 +46,8 @@ KINDS = ("station", "day", "lot")
 #: Devices of a line at most.
 MOST_NAMED = 20
 SECONDS_A_DAY = 86400.0
+#: Times the batch's median from which on parts do not differ: a batch that sees no less names no unit by it.
+MOST_TIMES = 1000.0
 
 
 @dataclass(frozen=True)
@@ -94,13 +95,17 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     laws = _laws(devices)
     known = _known(devices, laws, model)
     unidentified: dict[str, tuple[int, int]] = {}
-    found = populations(list(_measured(known, names, laws, unidentified)), groupings)
     shared = _shared(devices, groupings)
+    marked = list(_marked(devices, laws, shared))
+    odd: dict[str, set[int]] = {}
+    for axis, name, _ in marked:
+        odd.setdefault(axis, set()).add(names.index(name))
+    found = populations(list(_measured(known, names, laws, unidentified)), groupings, odd)
     unlike: dict[str, list[str]] = {}
     for population in found:
         for one in population.unlike:
             unlike.setdefault(names[one.at], []).append(_off(population, one.off, one.log_p))
-    for name, words in _marked(devices, laws, shared):
+    for _, name, words in marked:
         unlike.setdefault(name, []).append(words)
     others = {key: list(one) for key, one in left_out.items()}
     drifts = drifts_of(_series(known, names))
@@ -175,16 +180,18 @@ def _behind(axis: Mapping[str, Any]) -> dict[str, float]:
 
 
 def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
-    """The law that the batch has, by axis: the one with the greatest evidence over all units."""
-    found = {}
+    """The law that the batch has, by axis: most units are of it where each is of one law, by the greatest likelihood.
+
+    An odd unit counts as one, however many nats it has. Expectation and maximization in turn find the shares."""
+    found: dict[str, str] = {}
     for axis in axes_of(devices):
-        total: Counter[str] = Counter()
-        for axes in sound_of(devices, axis).values():
-            for one in axes:
-                for law, nats in _behind(one).items():
-                    total[law] -= min(nats, MOST_NATS)  # type: ignore[assignment]
-        if total:
-            found[axis] = max(total, key=lambda law: total[law])
+        behind = [_behind(one) for axes in sound_of(devices, axis).values() for one in axes]
+        laws = list(dict.fromkeys(law for one in behind for law in one))
+        likelihood = np.exp([[-one.get(law, math.inf) for law in laws] for one in behind])
+        share = np.ones(len(laws))
+        for _ in range(SHARE_ROUNDS if behind else 0):
+            share = likelihood.T @ (1.0 / (likelihood @ share)) * share / len(behind)
+        found |= {axis: laws[int(np.argmax(share))]} if behind else {}
     return found
 
 
@@ -217,9 +224,13 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
 
 
 def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: Sequence[Regressor]) -> dict[str, Known]:
-    """What one recording says of each parameter of a law, each coefficient of a regressor, and the bias."""
+    """What one recording says of each parameter of a law, each coefficient of a regressor, and the bias.
+
+    A unit whose own law has N where the batch's has no number is compared by its own."""
     parameters: Mapping[str, Mapping[str, Any]] = axis["parameters"][law]
     found = {name: _parameter(one, group.priors.get(name)) for name, one in parameters.items()}
+    if found.get("N") is None:
+        found["N"] = _parameter(axis["parameters"][best(axis)]["N"], group.priors.get("N"))
     for one in regressors:
         for column, estimate in axis.get("regressors", {}).get(one.name, {"coefficients": {}})["coefficients"].items():
             found[column] = _coefficient(estimate, one.sd[group.name])
@@ -230,9 +241,11 @@ def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: S
 
 
 def _parameter(one: Mapping[str, Any], prior: Prior | None) -> Known | None:
-    """ln of a parameter. A uniform `prior` leans upwards by s^2 in the logarithm. None: the recording says nothing."""
+    """ln of a parameter. A uniform `prior` leans upwards by s^2 in the logarithm. None: the recording says nothing.
+
+    An estimate off the grid counts: it is rough, and far from the batch's if it is odd."""
     median, q05, q95 = (one[key] for key in ("median", "q05", "q95"))
-    if None in (median, q05, q95) or not 0.0 < q05 < q95 < math.inf or one["off_grid"]:
+    if None in (median, q05, q95) or not 0.0 < q05 < q95 < math.inf:
         return None
     s = math.log(q95 / q05) / (2.0 * HALF_90)
     y = math.log(median)
@@ -310,8 +323,10 @@ def _off(population: Population, off: float, log_p: float) -> str:
 
 def _marked(
     devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], shared: Sequence[Shared]
-) -> Iterator[tuple[str, str]]:
-    """Devices with what few others have: marks of the readings, another lattice, another law, a cause."""
+) -> Iterator[tuple[str, str, str]]:
+    """Axes of devices with what few others have, and its words: another lattice or law than most, a mark, a cause.
+
+    A mark or a cause that more than MOST_ODD of the units have is the batch's own."""
     known = {(one.kind, one.name, one.cause) for one in shared}
     for axis in axes_of(devices):
         sound = sound_of(devices, axis)
@@ -326,22 +341,19 @@ def _marked(
             own = axes[-1].get("lattice", math.nan)
             if abs(own / step - 1.0) > LATTICE:
                 unit = axes[-1]["bias_now"]["unit"]
-                found.setdefault("lattice", []).append(
-                    (name, f"{axis} steps of {own:.3g} {unit}, the batch's are {step:.3g}")
-                )
+                yield axis, name, f"{axis} steps of {own:.3g} {unit}, the batch's are {step:.3g}"
             behind = _behind(axes[-1])
             if axis in laws and behind.get(laws[axis], math.inf) > OTHER_LAW + math.log(len(sound)):
                 law = min(behind, key=lambda one: behind[one])
-                words = f"{axis} {law} by {behind[laws[axis]]:.0f} nats, the batch's law is {laws[axis]}"
-                found.setdefault(f"law {law}", []).append((name, words))
+                yield axis, name, f"{axis} {law} by {behind[laws[axis]]:.0f} nats, the batch's law is {laws[axis]}"
             for unit_ in devices[name]:
                 for cause in unit_.causes(axis):
                     if not any((kind, group_of(kind, unit_), cause) in known for kind in KINDS):
                         found.setdefault(f"cause {cause}", []).append((name, f"{axis} {cause}"))
         for marked in found.values():
             told = dict(marked)
-            if len(told) <= max(1.0, COMMON * len(sound)):
-                yield from told.items()
+            if len(told) <= MOST_ODD * len(sound):
+                yield from ((axis, name, words) for name, words in told.items())
 
 
 def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]) -> list[Shared]:
@@ -413,6 +425,13 @@ def plain(measured: Measured, of: Interval) -> Interval:
     return of.through(math.exp) if measured.logarithm else of
 
 
+def _seen_from(population: Population) -> float | None:
+    """How far off a unit must be to be unlike, a factor or in the unit; None: no part is as far off."""
+    if not population.measured.logarithm:
+        return population.seen_from
+    return math.exp(population.seen_from) if population.seen_from <= math.log(MOST_TIMES) else None
+
+
 def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
     measured = population.measured
     return {
@@ -422,9 +441,9 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
         "of": "ln" if measured.logarithm else "value",
         "middle": vars(plain(measured, population.fit.middle)),
         "spread": vars(population.fit.spread),
-        "unlike_from": math.exp(population.seen_from) if measured.logarithm else population.seen_from,
-        "left_out": [names[one.at] for one in population.unlike],
-        "apart": [vars(one) for one in population.apart],
+        "unlike_from": _seen_from(population),
+        "left_out": [names[at] for at in measured.at[~population.kept].tolist()],
+        "apart": [{**vars(one), "members": [names[at] for at in one.members]} for one in population.apart],
     }
 
 
@@ -441,13 +460,23 @@ def lines_of(batch: Batch) -> Iterator[str]:
         )
     yield from unidentified_lines(batch)
     for (axis, reason), names in batch.left_out.items():
-        more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-        yield f"left out of the population: {axis} of {', '.join(names[:MOST_NAMED])}{more}: {reason}"
+        yield f"left out of the population: {axis} of {_some(names)}: {reason}"
+    yield from group_lines(batch)
+
+
+def group_lines(batch: Batch) -> Iterator[str]:
+    """A line for each group that is apart, and for each cause that a group shares."""
+    names = list(batch.devices)
     for one in batch.populations:
         for apart in one.apart:
-            yield f"{apart.kind} {apart.name}: {apart_words(one.measured, apart)}"
+            yield f"{f'{apart.kind} {apart.name}'.strip()}: {apart_words(one.measured, apart, names)}"
     for shared in batch.shared:
-        yield f"{shared.kind} {shared.name}: {shared_words(shared)}"
+        yield f"{shared.kind} {shared.name}: {_shared_words(shared)}"
+
+
+def _some(names: Sequence[str]) -> str:
+    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
+    return f"{', '.join(names[:MOST_NAMED])}{more}"
 
 
 def unidentified_lines(batch: Batch) -> Iterator[str]:
@@ -461,8 +490,10 @@ def unidentified_lines(batch: Batch) -> Iterator[str]:
 
 def seen_from_words(population: Population) -> str:
     """How far off a unit must be to be unlike."""
-    measured, off = population.measured, population.seen_from
-    return f"{math.exp(off):.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
+    measured, off = population.measured, _seen_from(population)
+    if off is None:
+        return f"more than {MOST_TIMES:.0f} times: too few units, or too short recordings"
+    return f"{off:.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
 
 
 def _drift_words(one: Drift) -> str:
@@ -470,18 +501,21 @@ def _drift_words(one: Drift) -> str:
     return f"{one.quantity} {rate} a day, {one.recordings} recordings in {one.days:.3g} days, {sd_of(one.log_p):.1f} sd"
 
 
-def apart_words(measured: Measured, apart: Apart) -> str:
-    """How a group differs, and whose that is."""
+def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:
+    """How a group differs, and whose that is. `names`: the devices, for a group without a label."""
     also = f"; the same units are {', '.join(apart.also)}" if apart.also else ""
     how = f"{math.exp(apart.offset):.3g} times" if measured.logarithm else f"{apart.offset:+.3g} {measured.unit} from"
     if apart.against is None:
         return f"{measured.name} is {how} the other units', {sd_of(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
+    if apart.kind == TWO_GROUPS:
+        of = _some([names[at] for at in apart.members])
+        return f"{measured.name} of {of} is {how} the others': no column of the batch explains it"
     other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
     said = f"the two differ, {sd_of(apart.log_p):.1f} sd: which one is off, two alone do not show"
     return f"{measured.name} is {how} {other}, {said}{also}"
 
 
-def shared_words(shared: Shared) -> str:
+def _shared_words(shared: Shared) -> str:
     """How many units of a group have a cause, and whose it is."""
     inside, outside = shared.inside, shared.outside
     there = f"{inside[0]} of {inside[1]} units, {outside[0]} of {outside[1]} elsewhere"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from selfcal.bank.result import HALF_90
-from selfcal.base.errors import UserError, install
+from selfcal.base.errors import UserError, cell, install
 from selfcal.base.output import whole
 from selfcal.batch.files import Source, moment, stem
 
@@ -142,5 +142,4 @@ def _cell(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, float):
         return f"{value:.9g}"
-    text = str(value)
-    return f"'{text}" if text[:1] in ("=", "+", "@", "\t", "\r") else text
+    return cell(value) if isinstance(value, str) else str(value)

@@ -101,7 +101,7 @@ def _never(a: Look, b: Look) -> bool:
 def sized(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
     """The entry of a column, of which a look knows numbers better than the search that chose it."""
     known = {} if look is None else medians(look)
-    return {**entry, **{key: digits(value) for key, value in known.items() if key in entry}}
+    return {**entry, **{key: digits(value, 9) for key, value in known.items() if key in entry}}
 
 
 @dataclass(frozen=True)
@@ -130,8 +130,10 @@ class Cause:
     from_zero    the simulator's effect begins at 0, its column is about the middle.
     law          adds a law to a model file's tree without which N is wrong: `identify` reports by it.
     extend       writes what is no column into the model file.
+    stated       whether a model file has it already: then it is no finding. A column is in the model from the start.
     of_column    keys of `--effect` for columns of the model file: the first one and the coefficients of all.
-    of_estimate  keys of `--effect` for a finding; None: the simulator cannot make it.
+    of_estimate  keys of `--effect` for a finding where they are not the medians of its estimate; None, or none of them:
+                 the simulator cannot make it.
     keys         keys of `simulate --effect`; empty: it cannot be simulated.
     follows      the effect follows another axis: the key `other`.
     common       the effect is of the whole recording and has no axis.
@@ -163,6 +165,7 @@ class Cause:
     from_zero: bool = False
     law: Callable[[dict[str, Any], Look], None] | None = None
     extend: Callable[[Extension], None] | None = None
+    stated: Callable[[Finding, Model], bool] = field(default=lambda finding, model: False)
     of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None
     of_estimate: Callable[[Look], dict[str, Any] | None] | None = None
     keys: Mapping[str, Key] = field(default_factory=dict)
@@ -170,6 +173,12 @@ class Cause:
     common: bool = False
     add: Callable[[Mapping[str, Any], Channels], Array] | None = None
     spoil: Callable[[Array, Mapping[str, Any], float, float, Random], None] | None = None
+
+    def effect(self, look: Look) -> dict[str, Any] | None:
+        """Keys of `--effect` for a finding; None: the simulator cannot make it."""
+        if self.of_estimate is not None:
+            return self.of_estimate(look)
+        return {key: value for key, value in medians(look).items() if key in self.keys} or None
 
     @property
     def several(self) -> bool:

@@ -18,6 +18,7 @@ from selfcal.base.ending import Held, Stopped, abandon
 from selfcal.base.errors import UserError, note, printable
 from selfcal.base.progress import Doing
 from selfcal.diagnosis import words
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
@@ -87,10 +88,17 @@ def looked_at(record: Record, names: Sequence[str], ending: Held, doing: Doing) 
     return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
 
 
+def less_stated(one: Diagnosed, model: Model) -> Diagnosed:
+    """The axis without findings that the model file states already: they are `stated`."""
+    stated = [finding for finding in one.findings if CAUSES[finding.look.cause].stated(finding, model)]
+    findings = [finding for finding in one.findings if not any(finding is each for each in stated)]
+    return replace(one, findings=findings, stated=stated, before=one.before if findings else one.after)
+
+
 def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
-    """Axes without a cause must pass the checks of `identify`."""
+    """Axes without a cause must pass the checks of `identify`, whose bank has the whole model."""
     for name, one in found.items():
-        if one.findings or one.state.below_lattice:
+        if one.findings or one.state.below_lattice or model.beyond:
             continue
         with suppress(UserError):  # no report, no checks
             look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)
@@ -179,6 +187,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         reason = f": {axis['unfinished']}" if axis.get("unfinished") else ""
         colour = "bold red" if axis["verdict"] != "adequate" else "yellow" if reason else "green"
         heading = f"{name} [{axis['unit']}]: {words.verdict(axis)}{reason}"
+        heading += f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else ""
         console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
         for finding in axis["findings"]:
             for line in _lines(finding):

@@ -23,8 +23,8 @@ from selfcal.model.file import MOST_COLUMNS
 from selfcal.model.regressors import coefficient_unit
 
 SCHEMA = "selfcal.diagnose/1"
-#: Why a finding is not in the extended model file.
-NO_ROOM = f"a model file holds {MOST_COLUMNS} columns, and findings of more evidence fill them"
+#: Why a finding is not in a module's model.
+NO_ROOM = f"a bank has {MOST_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
 G_SENSITIVITY_UNIT = coefficient_unit("deg/s", "m/s^2")
 
 
@@ -38,7 +38,7 @@ def to_document(
 ) -> dict[str, Any]:
     """The document, in the units of the recording's columns. `errors`: why an axis has no result. `model`: the extended
     model file's tree. `first`: what a look at means has found, of which causes that `found` has not stay beside it.
-    `out`: findings that the model file has no room for."""
+    `out`: findings that a bank has no room for."""
     axes = {name: _axis(one, recording.columns[name].unit, first.get(name), out) for name, one in found.items()}
     return {
         "schema": SCHEMA,
@@ -59,6 +59,7 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
         "judged_at_hz": record.rate_hz,
         "verdict": "adequate" if one.adequate else "inadequate",
         **({"unfinished": one.unfinished} if one.unfinished else {}),
+        **({"stated": [finding.look.cause for finding in one.stated]} if one.stated else {}),
         "findings": [
             _finding(finding, record, factor, unit)
             | ({"left_out_of_model": NO_ROOM} if any(finding is each for each in out) else {})

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from selfcal.bank.priors import state_own
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError, remark
 from selfcal.diagnosis.cause import Cause, Extension
@@ -22,11 +23,10 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import finish
 from selfcal.likelihood.state import Regressor as Column
-from selfcal.model.file import MOST_COLUMNS, SMALLEST, Model
+from selfcal.model.file import MOST_COLUMNS, MOST_STATED, SMALLEST, Model
 from selfcal.model.forms import NUMBER, formed
 from selfcal.model.laws import averaged
 from selfcal.model.regressors import trailing_mean
-from selfcal.readings.priors import state_own
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0
@@ -78,42 +78,58 @@ def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
             nodes["cortex-m0"].update({law: nodes["cortex-m0-small"][law] for law in plain})
 
 
-def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[dict[str, float], list[tuple[str, Finding]]]:
-    """Regressors that the model file has room for, with their evidence, the most first; findings that it has none for,
-    with their axes. A finding fits whole or not at all."""
+def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], list[tuple[str, Finding]]]:
+    """Regressors that the model file has room for: those that a bank has columns for first, and the most evidence
+    first. Findings that a bank has none for, with their axes: a finding fits whole or not at all."""
     stated = {column for one in model.regressors for column in one.columns}
+    beyond = {column for one in model.beyond for column in one.columns}
     offered: list[tuple[float, str, Finding | None, dict[str, int]]] = []
     for name, one in found.items():
         places = {
             column.name: k
             for k, column in enumerate(one.state.regressors, 1)
-            if column.name not in stated and column.entry
+            if column.name not in stated | beyond and column.entry
         }
-        owned = [(finding, {column.name for column in finding.columns}) for finding in one.findings]
-        groups: list[tuple[Finding | None, list[str]]] = [
-            (finding, [column for column in places if column in own]) for finding, own in owned if own & places.keys()
-        ]
-        # A harmonic's finding is its fundamental's.
-        groups += [(None, [column]) for column in places if not any(column in own for _, own in owned)]
-        for finding, columns in groups:
+        owner = {column.name: finding for finding in one.findings for column in finding.columns}
+        groups: dict[object, list[str]] = {}
+        for column in places:
+            of = owner.get(column)
+            groups.setdefault(regressor_key(column) if of is None else id(of), []).append(column)
+        for columns in groups.values():
+            finding = owner.get(columns[0])
             c, sd = (getattr(one.state.best, of)[[places[column] for column in columns]] for of in ("c", "sd"))
             gain = finding.look.gain if finding else 0.5 * float(np.sum((c / np.maximum(sd, 1e-300)) ** 2))
-            offered.append((gain, name, finding, dict(Counter(map(regressor_key, columns)))))
-    kept: dict[str, float] = {}
+            offered.append(
+                (gain, name, finding or _fundamental(one, columns[0]), dict(Counter(map(regressor_key, columns))))
+            )
+    kept: dict[str, bool] = {}
     out: list[tuple[str, Finding]] = []
-    used = len(stated)
-    for gain, name, finding, keys in sorted(offered, key=lambda one: -one[0]):
+    of_bank, of_file = len(stated), len(stated | beyond)
+    for _, name, finding, keys in sorted(offered, key=lambda one: -one[0]):
         more = {key: count for key, count in keys.items() if key not in kept}
-        if used + sum(more.values()) <= MOST_COLUMNS:
-            kept |= dict.fromkeys(more, gain)
-            used += sum(more.values())
-        elif finding is not None:
+        fits = of_bank + sum(more.values()) <= MOST_COLUMNS
+        of_bank += fits * sum(more.values())
+        if finding is not None and not fits and all(finding is not each for _, each in out):
             out.append((name, finding))
-    return kept, out
+        if of_file + sum(more.values()) <= MOST_STATED:
+            of_file += sum(more.values())
+            kept |= dict.fromkeys(more, fits)
+    return sorted(kept, key=lambda key: not kept[key]), out
+
+
+def _fundamental(one: Diagnosed, harmonic: str) -> Finding | None:
+    """The finding that a harmonic's column belongs to."""
+    hz = next(float(column.entry["frequency_hz"]) for column in one.state.regressors if column.name == harmonic)
+
+    def off(finding: Finding) -> float:
+        turns = hz / float(finding.look.estimate["frequency_hz"]["median"])
+        return abs(turns - round(turns))
+
+    return min((each for each in one.findings if "harmonics" in each.look.estimate), key=off, default=None)
 
 
 def left_out(model: Model, found: Mapping[str, Diagnosed]) -> list[tuple[str, Finding]]:
-    """Findings whose columns the model file has no room for, each with its axis. Those of most evidence are in it."""
+    """Findings whose columns a bank has no room for, each with its axis. Those of most evidence have it."""
     return _fitting(model, found)[1]
 
 
@@ -132,11 +148,8 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             look = None if finding is None else finding.look
             own = CAUSES[regressor.cause].entry(regressor.entry, look, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
-            if (
-                CAUSES[regressor.cause].smoothed
-                and entry["kind"] == "column"
-                and entry.get("form") not in ("lag", "rate")
-            ):
+            form = entry.get("form")
+            if entry["kind"] == "column" and (form == "rate" or (CAUSES[regressor.cause].smoothed and form != "lag")):
                 smoothed.add(key)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
@@ -151,8 +164,8 @@ def finding_of(one: Diagnosed, column: Column) -> Finding | None:
 
 
 def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) -> None:
-    """The window whose trailing mean explains the axes best. A centred mean, which the diagnosis takes, needs values
-    that a module does not have yet; a trailing one lags, so a shorter window suits it."""
+    """The window whose trailing mean, or slope, explains the axes best. A centred one, which the diagnosis takes, needs
+    values that a module does not have yet; a trailing one lags, so a shorter window suits it."""
     explained = [one for one in found.values() if any(column.name == name for column in one.state.regressors)]
     record = max((one.record for one in explained), key=lambda record: record.rate_hz)
     gains: dict[float, float] = {}
@@ -160,23 +173,29 @@ def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) ->
         window = max(1, round(width * record.rate_hz))
         if window > record.present.size // 10:
             break
+        if window == 1 and entry.get("form") == "rate":  # a slope has two readings at least
+            continue
         try:
             gains[width if window > 1 else 0.0] = sum(_with_values(one, name, width, entry) for one in explained)
         except Stopped:  # the shortest, which suits any
             break
-    best = max(gains, key=lambda width: gains[width], default=0.0)
-    entry.pop("window_s", None)
+    best = max(gains, key=lambda width: gains[width], default=None)
+    if best is not None:
+        entry.pop("window_s", None)
     if best:
         entry["window_s"] = best
 
 
 def _with_values(one: Diagnosed, name: str, width: float, entry: Mapping[str, Any]) -> float:
-    """ln likelihood of the axis with a column of trailing means of `width` s, at the drift found."""
+    """ln likelihood of the axis with a column of trailing means, or slopes, of `width` s, at the drift found."""
     record = one.record
     channel = record.channel_of(str(entry["column"]), str(entry.get("input", "value")))
-    means = trailing_mean(channel, max(1, round(width * record.rate_hz)))
-    form, about = str(entry.get("form", "static")), float(entry["reference"])
-    values = formed(means - about, form, float(entry.get(NUMBER.get(form, ""), math.nan)))
+    form, about = str(entry.get("form", "static")), float(entry.get("reference", 0.0))
+    if form == "rate":
+        values = formed(channel - about, form, width, 0.0, 1.0 / record.rate_hz)
+    else:
+        means = trailing_mean(channel, max(1, round(width * record.rate_hz)))
+        values = formed(means - about, form, float(entry.get(NUMBER.get(form, ""), math.nan)))
     columns = tuple(
         replace(column, values=values) if column.name == name else column for column in one.state.regressors
     )
@@ -212,11 +231,11 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
         sigma_m = fit.sigma_m / math.sqrt(gain)
         drift = {"hypothesis": "gauss_markov", "sigma_m": digits(sigma_m), "alpha": digits(fit.alpha)}
         lacking = rest * sigma_m**2
-    # The simulator's ramp and temperature begin at 0.
+    # The simulator's ramp and temperature begin at 0, but for a rate.
     at_first = sum(
         float(c * column.values[0])
         for c, column in zip(fit.c[1:], one.state.regressors, strict=True)
-        if column.cause in CAUSES and CAUSES[column.cause].from_zero
+        if column.cause in CAUSES and CAUSES[column.cause].from_zero and form_of(column)[2] != "rate"
     )
     return {
         "hypothesis": drift.pop("hypothesis"),
@@ -270,10 +289,10 @@ def _channel_of(column: Column) -> tuple[str, ...]:
 
 
 def _of_findings(one: Diagnosed) -> Iterator[_Effect]:
-    """Of the findings. The lattice and the range are in the groups."""
-    for finding in one.findings:
+    """Of the findings, also of those that the model file states. The lattice and the range are in the groups."""
+    for finding in (*one.findings, *one.stated):
         cause = CAUSES[finding.look.cause]
-        keys = cause.of_estimate(finding.look) if cause.of_estimate is not None else None
+        keys = cause.effect(finding.look)
         if keys is not None:
             channel = _channel_of(finding.columns[0]) if finding.columns else ()
             yield _Effect(cause, finding.look.gain, keys, channel)

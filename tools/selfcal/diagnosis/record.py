@@ -15,7 +15,7 @@ from selfcal.likelihood.state import Regressor, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.logs.timebase import Clock
-from selfcal.model.file import Group, Model
+from selfcal.model.file import REGRESSORS, Group, Model
 from selfcal.model.file import Regressor as Stated
 from selfcal.model.forms import variance_of
 from selfcal.model.regressors import columns_of, offered
@@ -29,6 +29,8 @@ BEYOND = 100.0
 SAME = 1.0 - 1e-7
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
 SLOWEST = 0.99
+#: Keys of a regressor that are times of the recording.
+TIMES = ("time_s", "start_s", "end_s")
 
 
 @dataclass(frozen=True)
@@ -104,6 +106,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     """
     if decimate is not None and not (math.isfinite(decimate) and 0.0 < decimate <= recording.rate_hz):
         raise UserError(f"--decimate must be a rate above 0 Hz, at most the recording's {recording.rate_hz:g} Hz")
+    model = replace(model, regressors=(*model.regressors, *model.beyond))
     known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
     recording, changes = evened(recording)
     recording, held = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
@@ -145,17 +148,9 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         own = recording.along(name) if offered(model, name) else recording
         for one in offered(model, name):
             values = columns_of((one,), own)
-            entry = {
-                "column": one.column,
-                "frequency_hz": one.frequency_hz,
-                "time_s": one.time_s - recording.start_s,
-                "tau_s": one.tau_s,
-                "kind": one.kind,
-                "form": one.form,
-                "input": one.input,
-                "start_s": one.start_s - recording.start_s,
-                "end_s": one.end_s - recording.start_s,
-            }
+            # The loop's own columns have a unit beside these: those alone may give way to a better form.
+            entry = {key: getattr(one, key) for key in ("kind", *REGRESSORS[one.kind]) if key != "unit"}
+            entry |= {key: entry[key] - recording.start_s for key in TIMES if key in entry}
             for column, row in zip(one.columns, values.T, strict=True):
                 about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.offset
                 found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
@@ -244,7 +239,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     for cause, (column, unit) in SIDE_CHANNELS.items():
         if column in recording.columns:
             values = recording.in_unit(column, unit)
-            if np.ptp(values) > 0.0:
+            if np.ptp(values) > 0.0 and _original(recording, column, tuple(states)) is None:
                 channels[cause] = bridged(on_grid(recording.clock, values)[0])
                 names[cause] = column
     return Record(
@@ -305,7 +300,7 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
 
 
 def _original(recording: Recording, name: str, others: Sequence[str]) -> str | None:
-    """The axis of `others` that this one is a copy of: no noise of its own."""
+    """The axis of `others` that this column is a copy of: no noise of its own."""
     own = np.diff(recording.columns[name].values)
     for other in others:
         theirs = np.diff(recording.columns[other].values)
@@ -332,9 +327,11 @@ def _beyond(values: Array, group: Group) -> bool:
 
 def _cause(one: Stated, model: Model) -> str:
     """The cause that a regressor of the model file stands for."""
-    if one.kind == "column" and one.column in model.axes:
-        return "cross_axis"
-    return {"time": "ramp", "column": _channel(one.column), "rate": "rate"}.get(one.kind, one.kind)
+    if one.kind not in ("column", "rate"):
+        return {"time": "ramp"}.get(one.kind, one.kind)
+    if one.column in model.axes:
+        return "vibration" if one.input == "variance" else "cross_axis"
+    return _channel(one.column)
 
 
 def _channel(column: str) -> str:

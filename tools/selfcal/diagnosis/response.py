@@ -15,7 +15,7 @@ from rich.table import Table
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
-from selfcal.base.output import save_picture
+from selfcal.base.output import plotter, save_picture
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
@@ -60,7 +60,11 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
         return [_about(Input(bridged(record.axes[name].y) + record.axes[name].level, record.axes[name].unit))]
     if name not in record.channel_names.values():
         known = name in dict(SIDE_CHANNELS.values())
-        reason = "does not change" if known else "is neither temp, nor supply, nor an axis of the model"
+        reason = (
+            "does not change, or is a copy of an axis"
+            if known
+            else "is neither temp, nor supply, nor an axis of the model"
+        )
         raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
     unit = recording.columns[name].unit
     values = units.convert(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
@@ -278,12 +282,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 
 def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
     """Save gain, phase and coherence over frequency. Raises UserError if the file cannot be written."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, (gain, phase, coherence) = pyplot.subplots(
+    figure, (gain, phase, coherence) = plotter().subplots(
         3, 1, figsize=(8.0, 8.6), sharex=True, layout="constrained", height_ratios=(3, 3, 2)
     )
     column, axis = document["input"], document["output"]

@@ -12,6 +12,7 @@ import yaml
 from selfcal.adequacy.checks import FEWEST
 from selfcal.adequacy.document import to_document
 from selfcal.adequacy.identify import identify_axis
+from selfcal.bank.priors import add_sources, for_record
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.integrity import masked
 from selfcal.diagnosis.loop import LOOKS
@@ -21,7 +22,6 @@ from selfcal.likelihood.state import NET_LEAST, Look
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import bank_block, make_tables
-from selfcal.readings.priors import add_sources, for_record
 
 if TYPE_CHECKING:
     from selfcal.likelihood.state import Look

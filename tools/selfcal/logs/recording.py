@@ -7,8 +7,10 @@ file may have such a text beside it, LOG.meta.json. Every fault raises UserError
 
 from __future__ import annotations
 
+import gzip
 import json
 import math
+import re
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
@@ -24,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, note, short, shown
+from selfcal.base.errors import UserError, cell, note, short, shown
 from selfcal.base.limits import (
     LEAST_RATE_HZ,
     LONGEST_HEADING,
@@ -39,8 +41,10 @@ from selfcal.base.limits import (
 from selfcal.base.options import Scale
 from selfcal.base.output import together, whole
 from selfcal.base.units import SENSORS
+from selfcal.logs import written
 from selfcal.logs.loaders import WRITTEN, check_library, format_of
 from selfcal.logs.loaders.child import tables_of
+from selfcal.logs.loaders.damage import SOUND, Damaged, bytes_of
 from selfcal.logs.loaders.headings import Meaning, Sensor, number_of, sensors_of, sides_of, split
 from selfcal.logs.loaders.sources import Part, chosen
 from selfcal.logs.loaders.table import Hints, Member, Table, parse_meta
@@ -60,10 +64,13 @@ _LSB_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in SENSORS}
 #: record that rests, and the seconds of a mean.
 _GRAVITY = {"g": 1.0, "mg": 1000.0, "m/s^2": units.STANDARD_GRAVITY, "mm/s^2": 1000.0 * units.STANDARD_GRAVITY}
 _GRAVITY_OFF, _AT_REST, _GRAVITY_S = 0.05, 0.9, 1.0
-
-
+#: What to type where no heading is a sensor's.
+_NAME_YOURS = "name yours with --column gx=NAME, and --unit gx=UNIT where its heading has none"
 #: Columns without a unit that begin with a whole number, from which on they may be counts.
 _COUNTS_FROM = 3
+
+#: Lines that are written at once; signs that separate columns, and so are none of a heading.
+_LINES, _SIGNS = 10_000, re.compile(r'[,;\t"]')
 
 #: Raises UserError for a row (from 0), a field (by its place; None: the whole row) and what is wrong there.
 _Fail = Callable[[int, int | None, str], NoReturn]
@@ -104,6 +111,8 @@ class Recording:
     started_s: float | None = None
     since_power_on_s: float = 0.0
     notes: tuple[str, ...] = ()
+    #: What of the files could not be read.
+    damaged: Damaged = SOUND
     #: The files, where there are several: `path` has them all for messages.
     paths: tuple[Path, ...] = ()
     #: Options of the command line that it was read with, and their values, empty for a switch.
@@ -353,7 +362,7 @@ def load(
     _check_gravity(recording, headers[0])
     recording = replace(
         recording,
-        notes=(*recording.notes, *_rates(recording)),
+        notes=tuple(dict.fromkeys((*recording.notes, *_rates(recording)))),
         options=_options(rate, columns, units, by_name, no_time, skip_bad, sources, dbc),
     )
     for text in recording.notes:
@@ -407,9 +416,9 @@ def _load(
             parts = [part for table in tables for part in _table_parts(path, rate, header, table, len(tables) > 1)]
         if not parts or (len(tables) > 1 and not any(part.axes for part in parts)):
             there = ", ".join(f"{one.source}: {', '.join(one.members)}" for one in tables)
+            why = next((f"; {one}" for table in tables for one in table.notes), "")
             raise UserError(
-                f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(there)}';"
-                " name yours with --column gx=NAME --unit gx=deg/s"
+                f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(there)}'; {_NAME_YOURS}{why}"
             )
         if wanted and not any(part.source for part in parts):
             raise UserError(f"{path}: it has one source alone: leave --source out")
@@ -417,7 +426,12 @@ def _load(
         several = len(found) > 1
         recordings = [part.read(several, part in sides) for part in found]
     sound = [one for one in recordings if one is not None]
-    return [replace(sound[0], notes=(*notes, *sound[0].notes)), *sound[1:]]
+    damaged = sum((one.damaged for one in [*tables[:1], *sound]), SOUND)
+    if damaged:
+        damaged = replace(damaged, whole=damaged.whole or bytes_of(path))
+        notes[:0] = [damaged.words] if tables else []  # a text's lines have lines of their own
+    first = replace(sound[0], notes=(*notes, *sound[0].notes), damaged=damaged)
+    return [first, *(replace(one, damaged=SOUND) for one in sound[1:])]
 
 
 def _named(*names: str) -> str:
@@ -474,6 +488,7 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: _Header) 
         path=paths,
         columns=columns,
         notes=tuple(dict.fromkeys(notes)),
+        damaged=sum((one.damaged for one in found), SOUND),
         paths=tuple(files) if len(files) > 1 else (),
     )
 
@@ -502,7 +517,10 @@ def _rates(recording: Recording) -> list[str]:
 def _check_gravity(recording: Recording, header: _Header) -> None:
     """Raise UserError for three accelerometers at rest that show 1 g of another unit than their headings'.
 
-    Nothing is checked where the user states a unit, or where gravity has the length of none."""
+    Nothing is checked where the user states a unit, where `convert` wrote the table, or where gravity has the length
+    of none."""
+    if written.stated(recording.meta):
+        return
     axes = [recording.columns[name] for name in ("ax", "ay", "az") if name in recording.columns]
     if len(axes) < 3 or any(one.unit != axes[0].unit or one.name in header.decided for one in axes):
         return
@@ -536,12 +554,15 @@ def save(
     meta: Mapping[str, Any] | None = None,
     t: NDArray[np.float64] | None = None,
     lsb: Mapping[str, float] | None = None,
+    *,
+    exact: bool = False,
 ) -> None:
     """Write a recording that `load` reads back; the suffix (.csv, .csv.gz, .npz) chooses the form.
 
-    `columns`: name -> (unit, float[n]). `t` float[n], s: time stamps; None is an even grid from 0. `meta`: JSON values,
-    kept in the npz or beside the CSV file as LOG.meta.json. `lsb`: name -> size of one LSB in the column's unit: npz
-    stores such a column as whole numbers of it. CSV values carry 9 digits. Raises UserError for an unwritable file.
+    `columns`: name -> (unit, float[n]); a unit "" is none. `t` float[n], s: time stamps; None is an even grid from 0.
+    `meta`: JSON values, kept in the npz or beside the CSV file as LOG.meta.json. `lsb`: name -> size of one LSB in the
+    column's unit: npz stores such a column as whole numbers of it. CSV values carry 9 digits, with `exact` as many as a
+    float64 takes; an empty cell is NaN then. Raises UserError for an unwritable file.
     """
     path = Path(path)
     described: dict[str, Any] = {**(meta or {}), "rate_hz": float(rate_hz)}
@@ -553,13 +574,33 @@ def save(
     n = len(next(iter(columns.values()))[1])
     stamps = np.arange(n) / rate_hz if t is None else t
     values = np.column_stack([stamps, *(values for _, values in columns.values())])
-    names = ",".join(["t[s]", *(f"{name}[{unit}]" for name, (unit, _) in columns.items())])
+    names = ",".join(["t[s]", *(_SIGNS.sub("_", cell(_heading(name, unit))) for name, (unit, _) in columns.items())])
     with together(path, meta_place(path)) as (table, beside):
-        np.savetxt(table, values, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
+        if exact:
+            _save_exact(table, names, values)
+        else:
+            np.savetxt(table, values, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
         if meta is None:
             beside.unlink()
         else:
             beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
+
+
+def _heading(name: str, unit: str) -> str:
+    return f"{name}[{unit}]" if unit else name
+
+
+def _save_exact(place: Path, header: str, values: NDArray[np.float64]) -> None:
+    """Write values [rows, columns] as CSV by their shortest texts that are read back to the bit."""
+    opened = gzip.open if place.suffix == ".gz" else open
+    with opened(place, "wt", encoding="utf-8") as file:
+        file.write(f"{header}\n")
+        for begin in range(0, len(values), _LINES):
+            lines = values[begin : begin + _LINES].tolist()
+            file.writelines(
+                ",".join("" if math.isnan(cell) else repr(cell).removesuffix(".0") for cell in line) + "\n"
+                for line in lines
+            )
 
 
 def _save_npz(
@@ -578,7 +619,7 @@ def _save_npz(
             arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
             described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
         else:
-            arrays[f"{name}[{unit}]"] = np.asarray(values, np.float64)
+            arrays[_heading(name, unit)] = np.asarray(values, np.float64)
     with whole(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)
 
@@ -602,9 +643,12 @@ class _Header:
     ) -> None:
         self.path, self.columns, self.stated, self.scale, self.sensors = path, columns, stated, scale, sensors
         self.no_time = no_time
+        #: `meta` states the clocks of the table.
+        self.written = False
         #: The table is not alone: a column may be in another.
         self.several = False
         self.notes: list[str] = []
+        self.damaged = SOUND
         #: Heading of a column of dates that is not taken for the time.
         self.dated = ""
         #: Columns whose unit the user states, or scales.
@@ -621,6 +665,7 @@ class _Header:
         """The same for one of the file's parts."""
         one = copy(self)
         one.several, one.notes, one.without_unit, one.without_size = several, [], [], []
+        one.damaged = SOUND
         one.whole = set()
         return one
 
@@ -710,8 +755,16 @@ class _Header:
             if is_row(",".join(keys)):
                 headings = ",".join(["t[s]", *(f"{name}[{unit}]" for name, unit in _LSB_UNITS.items())])
                 raise UserError(f"{none}put a line of headings before it, such as {headings}, in the columns' order")
-            raise UserError(f"{none}name yours with --column gx=NAME --unit gx=deg/s")
+            raise UserError(f"{none}{_NAME_YOURS}")
         return fields
+
+    def marks(
+        self, keys: Sequence[str], meta: Mapping[str, Any], rate: float | None, fields: Sequence[_Field]
+    ) -> list[_Field]:
+        """The columns that state the clocks of a table that `convert` wrote. The user's rate, or no time, decides."""
+        self.written = written.stated(meta) and rate is None and any(field.name == "t" for field in fields)
+        marks = written.marks_of(meta) if self.written else ()
+        return [_Field(key, f"{key} ", "1", 1.0) for key in keys if key in marks]
 
     def _since_1970(self, cell: str) -> str | None:
         """The unit of a time of our days, since 1970; None for another. In whole seconds a recording has no stamps."""
@@ -768,7 +821,10 @@ class _Header:
         """The options to type for the columns without a unit or a size, by the file's own names."""
         if len(self.without_unit) == 1 and self.without_unit[0][0] == self.without_unit[0][1]:
             name, _, unit = self.without_unit[0]
-            return f"column '{name}' has no unit: write {name}[{unit}] in the header or give --unit {name}={unit}"
+            return (
+                f"column '{name}' has no unit: write {name}[{unit}] in the header or give --unit {name}={unit}, or the "
+                "unit that it is in"
+            )
         counts = [one for one in self.without_unit if one[0] in self.whole]
         if len({name for _, name, _ in counts}) < _COUNTS_FROM:  # one alone may be a whole number by chance
             counts = []
@@ -809,26 +865,29 @@ class _Header:
         dates = dates and name == "t" and stated is None
         unit = "s" if dates else unit
         known = isinstance(unit, str) and units.known(unit)
+        example = {"t": "s", **dict(SIDE_CHANNELS.values()), **_LSB_UNITS}.get(name, "UNIT")
+        to_scale = (
+            f"give --scale {shlex.quote(f'{name}=SIZE[{example}]')}, SIZE the {example} of one '{short(str(unit))}'"
+        )
+        if not known and unit is not None and scaled is not None:
+            unit, known = units.LSB, True
         broken = ("[" in name or "]" in name) and not mapped
         if broken and any(name.startswith(sensor) for sensor in ("t", *self.sensors)):
             raise UserError(f"{column}: the brackets of its unit do not match: write name[unit]")
         if optional and (not name or broken or not known or (unit == units.LSB and "" not in self.scale)):
-            example = dict(SIDE_CHANNELS.values()).get(name)
-            if example is not None:
-                what = f"has the unit '{short(str(unit))}'" if unit is not None else "has no unit"
-                self.notes.append(
-                    f"column '{name}' {what} and is left out: write {name}[{example}], or give --unit {name}={example}"
-                )
+            if name in dict(SIDE_CHANNELS.values()):
+                to_state = f"write {name}[{example}], or give --unit {name}={example}, or the unit that it is in"
+                what = f"no unit and is left out: {to_state}"
+                if unit is not None:
+                    what = f"the unit '{short(str(unit))}' and is left out: {to_scale}"
+                self.notes.append(f"column '{name}' has {what}")
             return []
         if unit is None:
-            example = {"t": "s", **dict(SIDE_CHANNELS.values()), **_LSB_UNITS}.get(name, "UNIT")
             self.without_unit.append((key, name, example))
             return []
         if not known:
             known_units = f"(known: {', '.join(units.RECORDING_UNITS)})"
-            example = {"t": "s", **dict(SIDE_CHANNELS.values()), **_LSB_UNITS}.get(name, "UNIT")
-            typed = f"--unit {shlex.quote(f'{name}={example}')}"
-            raise UserError(f"{column} has the unknown unit '{short(str(unit))}' {known_units}: give {typed}")
+            raise UserError(f"{column} has the unknown unit '{short(str(unit))}' {known_units}: {to_scale}")
         size = 1.0
         if unit == units.LSB:
             given = self.scale.get("") if scaled is None else scaled
@@ -845,7 +904,7 @@ class _Header:
         if not (np.isfinite(size) and size > 0.0):
             raise UserError(f"{column}: the size of one LSB must be a number above 0")
         if name == "t" and not units.same_kind(unit, "s"):
-            raise UserError(f"{column} is in {unit}, which is not a time (s, ms, us, ns)")
+            raise UserError(f"{column} is in {unit}, which is not a time (h, min, s, ms, us, ns)")
         side = name in dict(SIDE_CHANNELS.values())
         return [_Field(key, name, unit, size, optional and not side, dates)]
 
@@ -919,6 +978,7 @@ class _Text:
             keys = [key for key in table.keys if key not in self.others]
             first = [cell for key, cell in zip(table.keys, table.first, strict=False) if key not in self.others]
             fields = header.fields(keys, table.where, {}, first, self.sensor.meant)
+            fields += header.marks(keys, meta, self.rate, fields)
             dated = next((place for place, field in enumerate(fields) if field.dates), None)
             read = table.columns(
                 [(field.key, field.name) for field in fields], [field.optional for field in fields], dated
@@ -928,6 +988,7 @@ class _Text:
         if meta.get("rows", columns[0].size + table.skipped) != columns[0].size + table.skipped:
             what = f"{columns[0].size} rows where {meta_place(path).name} says {shown(meta['rows'])}"
             raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
+        header.damaged += table.damaged
         if table.skipped:
             one = table.skipped == 1
             header.notes.append(
@@ -950,10 +1011,7 @@ class _Text:
 
 def _meta_beside(path: Path) -> Mapping[str, Any]:
     beside = meta_place(path)
-    try:
-        return parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text"))
-    except (FileNotFoundError, NotADirectoryError):  # the latter in a zip
-        return {}
+    return parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text")) if beside.is_file() else {}
 
 
 def _table_parts(path: Path, rate: float | None, header: _Header, table: Table, several: bool) -> list[Part]:
@@ -1018,6 +1076,7 @@ def _load_arrays(path: Path, rate: float | None, header: _Header, table: Table, 
         raise UserError(f"{path}: there are no columns")
     where = f"{table.source}: " if table.source else ""
     fields = header.fields(list(arrays), where, meta.get("columns", {}), (), sensor.meant)
+    fields += header.marks(list(arrays), meta, rate, fields)
     rows = math.prod(arrays[fields[0].key].shape)
     for field in fields:
         member, column = arrays[field.key], f"{path}: {where}column '{field.name}'"
@@ -1083,6 +1142,7 @@ def _checked(
         if kept.size < places.size:
             count, places = places.size - kept.size, places[kept]
             table[:] = [column[kept] for column in table]
+            header.damaged += Damaged(0, count)
             were = "s were" if count > 1 else " was"
             header.notes.append(f"{count} line{were} skipped for a damaged time stamp")
             fail_whole = fail
@@ -1118,6 +1178,10 @@ def _checked(
         unknown = np.isnan(stamps.values)
         if unknown.any():
             fail_time(int(np.argmax(unknown)), "no time stamp (an empty cell or NaN)")
+        if header.written:
+            return _as_written(
+                path, meta, fields, columns, units.convert(stamps.values, stamps.unit, "s"), header, places
+            )
         since = units.convert(stamps.values - stamps.values[0], stamps.unit, "s")
         time, wraps = unwrapped(since, next(_tick_s(field) for field in fields if field.name == "t"))
         if wraps:
@@ -1130,6 +1194,59 @@ def _checked(
         )
         stamps = None
     return _on_clocks(path, rate, meta, columns, rows, time, noise_s, started_s, header, fail_time, places)
+
+
+def _as_written(
+    path: Path,
+    meta: Mapping[str, Any],
+    fields: Sequence[_Field],
+    columns: Mapping[str, Column],
+    t: NDArray[np.float64],
+    header: _Header,
+    places: NDArray[np.int64] | None,
+) -> Recording:
+    """The recording of columns with NaN, and stamps `t`, s, by the clocks that `meta` states."""
+    marks = {field.key: columns[field.name].values for field in fields if field.name.endswith(" ")}
+    named = {split(field.key)[0]: field.name for field in fields if field.name in columns and field.key not in marks}
+    clocks = [
+        (names, clock, rows)
+        for names, clock, rows in written.clocks_of(path, meta, t, marks, places)
+        if any(name in named for name in names)
+    ]
+    if not clocks:
+        raise UserError(
+            f"{path}: meta: its clocks are of no column of the table: convert the log again, or give --rate HZ"
+        )
+    _, main, main_rows = clocks[0]
+    of: dict[str, tuple[Clock | None, NDArray[np.int64]]] = dict.fromkeys(named.values(), (None, main_rows))
+    for names, clock, rows in clocks[1:]:
+        other = replace(clock, start_s=clock.start_s - main.start_s)
+        of.update({named[name]: (other, rows) for name in names if name in named})
+    made: dict[str, Column] = {}
+    for name in named.values():
+        own, rows = of[name]
+        values = _at(columns[name].values, rows)
+        if not np.isfinite(values).any():
+            header.notes.append(f"column '{name}' holds no number and is left out")
+            continue
+        if name not in header.sensors:
+            values = bridged(values) if own is None else _bridged(own, values, main.time_s - main.start_s)
+            own = None
+        made[name] = replace(columns[name], values=values, clock=own)
+    if not any(name in header.sensors for name in made):
+        raise UserError(f"{path}: no sensor column holds a number")
+    started, notes = _number(meta.get("started_s")), meta.get("notes")
+    of_log = [one for one in notes if isinstance(one, str) and one.isprintable()] if isinstance(notes, list) else []
+    return Recording(
+        path,
+        main.rate_hz,
+        made,
+        main.missing_before,
+        meta,
+        main.off_grid_s,
+        started_s=started if math.isfinite(started) else None,
+        notes=(*of_log, *header.notes, *_of_clock(main)),
+    )
 
 
 def _tick_s(field: _Field) -> float:
@@ -1240,6 +1357,7 @@ def _on_clocks(
         main.off_grid_s,
         started_s=started_s,
         notes=notes,
+        damaged=header.damaged,
     )
 
 

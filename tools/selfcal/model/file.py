@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -71,8 +71,8 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
 MOST_HYPOTHESES = 8
 #: What a term of a law may state beside its kind and deviation.
 KEYS_OF_TERM = {"walk": (), "markov": ("bandwidth", "correlation_time_s"), "oscillation": ("period_s", "damping")}
-#: Columns of all regressors together: SELFCAL_REGRESSORS_MAX.
-MOST_COLUMNS = 6
+#: Columns of a bank's regressors together: SELFCAL_REGRESSORS_MAX; and those that a model file may state.
+MOST_COLUMNS, MOST_STATED = 6, 36
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,8 @@ class GridNodes:
 @dataclass(frozen=True)
 class Model:
     """A checked model file. `hypotheses` holds prior probabilities that sum to 1, `laws` the law of each; `simulate`
-    the entry of that name, its `axes` and `effects` always."""
+    the entry of that name, its `axes` and `effects` always. `beyond`: regressors that a bank has no column left for:
+    `diagnose` alone takes them."""
 
     name: str
     path: Path
@@ -253,6 +254,7 @@ class Model:
     nodes: Mapping[str, GridNodes]
     simulate: Mapping[str, Any]
     regressors: tuple[Regressor, ...] = ()
+    beyond: tuple[Regressor, ...] = ()
     half_life_s: float = 0.0  # of what the bank remembers; 0: it forgets nothing
     gate: Gate | None = None
     handling: Handling = NOT_HANDLED
@@ -266,6 +268,13 @@ class Model:
     def sensors(self) -> tuple[str, ...]:
         """Columns of a recording that may be axes: the usual ones, and the model's own."""
         return tuple(dict.fromkeys((*SENSORS, *self.axes)))
+
+    @property
+    def left_out(self) -> str:
+        """What a bank leaves out, in words; "" for nothing."""
+        names = ", ".join(one.name for one in self.beyond)
+        said = f"a bank has {MOST_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
+        return f"{self.path}: {said}" if names else ""
 
     def group_of(self, axis: str) -> Group:
         """The group of an axis, with its own priors. Raises UserError for an axis the model does not have."""
@@ -285,6 +294,15 @@ class Model:
     def of_tree(tree: Mapping[str, Any], path: Path) -> Model:
         """The same of a tree that is read already, from the file `path`."""
         return _Reader(path, tree).model()
+
+
+def with_room(regressors: Sequence[Regressor]) -> tuple[Regressor, ...]:
+    """Those that a bank has columns for: in their order, each whole or not at all."""
+    kept: list[Regressor] = []
+    for one in regressors:
+        if sum(len(other.columns) for other in (*kept, one)) <= MOST_COLUMNS:
+            kept.append(one)
+    return tuple(kept)
 
 
 def parts() -> dict[str, Path]:
@@ -575,16 +593,16 @@ class _Reader:
     def regressors(self, tree: Any, groups: tuple[Group, ...]) -> tuple[Regressor, ...]:
         if not isinstance(tree, list):
             raise self.fail("regressors", "must be a list")
-        if len(tree) > MOST_COLUMNS:
-            raise self.fail("regressors", f"{len(tree)} are more than {MOST_COLUMNS}")
+        if len(tree) > MOST_STATED:
+            raise self.fail("regressors", f"{len(tree)} are more than {MOST_STATED}")
         found = tuple(self.regressor(one, f"regressors[{i}]", groups) for i, one in enumerate(tree))
         names = [regressor.name for regressor in found]
         for name in names:
             if names.count(name) > 1:
                 raise self.fail("regressors", f"'{name}' appears twice")
         columns = sum(len(regressor.columns) for regressor in found)
-        if columns > MOST_COLUMNS:
-            raise self.fail("regressors", f"{columns} columns are more than {MOST_COLUMNS} (periodic: two each)")
+        if columns > MOST_STATED:
+            raise self.fail("regressors", f"{columns} columns are more than {MOST_STATED} (periodic: two each)")
         return found
 
     def gate(self, tree: Any, groups: tuple[Group, ...]) -> Gate:
@@ -759,6 +777,8 @@ class _Reader:
             if not isinstance(key, str) or not key.isprintable() or len(key) > LONGEST_TEXT:
                 raise self.fail("groups", f"a group's name must be text, not {shown(key)}")
         groups = tuple(self.group(name, fields, laws) for name, fields in groups_tree.items())
+        regressors = self.regressors(tree.get("regressors") or [], groups)
+        kept = with_room(regressors)
         axes = [axis for group in groups for axis in group.axes]
         if len(axes) > MOST_AXES:
             raise self.fail("groups", f"have {len(axes)} axes, {MOST_AXES} are the most")
@@ -780,7 +800,8 @@ class _Reader:
             laws=laws,
             nodes={name: self.nodes(fields, f"nodes.{name}", laws) for name, fields in targets.items()},
             simulate=self.simulate(tree.get("simulate") or {}, axes, laws),
-            regressors=self.regressors(tree.get("regressors") or [], groups),
+            regressors=kept,
+            beyond=tuple(one for one in regressors if one not in kept),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
             handling=self.handling({} if tree.get("handle") is None else tree["handle"], bool(tree.get("regressors"))),

@@ -18,9 +18,14 @@ BELOW_LATTICE = 1.9
 CARRIED_SECONDS, CARRIED_SHARE = 120, 0.5
 #: Difference of two remainders of sums that follow each other, each uniform in a step: its share in the scatter.
 REMAINDERS = 0.25
+#: Least variance that is told of a counter, steps^2 in a second: what 120 seconds show is as uncertain as 0.04.
+CARRIED_LEAST = 1e-3
 #: Variance, in steps^2, that noise gains in an interval from which on the remainders of its ends are white: they
 #: correlate by exp(-2 pi^2 of it), 0.14.
 WHITE_REMAINDERS = 0.1
+#: Values nearer than this share of the largest are one: differences of a counter are rounded so. Those of a float32 are
+#: six times as far apart.
+ROUNDED = 1e-8
 #: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
 FINE = 0.01
 #: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.
@@ -43,6 +48,13 @@ class Lattice:
     def too_coarse(self) -> bool:
         """Rounding is no white noise: what is told of the noise is the lattice's."""
         return self.coarseness > BELOW_LATTICE
+
+    @property
+    def white_hz(self) -> float:
+        """Rate of means of a counter whose remainders are white, Hz, to one digit."""
+        rate = self.carried / WHITE_REMAINDERS
+        digit = 10.0 ** math.floor(math.log10(rate))
+        return math.floor(rate / digit) * digit
 
     def too_coarse_over(self, interval_s: float) -> bool:
         """The same of means over an interval. Those of a counter have white remainders (quantization noise)."""
@@ -72,7 +84,7 @@ def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | N
         sums = within.sum(axis=1) / step
         scatter = 0.5 * float((np.diff(sums) ** 2).mean())
         if scatter < CARRIED_SHARE * second / coarseness**2:
-            carried = max(0.0, scatter - REMAINDERS)
+            carried = max(CARRIED_LEAST, scatter - REMAINDERS)
     return Lattice(step, coarseness, unique.size, carried) if coarseness >= FINE else None
 
 
@@ -85,7 +97,8 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
             kind = np.floor(np.log(size) / math.log(base))
         for one in np.unique(kind[np.isfinite(kind)]):
             for part in (unique[(kind == one) & (unique > 0.0)], unique[(kind == one) & (unique < 0.0)]):
-                if part.size > SHOWN and not abs(_step(part) / step - 1.0) < 0.02:
+                some = part.size > SHOWN and np.ptp(part) > 0.5 * step  # else one value, rounded
+                if some and not abs(_step(part) / step - 1.0) < 0.02:
                     return False
     return True
 
@@ -96,7 +109,7 @@ def _step(unique: NDArray[np.floating[Any]]) -> float:
     if unique.size < 2:
         return 0.0
     gaps = np.diff(unique)
-    gaps = gaps[gaps > 1e-9 * max(np.ptp(unique), np.abs(unique).max())]
+    gaps = gaps[gaps > ROUNDED * max(np.ptp(unique), np.abs(unique).max())]
     if not gaps.size:
         return 0.0
     least = float(gaps.min())

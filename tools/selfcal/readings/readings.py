@@ -458,7 +458,10 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     """Readings [n] that pile up at their largest or smallest value: noise would go on beyond it, and none does.
 
     The number expected beyond is the evidence, in nats (Poisson). Noise is normal about the mean of its neighbours.
+    Increments of a counter pile up on the codes about their mean, and none of them is lost.
     """
+    if lattice is not None and lattice.carried:
+        return None
     rows = np.flatnonzero(np.isfinite(values))
     y = values[rows]
     if y.size < 4 * AROUND:

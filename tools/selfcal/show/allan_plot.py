@@ -11,7 +11,7 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
-from selfcal.base.output import save_picture
+from selfcal.base.output import plotter, save_picture
 
 #: The model's colour, and that of what does not fit.
 MODEL, OUTSIDE = "tab:blue", "tab:red"
@@ -24,10 +24,7 @@ def plot_allan(document: Mapping[str, Any], path: Path | str, *, datasheet: bool
     probable law at its medians, the band of its posterior (5 to 95 %), and, pale, where the recording may lie.
     Averaging times outside are red. Raises UserError if the file cannot be written.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    pyplot = plotter()
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 

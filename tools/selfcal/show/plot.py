@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import printable
-from selfcal.base.output import save_picture
+from selfcal.base.output import plotter, save_picture
 from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import AxisReport, axis_unit
@@ -44,10 +44,7 @@ def plot_run(
     `truth`, of a simulated recording: per axis its `hypothesis` and parameters, drawn dashed. Raises UserError if it
     cannot be written.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
+    pyplot = plotter()
     from matplotlib.lines import Line2D
 
     axes = list(history)

@@ -13,11 +13,11 @@ from rich.table import Table
 
 from selfcal.adequacy.document import as_typed, since
 from selfcal.adequacy.summary import MOST_REST
+from selfcal.bank.priors import OF_RECORD
 from selfcal.base import units
 from selfcal.base.errors import called, printable
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
-from selfcal.readings.priors import OF_RECORD
 
 #: The table never folds its numbers: a narrower terminal wraps its lines.
 TABLE_WIDTH = 140
@@ -128,10 +128,18 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str) -> str:
     match check:
         case "lattice":
             step = f"{outcome['distinct']} distinct readings {outcome['step']:.3g} {unit} apart"
+            if "counter_hz" in outcome:
+                rate = f"{outcome['counter_hz']:.1g}"
+                return f"lattice: {step}: increments of a counter, N includes their rounding: give --decimate {rate}"
             return f"lattice: {step}: noise is below that, N includes the rounding, the bias may stick"
         case "drift_in_average":
             share = f"the drift hides {100.0 * value:.0f} % of the white noise"
-            return f"drift_in_average: {share}: average less, with a higher --decimate"
+            rate_hz = outcome.get("decimate_hz")
+            if rate_hz is None:
+                return f"drift_in_average: {share}, and no rate of this record shows it: record longer"
+            less = rate_hz > outcome["bank_hz"]
+            how = "average less" if less else "the part filters it out of its readings: average more"
+            return f"drift_in_average: {share}: {how}, with --decimate {rate_hz:g}"
         case "batch":
             return f"{value:.1f} sd from the batch of the model's priors: identify it with the model without that batch"
         case "outliers":
@@ -178,8 +186,12 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         if name not in axes:
             without.setdefault(axis["error"], []).append(name)
     failed = [f"no result: {', '.join(names)}: {error}; choose axes with --axis" for error, names in without.items()]
-    outside = [name for name, axis in axes.items() if axis.get("priors") == OF_RECORD]
-    kept = [f"priors: {', '.join(outside)}: from this record, which lies outside the model's"] if outside else []
+    outside: dict[str, list[str]] = {}
+    for name, axis in axes.items():
+        if axis.get("priors") == OF_RECORD:
+            outside.setdefault(", ".join(axis["own_priors"]), []).append(name)
+    line = "priors: {}: from this record, which lies outside the model's: {}"
+    kept = [line.format(", ".join(names), own) for own, names in outside.items()]
     for name, axis in axes.items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]

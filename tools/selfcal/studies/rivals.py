@@ -25,6 +25,7 @@ from rich.table import Table
 
 from selfcal.adequacy.document import recording_entry
 from selfcal.adequacy.identify import chosen_axes
+from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
 from selfcal.base.output import check_writable, write_json
@@ -34,7 +35,6 @@ from selfcal.logs.recording import Recording, as_float, load
 from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
 from selfcal.model.tables import make_tables
-from selfcal.readings.priors import for_record
 from selfcal.studies.methods import RIVALS, Rival
 from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.studies.methods.problem import Answer, Problem

@@ -24,34 +24,25 @@ def convert(
 ) -> Recording:
     """Write a recording as .csv, .csv.gz or .npz, and return it. The options are `load`'s.
 
-    Stamps are seconds from the first row. Axes of several rates share the rows: a cell without a sample is empty.
-    Raises UserError as `load` does, and for a file that cannot be written.
+    It reads back as the same recording, to the bit. Stamps are seconds from the first row. Axes of several rates share
+    the rows: a cell without a sample is empty. Raises UserError as `load` does, and for a file that cannot be written.
     """
-    import numpy as np
-
     from selfcal.base.output import check_place
-    from selfcal.logs.convert import ONE_ROW, rows_of, stamps_of
     from selfcal.logs.recording import list_of, load, save
+    from selfcal.logs.written import laid_out
 
     if Path(output).resolve() in {path.resolve() for path in list_of(log)}:
         raise UserError(f"{output}: is the log itself: give another file with -o")
     check_place(output)
     recording = load(log, **reading)
-    times = {id(one.clock): stamps_of(recording, name) for name, one in recording.columns.items()}
-    rows = rows_of(list(times.values()), ONE_ROW / recording.rate_hz)
-    table = {}
-    for name, one in recording.columns.items():
-        values = np.full(rows.size, np.nan)
-        at = np.searchsorted(rows, times[id(one.clock)] + 0.5 * ONE_ROW / recording.rate_hz, side="right") - 1
-        values[at] = one.values
-        table[name] = (one.unit, values)
-    save(output, table, recording.rate_hz, t=rows)
+    laid = laid_out(recording)
+    save(output, laid.columns, recording.rate_hz, laid.meta, t=laid.t, exact=True)
     return recording
 
 
 def show(recording: Recording, given: Mapping[str, Any]) -> int:
     """Print what was written."""
-    from selfcal.logs.convert import show as line
-
-    line(recording, given["output"])
+    axes = ", ".join(f"{name}[{one.unit}]" for name, one in recording.columns.items())
+    rows = f"{recording.samples:,} rows, {recording.rate_hz:.6g} Hz, {recording.duration_s:.6g} s"
+    print(f"{given['output']}: {rows}: {axes}")
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
@@ -80,6 +81,7 @@ def diagnose(
     """
     from selfcal.adequacy.document import of_errors
     from selfcal.adequacy.identify import chosen_axes, stretch_of
+    from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.ending import held
     from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.base.progress import Doing
@@ -94,6 +96,7 @@ def diagnose(
         add_posteriors,
         below_lattice,
         by_identify,
+        less_stated,
         looked_at,
         options_given,
         show_first,
@@ -108,7 +111,6 @@ def diagnose(
     from selfcal.likelihood import work
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
-    from selfcal.readings.priors import add_sources, for_record
 
     check(fail_on)
     check_options(limits, junit, verdicts)
@@ -131,8 +133,12 @@ def diagnose(
     with held() as ending, Doing("diagnose") as doing:
         record = of_recording(recording, loaded, decimate, names)
         if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
-            first = looked_at(of_recording(recording, loaded, FIRST_HZ, names), names, ending, doing)
-            show_first(recording, first, [name for name in names if name in record.axes], ending)
+            means = None
+            with suppress(UserError):  # a recording that is too short for means is looked at once
+                means = of_recording(recording, loaded, FIRST_HZ, names)
+            if means is not None:
+                first = looked_at(means, names, ending, doing)
+                show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = looked_at(record, names, ending, doing) if not ending.asked else {}
         looked = {
             name: first.get(name)
@@ -140,7 +146,7 @@ def diagnose(
             else joined(seen.get(name), first.get(name), INTERRUPTED)
             for name in names
         }
-        found = {name: one for name, one in looked.items() if one is not None}
+        found = {name: less_stated(one, loaded) for name, one in looked.items() if one is not None}
         if not ending.asked:
             doing.now("checks")
             by_identify(found, recording, loaded)
@@ -176,7 +182,7 @@ def diagnose(
                 write_text(write_model, as_text(tree, recording.path))
                 if out:
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
-                    note(f"{write_model} leaves out {told}: {NO_ROOM}")
+                    note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
             if report is not None:
                 from selfcal.show.page import write_page
 

@@ -159,6 +159,10 @@ def fleet(
     for unit in batch:
         if unit.undated:
             note(f"{unit.source.path}: leaves out the date '{short(unit.undated)}': write it as {DATE_FORM}")
+        if "damaged" in (known := unit.record.get("recording", {})):
+            note(f"{unit.source.path}: {known['damaged']['words']}")
+        if "damaged" in (known := unit.record.get("recording", {})):
+            note(f"{unit.source.path}: {known['damaged']['words']}")
     batch.sort(key=lambda unit: unit.place)
     write_table(output, (row for unit in batch for row in rows_of(unit, version)))
     judged = [] if bounds is None else judged_units(batch, bounds)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 
-from selfcal.base.errors import UserError
+from selfcal.base.errors import UserError, say_once
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
 from selfcal.verbs._shared import (
@@ -105,6 +105,7 @@ def identify(
 
     from selfcal.adequacy.document import Identified, to_document
     from selfcal.adequacy.identify import chosen_axes, identify_axis, left_out_together, stretch_of, with_reasons
+    from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.base.results import Identification
     from selfcal.batch.fail_on import check
@@ -112,7 +113,6 @@ def identify(
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.model.regressors import choices_of, offered
-    from selfcal.readings.priors import add_sources, for_record
     from selfcal.show.export import FORMS, write_export
 
     check(fail_on)
@@ -133,6 +133,7 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
+    say_once(loaded_model.left_out)
     bounds = None if limits is None else Limits.load(limits, loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)

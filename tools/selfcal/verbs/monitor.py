@@ -62,12 +62,13 @@ def monitor(
 
     from selfcal.base.ending import held
     from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.logs.framelog import FrameLog, check_suffix
     from selfcal.show.plot import plot_run
     from selfcal.wire.dbc_file import NODES
-    from selfcal.wire.framelog import FrameLog, FrameWriter, check_suffix
+    from selfcal.wire.frame_writer import FrameWriter
     from selfcal.wire.frames import AXES, REASONS, AxisReport, Link, Streams, axis_unit, open_bus, reasons, serial_ports
     from selfcal.wire.known_models import KnownModels
-    from selfcal.wire.live import Contact, View
+    from selfcal.wire.live import Contact, View, patient
     from selfcal.wire.monitor import LOOK_S, MODULES, REOPEN_S, Outcome, document, farewell, feed, keep
     from selfcal.wire.streams import check as check_stream
     from selfcal.wire.streams import content, open_streams
@@ -98,7 +99,7 @@ def monitor(
     streams = Streams(node=node)
     contacts: dict[int, Contact] = {}
     histories: dict[int, dict[str, list[AxisReport]]] = {}
-    with held() as ending, ExitStack() as stack:
+    with held() as ending, patient(), ExitStack() as stack:
         source: Link | FrameLog
         if channel is None:
             source = stack.enter_context(FrameLog(name, speed))

@@ -44,11 +44,11 @@ def part(
     """
     import yaml
 
+    from selfcal.bank.part import as_text, finish, groups, of_recording, of_sheet, parse
     from selfcal.base.output import check_writable, write_text
     from selfcal.base.units import SENSORS
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import DEFAULT, Model
-    from selfcal.readings.part import as_text, finish, groups, of_recording, of_sheet, parse
 
     if not log and not datasheet:
         raise UserError("give a recording at rest, or numbers of a data sheet: --datasheet 'N=0.012deg/sqrt(h)'")
@@ -84,7 +84,7 @@ def part(
 
 def show(model: Model, given: Mapping[str, Any]) -> int:
     """Print what was written."""
-    from selfcal.readings.part import show as lines
+    from selfcal.bank.part import show as lines
 
     lines(model)
     return 0

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 
-from selfcal.base.errors import UserError, note
+from selfcal.base.errors import UserError, note, say_once
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
 from selfcal.verbs._shared import (
@@ -67,6 +67,7 @@ def replay(
     Numbers are in the recording's units. Raises UserError for what the user can put right.
     """
     from selfcal.adequacy.identify import chosen_axes
+    from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.base.results import Identification
     from selfcal.diagnosis.warm import load as load_start
@@ -74,7 +75,6 @@ def replay(
     from selfcal.model.file import Model
     from selfcal.model.regressors import from_time
     from selfcal.readings.gate import table_of as gate_of
-    from selfcal.readings.priors import add_sources, for_record
     from selfcal.show.plot import plot_run
     from selfcal.wire.dbc_file import HYPOTHESES
     from selfcal.wire.frames import names_of
@@ -95,6 +95,7 @@ def replay(
         check_picture(plot)
     check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)
+    say_once(loaded_model.left_out)
     known = None if start is None else load_start(start, loaded_model)
     if len(loaded_model.hypotheses) > HYPOTHESES:
         raise UserError(

@@ -49,6 +49,7 @@ def simulate(
     from selfcal import _reference
     from selfcal.base import units
     from selfcal.base.output import check_place
+    from selfcal.batch.spread import checked_seed
     from selfcal.diagnosis.causes import CAUSES
     from selfcal.diagnosis.simulate import DRAWS, added_by, applied_to, axis_of, read_out, scene_of, slower, truth_of
     from selfcal.logs import recording
@@ -57,8 +58,7 @@ def simulate(
 
     model = Model.load(model_path)
     check_place(output)
-    if not 0 <= seed < 2**64:
-        raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {seed}")
+    checked_seed(seed)
     scene = scene_of(model, seed)
     scene.bank_block = bank_block(scene.rate_hz, model.bank_rate_hz)
     truth = truth_of(model, seed)

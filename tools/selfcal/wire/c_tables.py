@@ -73,6 +73,8 @@ def bank_bytes(tables: Tables) -> int:
 
 def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
     """What of the model comes to nothing."""
+    if model.left_out:
+        yield model.left_out
     if model.gate is not None and gate_table(model, tables) is None:
         yield f"{model.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
     if tables.handling.outlier_sd and tables.block == 1:

@@ -15,12 +15,13 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.bank.result import AxisResult, Estimate
-from selfcal.base.errors import UserError, called
+from selfcal.base.errors import UserError, called, install
 from selfcal.model.file import Model
 from selfcal.wire.dbc_file import AXIS_UNITS, BASE, BY_PLACE, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
 
@@ -791,6 +792,8 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
 
     if interface in ("slcan", "serial"):
         _check_port(interface, channel)
+    if interface == "udp_multicast" and find_spec("msgpack") is None:
+        raise UserError(f"{interface}: msgpack is not installed: {install('selfcal[multicast]')}")
     try:
         bus = can.Bus(interface=interface, channel=channel, **options)
     except Exception as error:  # python-can's drivers raise what the libraries below them raise
@@ -879,8 +882,7 @@ def _reason(interface: str, channel: str, error: BaseException) -> str:
     if interface == "udp_multicast":
         if number in (errno.ENODEV, errno.ENETUNREACH):
             return f"no network takes this group: `ip route add {channel} dev lo` keeps it on this machine"
-        if "msgpack" not in said:
-            return "this is no multicast group: take 239.74.163.2, python-can's own"
+        return "this is no multicast group: take 239.74.163.2, python-can's own"
     if "://" in channel and number is None:
         return "pyserial opens no such address: socket://HOST:PORT and rfc2217://HOST:PORT are some that it does"
     if number in (errno.EACCES, errno.EPERM):

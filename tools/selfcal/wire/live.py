@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import math
+import os
+import sys
+import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from types import TracebackType
-from typing import Protocol
+from typing import Protocol, TextIO
 
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
@@ -50,9 +55,77 @@ SILENT_S, INTERVALS = 3.0, 3.0
 #: s that a module may be silent before its second status has shown how often it speaks: it sends one every 10 s
 #: (STATUS_MS in port/app/app_frames.c), and a save takes up to 2 s.
 FIRST_S = 12.0
+#: Characters that wait for a terminal, from which on it gets no more, and s that the end waits for it to read them.
+MOST_WAITING, DRAIN_S = 1 << 16, 1.0
 BLOCKS = "▁▂▃▄▅▆▇█"
 #: Colours of a module's judgement of its model.
 ADEQUACY = {"inadequate": "red", "adequate": "green"}
+
+
+class Patient(io.TextIOBase):
+    """A terminal's stream that never holds its writer: a thread writes. What a terminal that has stopped reading leaves
+    waiting is dropped from MOST_WAITING characters on."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self._stream = stream
+        self._waiting: deque[str] = deque()
+        self._ready = threading.Condition()
+        self._busy = False
+        threading.Thread(target=self._run, daemon=True).start()
+
+    @property
+    def encoding(self) -> str:  # type: ignore[override]
+        """The stream's."""
+        return self._stream.encoding
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    def write(self, text: str) -> int:
+        """Take a text. Never waits."""
+        with self._ready:
+            if sum(map(len, self._waiting)) < MOST_WAITING:
+                self._waiting.append(text)
+                self._ready.notify_all()
+        return len(text)
+
+    def drain(self, seconds: float) -> bool:
+        """Wait so long until all has gone out; whether it has."""
+        with self._ready:
+            return self._ready.wait_for(lambda: not (self._waiting or self._busy), seconds)
+
+    def _run(self) -> None:
+        while True:
+            with self._ready:
+                self._ready.wait_for(lambda: bool(self._waiting))
+                data, self._busy = "".join(self._waiting).encode(self.encoding, "replace"), True
+                self._waiting.clear()
+            # Not by the stream: Python's end would wait for its lock.
+            with suppress(OSError):
+                while data:
+                    data = data[os.write(self.fileno(), data) :]
+            with self._ready:
+                self._busy = False
+                self._ready.notify_all()
+
+
+@contextmanager
+def patient() -> Iterator[None]:
+    """Within, stderr is a Patient where it is a terminal: a view on one that nobody reads ends as any other. It stays
+    one where the terminal still does not read at the end."""
+    if not sys.stderr.isatty():
+        yield
+        return
+    before, sys.stderr = sys.stderr, (own := Patient(sys.stderr))
+    try:
+        yield
+    finally:
+        if own.drain(DRAIN_S):
+            sys.stderr = before
 
 
 class Source(Protocol):
@@ -159,7 +232,13 @@ class View:
         self._advice = advice
         self._modules: dict[int, Module] = {}
         self._console = Console(stderr=True)
-        self._live = Live(get_renderable=self.renderable, console=self._console, refresh_per_second=4, transient=True)
+        self._live = Live(
+            get_renderable=self.renderable,
+            console=self._console,
+            refresh_per_second=4,
+            transient=True,
+            redirect_stdout=False,  # it would put the lines of --stream jsonl into the view
+        )
 
     def show(self, reports: Sequence[AxisReport]) -> None:
         """Take new reports."""

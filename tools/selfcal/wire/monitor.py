@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from selfcal.adequacy.checks import Judged
 from selfcal.adequacy.document import Identified, Telemetry, to_document
+from selfcal.logs.framelog import FrameLog
 from selfcal.wire.dbc_file import Names
-from selfcal.wire.framelog import FrameLog
 from selfcal.wire.frames import (
     AxisReport,
     Decoder,

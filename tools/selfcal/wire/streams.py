@@ -9,17 +9,20 @@ from __future__ import annotations
 
 import base64
 import json
+import os
+import select
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
+from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, install
 from selfcal.base.output import finite
 from selfcal.base.units import parameter_unit
+from selfcal.logs.framelog import FRAMES
 from selfcal.wire.dbc_file import PLACE_NAMES, Names
 from selfcal.wire.frames import AXES, AxisReport, axis_unit
 from selfcal.wire.live import told_of
@@ -33,9 +36,6 @@ KINDS = (*PORTS, "jsonl")
 HOST = "127.0.0.1"
 #: Statistics of a parameter that are told.
 TOLD = ("mean", "median", "sd", "q05", "q95")
-#: Topic and schema of raw frames in an MCAP file, and the size of one record there at most.
-FRAMES = "/selfcal/frames"
-LARGEST = 1 << 16
 
 
 class Stream(Protocol):
@@ -118,10 +118,22 @@ class _Udp:
 
 
 class _Lines:
-    """A line each on stdout, at once."""
+    """A line each on stdout, at once. It waits for a reader, but no longer than until a signal asks for the end."""
 
     def send(self, report: Mapping[str, Any], at_s: float) -> None:
-        print(line_of(report, at_s), flush=True)
+        line = line_of(report, at_s)
+        try:
+            stdout = sys.stdout.fileno()
+        except OSError:  # a program's own stdout is no file
+            print(line, flush=True)
+            return
+        sys.stdout.flush()
+        data = f"{line}\n".encode()
+        while data:
+            if select.select([], [stdout], [], 0.25)[1]:
+                data = data[os.write(stdout, data[: select.PIPE_BUF]) :]
+            elif Held().asked:
+                return
 
     def close(self) -> None:
         sys.stdout.flush()
@@ -224,36 +236,3 @@ class McapLog:
         finish: Callable[[], None] = self._writer.finish  # mcap does not type it
         finish()
         self.file.close()
-
-
-class McapFrames:
-    """The frames of a file that McapLog wrote, as python-can's readers give them. A record of more than LARGEST bytes
-    ends it."""
-
-    def __init__(self, path: Path) -> None:
-        self._file = path.open("rb")
-
-    def __iter__(self) -> Iterator[can.Message]:
-        import can
-        from mcap.records import Channel, Message
-        from mcap.stream_reader import StreamReader
-
-        frames: set[int] = set()
-        for record in StreamReader(self._file, emit_chunks=True, record_size_limit=LARGEST).records:
-            if isinstance(record, Channel) and record.topic == FRAMES:
-                frames.add(record.id)
-            elif isinstance(record, Message) and record.channel_id in frames:
-                told = json.loads(record.data)
-                data = base64.b64decode(told["data"], validate=True)
-                yield can.Message(
-                    timestamp=record.log_time * 1e-9,
-                    arbitration_id=int(told["id"]),
-                    is_extended_id=bool(told["extended"]),
-                    dlc=len(data),
-                    data=data,
-                    check=True,
-                )
-
-    def stop(self) -> None:
-        """Close the file."""
-        self._file.close()

@@ -10,13 +10,15 @@ from typing import Any, Literal
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.cause import Cause, Extension, Key, shown
 from selfcal.diagnosis.causes import quantization_noise
+from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, best, fit, moved
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, interval, net
 from selfcal.likelihood.statemodel import Array
+from selfcal.model.file import Model
 from selfcal.model.laws import RATIO_LIMITS
 
 
@@ -74,6 +76,14 @@ def _extend(at: Extension) -> None:
     add_law(tree, "moving_average", "spectral_ratio", {"law": "log_uniform", "min": 0.2, "max": 5.0})
 
 
+def _stated(finding: Finding, model: Model) -> bool:
+    """Whether a law has coloured noise, or a drift of its correlation time."""
+    dt, lag1 = finding.after.dt, finding.look.estimate["lag1"]
+    terms = [term for law in model.laws.values() for term in law.terms if term.kind == "markov" and term.stated]
+    short = any(lag1["q05"] <= math.exp(-dt * term.bandwidth) <= lag1["q95"] for term in terms)
+    return short or any(law.coloured_noise for law in model.laws.values())
+
+
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     return {"lag1": (math.sqrt(2.0 * NET_LEAST / state.best.n), "1")}
 
@@ -88,6 +98,6 @@ CAUSE = Cause(
     pictures=shown("correlation"),
     least=_least,
     extend=_extend,
-    of_estimate=medians,
+    stated=_stated,
     keys={"lag1": Key(lambda s: 0.5, "noise_lag1", lambda v: -1.0 < v < 1.0, "between -1 and 1")},
 )

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.cause import Cause, Extension, Key, shown
 from selfcal.diagnosis.model_tree import add_law
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, best, fit, ln_likelihood, moved, run
@@ -76,6 +76,6 @@ CAUSE = Cause(
     slow=True,
     pictures=shown("allan"),
     extend=_extend,
-    of_estimate=medians,
+    stated=lambda finding, model: any(law.drift_name == "B" for law in model.laws.values()),
     keys={"B": Key(lambda s: 0.5 * s.n, "flicker_B")},
 )

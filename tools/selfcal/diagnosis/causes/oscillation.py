@@ -16,14 +16,16 @@ from typing import Any
 import numpy as np
 
 from selfcal.bank.result import HALF_90
-from selfcal.diagnosis.cause import Cause, Channels, Extension, Key, medians, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Extension, Key, positive, shown
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
+from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import swinging
 from selfcal.likelihood.fit import Fit, Series, best, fit, ln_likelihood, run
 from selfcal.likelihood.state import Look, State, net
 from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms
+from selfcal.model.file import Model
 from selfcal.model.laws import RATIO_LIMITS, swing
 
 #: Periods in a record at least.
@@ -189,6 +191,13 @@ def _periods(tree: Mapping[str, Any]) -> list[float]:
     return [float(term["period_s"]) for term in terms if term["kind"] == "oscillation"]
 
 
+def _stated(finding: Finding, model: Model) -> bool:
+    """Whether a law has an oscillation of this period."""
+    period = finding.look.estimate["period_s"]
+    terms = [term for law in model.laws.values() for term in law.terms if term.kind == "oscillation"]
+    return any(period["q05"] <= 2.0 * math.pi / term.bandwidth <= period["q95"] for term in terms)
+
+
 CAUSE = Cause(
     "oscillation",
     "The bias oscillates: a damped swing of one period that noise drives.",
@@ -199,7 +208,7 @@ CAUSE = Cause(
     alike=_alike,
     pictures=shown("allan", "spectrum"),
     extend=_extend,
-    of_estimate=medians,
+    stated=_stated,
     add=_add,
     keys={
         "period_s": positive(lambda s: s.duration_s / 20.0),

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, medians, shown
+from selfcal.diagnosis.cause import Cause, Extension, Key, shown
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import run
@@ -126,6 +126,5 @@ CAUSE = Cause(
     pictures=shown("largest", "histogram"),
     least=_least,
     extend=_extend,
-    of_estimate=lambda look: medians(look, "fraction"),
     keys={"fraction": Key(lambda s: 0.005, "outlier_fraction", lambda v: 0.0 <= v <= 1.0, "from 0 to 1")},
 )

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
 
-from selfcal.diagnosis.cause import Cause, Key, medians
+from selfcal.diagnosis.cause import Cause, Key
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, finish, fit, moved
@@ -200,8 +200,9 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
 
 
 def _harmonics(one: Diagnosed) -> None:
-    """Lines at multiples of a stronger one's frequency are one finding with it: their gains are added."""
-    lines = sorted((f for f in one.findings if f.look.cause == "periodic"), key=lambda f: -f.look.gain)
+    """Lines at multiples of a slower one's frequency are one finding with it: their gains are added."""
+    found = (f for f in one.findings if f.look.cause == "periodic")
+    lines = sorted(found, key=lambda f: f.look.estimate["frequency_hz"]["median"])
     for base in lines:
         if base not in one.findings:
             continue
@@ -296,7 +297,6 @@ CAUSE = Cause(
     trained=_trained,
     least=_least,
     of_column=_of_column,
-    of_estimate=lambda look: medians(look, "frequency_hz", "amplitude"),
     keys={
         "frequency_hz": Key(lambda s: 0.05, "periodic_frequency_hz"),
         "amplitude": Key(lambda s: 0.5 * s.n, "periodic_amplitude"),

@@ -303,7 +303,6 @@ CAUSE = Cause(
     least=_least,
     entry=_entry,
     of_column=_of_column,
-    of_estimate=medians,
     add=_add,
     keys={
         "time_s": Key(lambda s: 0.45 * s.duration_s),

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.base import units
-from selfcal.diagnosis.cause import Cause, Channels, Extension, medians, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Extension, positive, shown
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit
@@ -89,7 +89,7 @@ CAUSE = Cause(
     least=_least,
     law=_law,
     extend=_extend,
-    of_estimate=lambda look: medians(look, "Q"),
+    stated=lambda finding, model: any(law.coloured_noise for law in model.laws.values()),
     keys={"Q": positive(lambda s: s.n * math.sqrt(s.duration_s / s.samples))},
     add=_add,
 )

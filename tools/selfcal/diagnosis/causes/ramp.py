@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from selfcal.diagnosis.cause import Cause, Key, medians, shown
+from selfcal.diagnosis.cause import Cause, Key, shown
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import SCREEN, Look, Regressor, State, interval, mixture, net
@@ -51,6 +51,5 @@ CAUSE = Cause(
     least=_least,
     from_zero=True,
     of_column=lambda column, c: {"slope": c[0]},
-    of_estimate=medians,
     keys={"slope": Key(lambda s: 5.0 * s.n / s.duration_s, "ramp_slope")},
 )

@@ -9,6 +9,7 @@ CAUSE = Cause(
     "The sampling rate changes.",
     "Look for what set the rate at that time; record at one rate.",
     no_gain="the record has one rate before and after",
+    of_estimate=lambda look: None,  # the record and its model have one rate
     keys={
         "time_s": Key(lambda s: s.duration_s / 2.0),
         "after_hz": positive(lambda s: 0.5 * s.samples / s.duration_s),

@@ -34,5 +34,6 @@ CAUSE = Cause(
     pictures=shown("limit"),
     no_gain="readings at the limit are scored by no density",
     extend=_extend,
+    of_estimate=lambda look: None,  # the range is in the group
     keys={"limit": positive(lambda s: abs(s.bias) + s.sd, "range")},
 )

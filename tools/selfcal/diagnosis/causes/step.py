@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Key, medians, shown, sized
+from selfcal.diagnosis.cause import Cause, Key, shown, sized
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
@@ -207,7 +207,6 @@ CAUSE = Cause(
     least=_least,
     entry=_entry,
     of_column=_of_column,
-    of_estimate=medians,
     keys={
         "time_s": Key(lambda s: s.duration_s / 2.0, "step_time_s"),
         "amplitude": Key(lambda s: 2.0 * s.n, "step_amplitude"),

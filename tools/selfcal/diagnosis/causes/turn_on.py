@@ -305,7 +305,6 @@ CAUSE = Cause(
     least=_least,
     entry=_entry,
     of_column=lambda column, c: {"amplitude": c[0], "tau_s": float(column.entry["tau_s"])},
-    of_estimate=medians,
     add=_add,
     keys={
         "amplitude": Key(lambda s: 5.0 * s.n),

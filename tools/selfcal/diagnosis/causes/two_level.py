@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
@@ -253,7 +253,6 @@ CAUSE = Cause(
     pictures=shown("means", "evidence"),
     no_gain="the levels are found in the readings themselves, and no model file predicts them",
     once="its jumps are events of their recording",
-    of_estimate=lambda look: medians(look, "amplitude", "dwell_low_s", "dwell_high_s"),
     add=_add,
     keys={
         "amplitude": Key(lambda s: 3.0 * s.n),

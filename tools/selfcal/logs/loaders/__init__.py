@@ -8,6 +8,7 @@ programs call their columns, `sources.py` chooses among several sensors of a log
 from __future__ import annotations
 
 import importlib.util
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -46,14 +47,14 @@ FORMATS = (
     Format("an npz file", (".npz",), "npz", here=True),
     Format("a MATLAB file", (".mat",), "matlab"),
     Format("an R file", (".rda", ".rdata", ".rds"), "r_data", library="rdata", extra="r"),
-    Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags"),
-    Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap"),
-    Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog"),
+    Format("a ROS bag", (".bag", ".db3"), "ros", ((0, b"#ROSBAG V2.0"), (0, b"SQLite format 3")), "rosbags", "ros"),
+    Format("an MCAP file", (".mcap",), "mcap", ((0, b"\x89MCAP0\r\n"),), "mcap", "mcap"),
+    Format("a ULog file", (".ulg",), "ulog", ((0, b"ULog\x01\x12\x35"),), "pyulog", "px4"),
     Format("a DataFlash log", (".bin", ".tlog"), "dataflash", ((0, b"\xa3\x95\x80"),), "pymavlink", "ardupilot"),
     Format("a Betaflight log", (".bbl", ".bfl"), "blackbox", ((0, b"H Product:Blackbox"),)),
-    Format("an HDF5 file", (".h5", ".hdf5"), "hdf5", ((0, _HDF5), (512, _HDF5)), "h5py"),
+    Format("an HDF5 file", (".h5", ".hdf5"), "hdf5", ((0, _HDF5), (512, _HDF5)), "h5py", "hdf5"),
     Format("a Parquet file", (".parquet",), "parquet", ((0, b"PAR1"),), "pyarrow", "lab"),
-    Format("a TDMS file", (".tdms",), "tdms", ((0, b"TDSm"),), "nptdms"),
+    Format("a TDMS file", (".tdms",), "tdms", ((0, b"TDSm"),), "nptdms", "labview"),
     Format("an MDF file", (".mf4", ".mdf"), "mf4", ((0, b"MDF     "), (0, b"UnFinMF ")), "asammdf", "automotive"),
     Format("a log of CAN frames", (".blf", ".asc", ".trc"), "can_log", ((0, b"LOGG"),), "can"),
 )
@@ -98,7 +99,7 @@ class Reading(TypedDict, total=False):
     scale: Annotated[
         Mapping[str, Scale] | float | None,
         option(
-            "Size of one LSB of LSB columns (repeat for more)",
+            "Size of one LSB, or of a unit that is not known (repeat for more)",
             metavar="[gx=]SIZE[unit]",
             kind=list[str],
             made=_scales,
@@ -127,10 +128,14 @@ def is_text(path: Path) -> bool:
 def format_of(path: Path, *, frames: bool = False) -> Format | None:
     """The format of a file that is no text, by its first bytes, else by its suffix; None for a text. `frames`: it is a
     log of CAN frames, which may be a text. Raises UserError, and OSError."""
+    if not path.is_dir():
+        _check_file(path)
     if frames:
         return next(one for one in FORMATS if one.module == "can_log")
     if path.is_dir():
         if any(True for pattern in _ROS_FOLDER for _ in path.glob(pattern)):
+            for part in path.iterdir():
+                _check_file(part)
             return next(one for one in FORMATS if one.module == "ros")
         raise UserError(f"{path}: is a folder: name a recording in it ({READ})")
     with path.open("rb") as stream:
@@ -149,6 +154,12 @@ def format_of(path: Path, *, frames: bool = False) -> Format | None:
             raise UserError(f"{path}: the file is empty")
         return None
     raise UserError(f"{path}: not a recording: its name ends in none of {READ}")
+
+
+def _check_file(path: Path) -> None:
+    """Raise UserError for a pipe or a device, which could hold the reader for ever. Raises OSError."""
+    if not (stat.S_ISREG(mode := path.stat().st_mode) or stat.S_ISDIR(mode)):
+        raise UserError(f"{path}: is a pipe or a device: write it into a file first")
 
 
 def check_library(path: Path, one: Format) -> None:

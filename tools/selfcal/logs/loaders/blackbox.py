@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 BEGIN = b"H Product:Blackbox"
@@ -197,6 +198,8 @@ class _Log:
             _MINMOTOR: self._number("motorOutput", self._number("minthrottle", 1150)),
         }
         self.step = max(1, self._number("P interval", 1, "/"))
+        #: What could not be read so far.
+        self.damaged = Damaged()
 
     def _numbers(self, name: str) -> list[int]:
         return [int(part) for part in self.headers.get(name, "").split(",") if part.lstrip("-").isdigit()]
@@ -206,15 +209,17 @@ class _Log:
         return int(first) if first.lstrip("-").isdigit() else otherwise
 
     def frames(self) -> Iterator[list[int]]:
-        """The values of the main frames, in order."""
+        """The values of the main frames, in order. What lies between a damaged one and the next that stands for itself
+        counts as `damaged`."""
         data, history = self.data, list[list[int]]()
-        while data.at < len(data.data):
+        lost, size = -1, len(data.data)
+        while data.at < size:
             begin = data.at
             try:
                 kind = data.byte()
                 if kind == ord("E"):
                     if self._event():
-                        return
+                        size = data.at
                     continue
                 if kind not in self.kinds:
                     raise _Damaged
@@ -229,13 +234,17 @@ class _Log:
                 values = self._predicted(values, frames.predictors, history if kind == ord("P") else [])
                 if history and not 0 < values[self.time] - history[-1][self.time] < _JUMP:
                     raise _Damaged
-            except _Damaged:
+            except (_Damaged, IndexError):
+                lost = begin if lost < 0 else lost
                 history, data.at = [], begin + 1
                 continue
-            except IndexError:
-                return
+            if lost >= 0:
+                self.damaged += Damaged(begin - lost, 1)
+                lost = -1
             history = [values, values] if kind == ord("I") else [history[-1], values]
             yield values
+        if lost >= 0:
+            self.damaged += Damaged(size - lost, 1)
 
     def _predicted(self, values: list[int], predictors: Sequence[int], history: Sequence[list[int]]) -> list[int]:
         """The values with what they are predicted by. Raises _Damaged."""
@@ -282,19 +291,23 @@ class _Log:
 
 def read(path: Path, _: Hints) -> list[Table]:
     """The tables of a file's logs. Raises UserError."""
-    data = path.read_bytes()
+    data = path.read_bytes().rstrip(b"\xff")  # of a chip that was never written
     begins = [data.find(BEGIN)]
     while begins[-1] >= 0:
         begins.append(data.find(BEGIN, begins[-1] + 1))
-    tables = []
+    tables = list[Table]()
+    damaged = Damaged()
     for number, (begin, end) in enumerate(zip(begins[:-1], [*begins[1:-1], len(data)], strict=True), 1):
         try:
-            table = _table(_Log(data[begin:end]), f"log {number}")
+            log = _Log(data[begin:end])
+            table = _table(log, f"log {number}")
         except ValueError as error:
             raise UserError(f"{path}: log {number}: {error}") from error
+        damaged += log.damaged
         tables += [table] if table is not None else []
     if not tables:
         raise UserError(f"{path}: no log in it has frames with gyroADC")
+    tables = [replace(one, damaged=damaged) for one in tables]
     return [replace(tables[0], source="")] if len(tables) == 1 else tables
 
 

@@ -1,4 +1,4 @@
-"""Logs of CAN frames by python-can, decoded by cantools with the database of `--dbc`: a table a message.
+"""Logs of CAN frames by framelog.py, decoded by cantools with the database of `--dbc`: a table a message.
 
 Signals are columns by their names and units. Stamps are the adapter's.
 """
@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.base.errors import UserError
+from selfcal.logs.framelog import FrameLog
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 
@@ -19,7 +20,8 @@ def read(path: Path, hints: Hints) -> list[Table]:
     """The tables of a log. Raises UserError and what the libraries raise."""
     if "dbc" not in hints:
         raise UserError(f"{path}: is a log of CAN frames: name the database of its signals with --dbc FILE.dbc")
-    import can
+    if not Path(hints["dbc"]).is_file():
+        raise UserError(f"{hints['dbc']}: there is no such file, or it is a pipe or a device")
     import cantools
 
     database = cantools.database.load_file(hints["dbc"], strict=False)
@@ -28,8 +30,8 @@ def read(path: Path, hints: Hints) -> list[Table]:
     messages = {one.frame_id: one for one in database.messages if not one.is_multiplexed()}
     stamps: dict[int, Any] = {}
     values: dict[int, Any] = {}
-    with can.LogReader(path) as log:
-        for frame in log:
+    with FrameLog(path) as log:
+        while (frame := log.recv(0.0)) is not None:
             message = messages.get(frame.arbitration_id)
             if message is None or frame.is_remote_frame or frame.is_error_frame or len(frame.data) < message.length:
                 continue
@@ -48,5 +50,5 @@ def read(path: Path, hints: Hints) -> list[Table]:
         columns = {"t[s]": np.array(times)}
         for place, signal in enumerate(message.signals):
             columns[f"{signal.name}[{signal.unit}]" if signal.unit else signal.name] = rows[:, place]
-        tables.append(of_arrays(message.name, columns))
+        tables.append(of_arrays(message.name, columns, damaged=log.damaged))
     return tables

@@ -1,52 +1,73 @@
 """A binary file is read in a child process, within bounds of time and memory.
 
-The parent gets arrays and one line of JSON, or one line that says why there are none. The reader may end by a signal,
-or never: the parent goes on.
+The parent gets JSON and the bytes of arrays by a pipe, or one line that says why there are none. The reader may end by
+a signal, or never: the parent goes on.
 """
 
 from __future__ import annotations
 
+import ctypes
 import json
+import math
 import os
 import resource
-import subprocess
+import select
+import signal
+import struct
 import sys
-import tempfile
+import time
 from collections.abc import Callable
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from selfcal.base.errors import UserError
+from selfcal.base.errors import UserError, printable
 from selfcal.base.limits import MOST_COLUMNS, MOST_NUMBERS, reading
 from selfcal.logs.loaders import Format
+from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
 _LEAST_S, _S_PER_BYTE = 60.0, 4e-6
 #: Bytes of memory of a reading: for any file, as libraries are large; a byte; and at most.
 _LEAST_BYTES, _PER_BYTE, _MOST_BYTES = 3 << 30, 40, 16 << 30
+#: Of prctl(2): the signal that a process gets when its parent ends.
+_PR_SET_PDEATHSIG = 1
+#: What comes before the JSON: its size.
+_SIZE = struct.Struct("=Q")
 
-#: What reads: (format, path, hints, folder for the answer) -> exit code, negative for a signal, None for no end.
-Start = Callable[[Format, Path, Hints, Path], int | None]
+#: What starts a reader: (format, path, hints, descriptor for the answer) -> number of its process.
+Start = Callable[[Format, Path, Hints, int], int]
 
 
 def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None) -> list[Table]:
-    """The tables of a file, by a child process. `start` runs it. Raises UserError."""
-    with tempfile.TemporaryDirectory(prefix="selfcal-") as folder:
-        place = Path(folder)
-        code = (start or _spawned)(one, path, hints, place)
-        answer = place / "answer.json"
-        if code == 0 and answer.exists():
-            found = json.loads(answer.read_text(encoding="utf-8"))
-            if "error" in found:
-                raise UserError(found["error"])
-            return [_table(place, number, entry) for number, entry in enumerate(found["tables"])]
-    if code is None or code == -24:  # SIGXCPU
+    """The tables of a file, by a child process. `start` starts it. Raises UserError."""
+    ends = time.monotonic() + _seconds(path)
+    pipe, its_end = os.pipe()
+    number, code = 0, 0
+    try:
+        try:
+            number = (start or _spawned)(one, path, hints, its_end)
+        finally:
+            os.close(its_end)
+        return _answered(pipe, ends)
+    except EOFError:
+        code = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+        number = 0
+    except TimeoutError:
+        code = -signal.SIGXCPU
+    finally:
+        os.close(pipe)
+        if number:
+            os.kill(number, signal.SIGKILL)
+            os.waitpid(number, 0)
+    if code == -signal.SIGXCPU:
         raise UserError(f"{path}: reading it takes more than {_seconds(path):.0f} s: it is damaged, or too long")
-    if code in (0, 1):
+    if code >= 0:
         raise UserError(
             f"{path}: not {'a' if one.name[1] != 'n' else 'an'}{one.name[one.name.index(' ') :]} that reads"
         )
@@ -54,60 +75,80 @@ def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None)
     raise UserError(f"{path}: not a sound {what}: {one.library or 'its reader'} fails at it (signal {-code})")
 
 
-def _table(place: Path, number: int, entry: dict[str, Any]) -> Table:
-    """A table that the child wrote."""
-    arrays = {
-        name: np.load(place / f"{number}.{column}.npy", allow_pickle=False)
-        for column, name in enumerate(entry["names"])
-    }
-    return of_arrays(entry["source"], arrays, entry["meta"], tuple(entry["notes"]))
+def _answered(pipe: int, ends: float) -> list[Table]:
+    """The tables that a child sends. Raises UserError; EOFError where it ended, TimeoutError at the time `ends`."""
+    found = json.loads(_received(pipe, _SIZE.unpack(_received(pipe, _SIZE.size, ends))[0], ends))
+    if "error" in found:
+        raise UserError(found["error"])
+    tables = []
+    for one in found["tables"]:
+        arrays = {}
+        for name, kind, shape in one["columns"]:
+            dtype = np.dtype(kind)
+            data = _received(pipe, math.prod(shape) * dtype.itemsize, ends)
+            arrays[name] = np.frombuffer(data, dtype).reshape(shape)
+        tables.append(of_arrays(one["source"], arrays, one["meta"], tuple(one["notes"]), Damaged(**one["damaged"])))
+    return tables
+
+
+def _received(pipe: int, size: int, ends: float) -> bytearray:
+    """The next bytes of a pipe. Raises EOFError and TimeoutError."""
+    data = bytearray(size)
+    left = memoryview(data)
+    ready = select.poll()
+    ready.register(pipe, select.POLLIN)
+    while left:
+        if not ready.poll(max(0.0, 1e3 * (ends - time.monotonic()))):
+            raise TimeoutError
+        count = os.readv(pipe, [left])
+        if not count:
+            raise EOFError
+        left = left[count:]
+    return data
 
 
 def _bytes(path: Path) -> int:
-    parts = path.iterdir() if path.is_dir() else [path]
-    return sum(part.stat().st_size for part in parts)
+    """Bytes of a file, or of a folder's files. A hole has none; a disk that packs files does so to a sixteenth."""
+    found = [part.stat() for part in (path.iterdir() if path.is_dir() else [path])]
+    return sum(min(one.st_size, 16 * 512 * one.st_blocks) for one in found)
 
 
 def _seconds(path: Path) -> float:
     return _LEAST_S + _S_PER_BYTE * _bytes(path)
 
 
-def _spawned(one: Format, path: Path, hints: Hints, place: Path) -> int | None:
-    command = [
-        sys.executable,
-        "-m",
-        "selfcal.logs.loaders.child",
-        one.module,
-        str(path),
-        str(place),
-        json.dumps(dict(hints)),
+def _spawned(one: Format, path: Path, hints: Hints, answer: int) -> int:
+    # -P: no module is imported from the folder that the user is in, where files of strangers may lie.
+    what = [one.module, str(path), json.dumps(dict(hints)), str(os.getpid())]
+    command = [sys.executable, "-P", "-m", "selfcal.logs.loaders.child", *what]
+    streams = [
+        (os.POSIX_SPAWN_DUP2, answer, 1),
+        (os.POSIX_SPAWN_OPEN, 0, os.devnull, os.O_RDONLY, 0),
+        (os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0),
     ]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    child = subprocess.Popen(
-        command, env=environment, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    try:
-        return child.wait(_seconds(path))
-    except subprocess.TimeoutExpired:
-        return None
-    finally:
-        child.kill()
-        child.wait()
+    return os.posix_spawn(sys.executable, command, environment, file_actions=streams)
 
 
-def answer(module: str, path: Path, place: Path, hints: Hints) -> None:
-    """In the child: read, within the bounds, and write the answer into the folder `place`."""
+def answer(module: str, path: Path, hints: Hints, to: int) -> None:
+    """In the child: read, within the bounds, and write the answer to the descriptor `to`."""
     seconds = int(_seconds(path)) + 1
     most = min(_MOST_BYTES, _LEAST_BYTES + _PER_BYTE * _bytes(path))
     _bound(resource.RLIMIT_AS, most, most)
     _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    arrays: list[NDArray[np.uint8]] = []
     try:
         with reading(path, "cannot be read"):
-            found: dict[str, Any] = {"tables": [_written(path, place, *one) for one in _read(module, path, hints)]}
+            read = import_module(f"selfcal.logs.loaders.{module}").read
+            found: dict[str, Any] = {"tables": [_entry(path, table, arrays) for table in read(path, hints)]}
     except UserError as error:
-        found = {"error": str(error)}
-    (place / "answer.json").write_text(json.dumps(found), encoding="utf-8")
+        found, arrays = {"error": str(error)}, []
+    head = json.dumps(found).encode()
+    with open(to, "wb") as pipe:
+        pipe.write(_SIZE.pack(len(head)) + head)
+        for array in arrays:
+            pipe.write(array.data)
 
 
 def _bound(kind: int, soft: int, hard: int) -> None:
@@ -117,25 +158,37 @@ def _bound(kind: int, soft: int, hard: int) -> None:
     resource.setrlimit(kind, (min(soft, most), most))
 
 
-def _read(module: str, path: Path, hints: Hints) -> list[tuple[int, Table]]:
-    return list(enumerate(import_module(f"selfcal.logs.loaders.{module}").read(path, hints)))
-
-
-def _written(path: Path, place: Path, number: int, table: Table) -> dict[str, Any]:
+def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[str, Any]:
+    """What the JSON says of a table, the bytes of whose columns join `arrays`."""
     if len(table.members) > MOST_COLUMNS:
         raise UserError(f"{path}: {table.source}: more than {MOST_COLUMNS} columns")
-    for column, member in enumerate(table.members.values()):
+    columns = []
+    for name, member in table.members.items():
         array = member.read()
         if array.size > MOST_NUMBERS:
             raise UserError(f"{path}: {table.source}: more than {MOST_NUMBERS:,} numbers: cut it in parts")
-        np.save(place / f"{number}.{column}.npy", array, allow_pickle=False)
-    return {"source": table.source, "names": list(table.members), "meta": dict(table.meta), "notes": list(table.notes)}
+        if array.dtype.kind not in "biufcMm":
+            raise ValueError(f"column '{name}' holds no numbers")
+        arrays.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8))
+        columns.append((name, array.dtype.str, array.shape))
+    return {
+        "source": printable(table.source),
+        "columns": columns,
+        "meta": dict(table.meta),
+        "notes": list(table.notes),
+        "damaged": asdict(table.damaged),
+    }
 
 
 def main() -> None:
-    """`python -m selfcal.logs.loaders.child MODULE PATH FOLDER HINTS`."""
-    module, path, place, hints = sys.argv[1:]
-    answer(module, Path(path), Path(place), json.loads(hints))
+    """`python -m selfcal.logs.loaders.child MODULE PATH HINTS PARENT`: answers on stdout, and ends with its parent."""
+    module, path, hints, parent = sys.argv[1:]
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != int(parent):  # it has ended before
+        return
+    to = os.dup(1)
+    os.dup2(2, 1)  # what a library prints is no answer
+    answer(module, Path(path), json.loads(hints), to)
 
 
 if __name__ == "__main__":

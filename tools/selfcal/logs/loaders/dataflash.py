@@ -6,14 +6,18 @@ Stamps are those of the sensor or the vehicle, never the times at which a ground
 from __future__ import annotations
 
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.limits import BLOCK_BYTES
+from selfcal.logs.loaders.damage import Bytes, Damaged, mapped, sifted, walk
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 #: Messages of a DataFlash log, and the source that each belongs to; the instance is in a field, or in the name.
@@ -37,6 +41,10 @@ _TLOG = {
     "HIGHRES_IMU": ("time_usec", "us", "rad/s", "m/s^2"),
 }
 _ARDUPILOT = 3
+#: How a message of a DataFlash log begins, and the kind that describes the others; the first byte of MAVLink's frames.
+_HEAD, _FMT = b"\xa3\x95", 0x80
+_MAVLINK_2 = 0xFD
+_MARKS = (0xFE, _MAVLINK_2)
 
 
 class _Rows:
@@ -55,23 +63,57 @@ class _Rows:
 def read(path: Path, _: Hints) -> list[Table]:
     """The tables of a .bin or a .tlog. Raises UserError and what pymavlink raises."""
     found: dict[str, dict[str, _Rows]] = {}
-    with path.open("rb") as stream:
-        binary = stream.read(2) == b"\xa3\x95"
-    for source, kind, headings, values in _bin(path) if binary else _tlog(path):
-        rows = found.setdefault(source, {})
-        if kind not in rows:
-            rows[kind] = _Rows(headings)
-        if rows[kind].headings == headings:
-            rows[kind].values.extend(values)
+    with mapped(path) as data:
+        binary = data[:2] == _HEAD
+        damaged, sound = sifted(data, 0, _ends(data)) if binary else (Damaged(), None)
+        lost = list[Damaged]()
+        for source, kind, headings, values in _bin(path, sound) if binary else _tlog(data, lost):
+            rows = found.setdefault(source, {})
+            if kind not in rows:
+                rows[kind] = _Rows(headings)
+            if rows[kind].headings == headings:
+                rows[kind].values.extend(values)
     if not found:
         raise UserError(f"{path}: no message {', '.join(_SOURCES if binary else _TLOG)}")
     order = list(_DATAFLASH if binary else _TLOG)
-    return [rows[kind].table(source) for source, rows in found.items() for kind in sorted(rows, key=order.index)]
+    tables = [rows[kind].table(source) for source, rows in found.items() for kind in sorted(rows, key=order.index)]
+    return [replace(one, damaged=sum(lost, damaged)) for one in tables]
 
 
-def _bin(path: Path) -> Iterator[tuple[str, str, list[str], list[float]]]:
-    """Source, kind, headings and values of each message of an IMU."""
+def _ends(data: Bytes) -> Callable[[int], int]:
+    """Where the message of a DataFlash log at a place ends. A page's rest that was never written counts as one.
+
+    A message is two bytes, its kind, and what the message FMT of its kind says. Source: ArduPilot's LogStructure.h.
+    """
+    size = written = len(data)
+    while written and not (block := data[max(0, written - BLOCK_BYTES) : written].rstrip(b"\xff")):
+        written = max(0, written - BLOCK_BYTES)
+    written = max(0, written - BLOCK_BYTES) + len(block) if written else 0
+    lengths = {_FMT: 89}
+
+    def end_of(at: int) -> int:
+        if at >= written:
+            return size
+        end = at + lengths.get(data[at + 2], 0) if data[at : at + 2] == _HEAD and at + 2 < size else 0
+        if not at + 2 < end <= size:
+            return 0
+        if data[at + 2] == _FMT:
+            lengths[data[at + 3]] = data[at + 4]
+        return end
+
+    return end_of
+
+
+def _bin(path: Path, sound: bytes | None) -> Iterator[tuple[str, str, list[str], list[float]]]:
+    """Source, kind, headings and values of each message of an IMU. `sound`: the sound messages, where some are not."""
     from pymavlink.DFReader import DFReader_binary
+
+    if sound is not None:  # the library opens a file by its name
+        with NamedTemporaryFile(prefix="selfcal-", suffix=".bin") as file:
+            file.write(sound)
+            file.flush()
+            yield from _bin(Path(file.name), None)
+        return
 
     class Log(DFReader_binary):  # type: ignore[misc]
         """A log whose reading ends: the library takes a message of no bytes for ever."""
@@ -114,14 +156,53 @@ def _layout(layout: Any) -> tuple[list[int], list[float], list[str], int | None]
     return places, sizes, headings, names.index("I") if "I" in names else None
 
 
-def _tlog(path: Path) -> Iterator[tuple[str, str, list[str], list[float]]]:
-    """The same of a ground station's log."""
-    from pymavlink import mavutil
+def _fits(crc: int, stated: bytes) -> bool:
+    """Whether a frame of a kind that the dialect does not know may be sound. Its checksum ends with a byte that is the
+    kind's own: to a damaged frame one of the 256 fits in one case of 256. Source: MAVLink's CRC_EXTRA."""
+    for own in range(256):
+        mixed = own ^ crc & 0xFF
+        mixed ^= mixed << 4 & 0xFF
+        if int.from_bytes(stated, "little") == (crc >> 8) ^ (mixed << 8) ^ (mixed << 3) ^ (mixed >> 4):
+            return True
+    return False
 
-    log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega", notimestamps=False)
+
+def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str], list[float]]]:
+    """The same of a ground station's log. What is damaged joins `lost`.
+
+    A message is a stamp of 8 bytes and a frame of MAVLink, which has a checksum.
+    """
+    from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+    link = dialect.MAVLink(None)
+    messages = dict[int, Any]()
+
+    def end_of(at: int) -> int:
+        head = data[at + 8 : at + 18]
+        if len(head) < 8 or head[0] not in _MARKS:
+            return 0
+        second = head[0] == _MAVLINK_2
+        number = int.from_bytes(head[7:10], "little") if second else head[5]
+        checked = at + 8 + head[1] + (12 if second else 8)
+        end = checked + (13 if second and head[2] & 1 else 0)  # a signature
+        if end > len(data):
+            return 0
+        if number not in dialect.mavlink_map:
+            return end if _fits(dialect.x25crc(data[at + 9 : checked - 2]).crc, data[checked - 2 : checked]) else 0
+        try:
+            messages[at] = link.decode(bytearray(data[at + 8 : end]))
+        except dialect.MAVError:
+            return 0
+        return end
+
     ardupilot: set[int] = set()
-    while (message := log.recv_match(type=["HEARTBEAT", *_TLOG])) is not None:
-        kind, vehicle = message.get_type(), message.get_srcSystem()
+    for begin, end, sound in walk(data, 0, end_of, checked=True):
+        if not sound:
+            lost.append(Damaged(end - begin, 1))
+        message = messages.pop(begin, None) if sound else None
+        if message is None or (kind := message.get_type()) not in ("HEARTBEAT", *_TLOG):
+            continue
+        vehicle = message.get_srcSystem()
         if kind == "HEARTBEAT":
             if message.autopilot == _ARDUPILOT:
                 ardupilot.add(vehicle)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.base.errors import UserError
-from selfcal.base.limits import MOST_META_BYTES, MOST_NUMBERS
-from selfcal.logs.loaders.table import Hints, Table, of_arrays, parse_meta
+from selfcal.base.errors import UserError, short
+from selfcal.base.limits import MOST_META_BYTES
+from selfcal.logs.loaders.table import Hints, Table, check_numbers, of_arrays, parse_meta
 
 #: Columns of a matrix.
 _WIDEST = 64
@@ -33,14 +33,15 @@ def read(path: Path, _: Hints) -> list[Table]:
         file.visititems(lambda name, item: datasets.append((name, item)) if isinstance(item, h5py.Dataset) else None)
         numbers = 0
         for name, dataset in datasets:
-            if name == "meta" and dataset.size <= MOST_META_BYTES:
+            if dataset.external or dataset.is_virtual:
+                raise UserError(f"{path}: dataset '{short(name)}' lies in other files: write it into this one")
+            if name == "meta" and dataset.nbytes <= MOST_META_BYTES:
                 meta = _text(dataset)
                 continue
             if name.startswith("#refs#") or dataset.ndim not in (1, 2) or dataset.dtype.kind not in "iufV":
                 continue
             numbers += dataset.size
-            if numbers > MOST_NUMBERS:
-                raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers")
+            check_numbers(path, numbers)
             group, _slash, label = name.rpartition("/")
             for heading, column in _columns(label, dataset):
                 tables.setdefault((group, column.size), {})[heading] = column

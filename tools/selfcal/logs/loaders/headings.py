@@ -160,11 +160,11 @@ FORMS = (
     ),
 )  # fmt: skip
 
-#: Units at the end of a name: `gyro_x_dps`, `time_us`, `temp_c`.
+#: Kinds of unit that a name may end with, `gyro_x_dps`, `time_us`, `temp_c`; and units that only names write so.
+_KINDS = ("rad/s", "m/s^2", "s", "K")
 _ENDINGS = {
     "dps": "deg/s", "degs": "deg/s", "deg_s": "deg/s", "rads": "rad/s", "rad_s": "rad/s", "radps": "rad/s",
-    "rps": "rad/s", "ms2": "m/s^2", "mps2": "m/s^2", "m_s2": "m/s^2", "m_s_2": "m/s^2", "g": "g", "mg": "mg",
-    "s": "s", "sec": "s", "ms": "ms", "us": "us", "ns": "ns", "c": "degC", "degc": "degC", "k": "K",
+    "rps": "rad/s", "ms2": "m/s^2", "mps2": "m/s^2", "m_s2": "m/s^2", "m_s_2": "m/s^2",
 }  # fmt: skip
 
 
@@ -326,9 +326,10 @@ def _matching(pattern: str | tuple[str, ...], keys: Sequence[str]) -> Iterator[t
             continue
         ending = match.groupdict().get("unit")
         if ending is not None:
-            if ending.lower() not in _ENDINGS:
+            named = _ENDINGS.get(ending.lower(), units.plain(ending))
+            if named == units.LSB or not units.known(named) or not any(units.same_kind(named, one) for one in _KINDS):
                 continue
-            unit = unit or _ENDINGS[ending.lower()]
+            unit = unit or named
         yield key, match, unit
 
 

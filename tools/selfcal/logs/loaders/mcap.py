@@ -7,14 +7,21 @@ Messages of ROS are read as in a bag (`ros.py`). Those in JSON or protobuf becom
 from __future__ import annotations
 
 import json
+import struct
+import zlib
 from array import array
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from selfcal.base.errors import UserError
 from selfcal.base.limits import MOST_COLUMNS
+from selfcal.logs.loaders.damage import Bytes, Damaged, bytes_of, mapped
 from selfcal.logs.loaders.headings import TIMES
 from selfcal.logs.loaders.ros import LAYOUTS, Topic, no_topic
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
@@ -22,6 +29,9 @@ from selfcal.logs.loaders.table import Hints, Table, of_arrays
 #: Fields whose message is a stamp: seconds and nanoseconds by these names.
 _STAMPS = ("header/stamp", "timestamp", "stamp", "time")
 _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs", "nanos")
+#: The first and the last bytes of a file; a record's kind and length; kinds of records; bytes of the last one.
+_MAGIC, _HEAD = b"\x89MCAP0\r\n", struct.Struct("<BQ")
+_MESSAGE, _CHUNK, _FOOTER_BYTES = 5, b"\x06", _HEAD.size + 20
 #: Depth of a message's fields.
 _DEEPEST = 6
 #: What of a message's fields is a sensor's by convention.
@@ -91,13 +101,12 @@ def _stamp(fields: Mapping[str, float | int]) -> int | None:
 
 def read(path: Path, _: Hints) -> list[Table]:
     """The tables of an MCAP file. Raises UserError and what mcap raises."""
-    from mcap.reader import make_reader
-
     found: dict[str, Topic | _Fields] = {}
     kinds: set[str] = set()
     decoders: dict[int, Callable[[bytes], Mapping[str, Any]]] = {}
-    with path.open("rb") as stream:
-        for schema, channel, message in make_reader(stream).iter_messages(log_time_order=False):
+    lost = list[Damaged]()
+    with mapped(path) as data:
+        for schema, channel, message in _messages_in(path, data, lost):
             kind = schema.name if schema is not None else channel.message_encoding
             kinds.add(kind)
             topic = channel.topic
@@ -117,9 +126,106 @@ def read(path: Path, _: Hints) -> list[Table]:
             fields = found[topic]
             if isinstance(fields, _Fields):
                 fields.take(decoders[channel.id](message.data), message.publish_time)
+    damaged = sum(lost, Damaged())
+    if damaged and not found:
+        raise UserError(f"{path}: damaged: {replace(damaged, whole=bytes_of(path)).words}, and no other is a sensor's")
     if not found:
         raise no_topic(path, kinds)
-    return [one.table(topic) for topic, one in found.items()]
+    return [replace(one.table(topic), damaged=damaged) for topic, one in found.items()]
+
+
+def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple[Any, Any, Any]]:
+    """Schema, channel and content of each sound message. A chunk that its checksum says is damaged is left out, and
+    what is no record: both join `lost`. Raises UserError where messages have the checksum of the whole alone, and it
+    does not fit. mcap's own readers end at the first damage, or pass by the checksums. Source: mcap.dev/spec.
+    """
+    from mcap import records as of
+    from mcap.exceptions import UnsupportedCompressionError
+
+    summary = _summary(data)
+    schemas = {one.id: one for one in summary if isinstance(one, of.Schema)}
+    channels = {one.id: one for one in summary if isinstance(one, of.Channel)}
+    count, at, unchecked = 0, len(_MAGIC), False
+    while data[at : at + len(_MAGIC)] != _MAGIC and at < len(data):
+        begin = at
+        try:
+            at, found, checked = _records(data, begin)
+        except UnsupportedCompressionError:
+            raise
+        except Exception:  # whatever mcap stumbles over
+            at = _next(data, begin)
+            lost.append(Damaged(at - begin, 1))
+            continue
+        for one in found:
+            if isinstance(one, of.Schema):
+                schemas[one.id] = one
+            elif isinstance(one, of.Channel):
+                channels[one.id] = one
+            elif isinstance(one, of.Message) and one.channel_id in channels:
+                count, unchecked = count + 1, unchecked or not checked
+                yield schemas.get(channels[one.channel_id].schema_id), channels[one.channel_id], one
+            elif (
+                isinstance(one, of.DataEnd) and unchecked and one.data_section_crc not in (0, zlib.crc32(data[:begin]))
+            ):
+                raise UserError(f"{path}: the checksum of its data does not fit: a message in it is damaged")
+    stated = sum(one.message_count for one in summary if isinstance(one, of.Statistics))
+    if stated > count + sum(one.messages for one in lost):
+        lost.append(Damaged(0, stated - count - sum(one.messages for one in lost)))
+
+
+def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
+    """The end of the record at a place, the record, or those of a chunk, and whether it has a checksum, which fits.
+    Raises what mcap raises."""
+    from mcap import records as of
+    from mcap.data_stream import ReadDataStream
+    from mcap.stream_reader import breakup_chunk
+
+    kinds: dict[int, Any] = {3: of.Schema, 4: of.Channel, 6: of.Chunk, 11: of.Statistics, 15: of.DataEnd, 2: of.Footer}
+    if not (end := _end(data, at)):
+        raise ValueError("no record")
+    stream, kind = ReadDataStream(BytesIO(data[at + _HEAD.size : end])), data[at]
+    if kind == _MESSAGE:
+        return end, [of.Message.read(stream, end - at - _HEAD.size)], False
+    record = kinds[kind].read(stream) if kind in kinds else None
+    if isinstance(record, of.Chunk):
+        return end, breakup_chunk(record, validate_crc=True), record.uncompressed_crc != 0
+    return end, [record], False
+
+
+def _end(data: Bytes, at: int) -> int:
+    """The end that a record at a place states; 0 where there is none."""
+    if at + _HEAD.size > len(data):
+        return 0
+    kind, length = _HEAD.unpack_from(data, at)
+    end = at + _HEAD.size + length
+    return end if (0 < kind < 16 or kind > 127) and end <= len(data) else 0
+
+
+def _next(data: Bytes, at: int) -> int:
+    """Where to go on after a damaged record: at its end where a record or the file's end is there, else at the next
+    sound chunk."""
+    end = _end(data, at)
+    if end and (_end(data, end) or data[end:] == _MAGIC):
+        return end
+    while (at := data.find(_CHUNK, at + 1)) >= 0:
+        with suppress(Exception):
+            if _records(data, at)[2]:
+                return at
+    return len(data)
+
+
+def _summary(data: Bytes) -> list[Any]:
+    """The records of the summary, none where it is absent or damaged."""
+    found: list[Any] = []
+    at = len(data) - _FOOTER_BYTES - len(_MAGIC)
+    with suppress(Exception):
+        end, (footer,), _ = _records(data, at)
+        start = footer.summary_start
+        if not footer.summary_crc or zlib.crc32(data[start : end - 4]) == footer.summary_crc:
+            while 0 < start < at:
+                start, more, _ = _records(data, start)
+                found += more
+    return found
 
 
 def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:

@@ -1,25 +1,45 @@
-"""ASAM MDF by asammdf: a table a channel group, on the group's own master channel. Units are the channels'."""
+"""ASAM MDF by asammdf: a table a channel group, on the group's own master channel. Units are the channels'.
+
+A conversion by a formula is code to asammdf, and never run: its channel is left out with a note.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_COLUMNS
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
+#: Channels that a note names.
+_MOST_NAMED = 6
+
 
 def read(path: Path, _: Hints) -> list[Table]:
-    """The tables of a file. Raises what asammdf raises."""
+    """The tables of a file. Raises UserError and what asammdf raises."""
     from asammdf import MDF
 
-    tables = []
+    tables: list[Table] = []
+    left_out: list[str] = []
     with MDF(path) as file:
         groups: list[Any] = file.groups
         for number, group in enumerate(groups):
             columns: dict[str, Any] = {}
-            for index, channel in enumerate(group.channels[:MOST_COLUMNS]):
-                if channel.channel_type in (2, 3):  # the group's clock
+            formulas = {index: text for index, one in enumerate(group.channels) if (text := _formula(one.conversion))}
+            notes = (_told([group.channels[index].name for index in formulas], formulas),) if formulas else ()
+            left_out += notes
+            for channel in group.channels:
+                if hasattr(channel, "attachment"):
+                    channel.attachment = None  # which may be another file
+            clock = file.masters_db.get(number)
+            if clock in formulas:
+                continue
+            for index in formulas:
+                group.channels[index].conversion = None
+            for index in range(len(group.channels[:MOST_COLUMNS])):
+                if index == clock or index in formulas:
                     continue
                 signal = file.get(group=number, index=index)
                 if signal.samples.dtype.kind in "iuf" and signal.samples.ndim == 1:
@@ -27,11 +47,36 @@ def read(path: Path, _: Hints) -> list[Table]:
                     columns["t[s]"] = signal.timestamps
             name = getattr(group.channel_group, "acq_name", "") or f"group {number}"
             if columns:
-                tables.append(of_arrays(f"{name}", columns))
+                tables.append(of_arrays(f"{name}", columns, notes=notes))
+    if left_out and not tables:
+        raise UserError(f"{path}: {left_out[0]}")
     names = [table.source for table in tables]
     if len(set(names)) < len(names):
         tables = [
-            of_arrays(f"{one.source} {k}", {n: m.read() for n, m in one.members.items()})
+            of_arrays(f"{one.source} {k}", {n: m.read() for n, m in one.members.items()}, notes=one.notes)
             for k, one in enumerate(tables)
         ]
     return tables
+
+
+def _told(names: list[str], formulas: Mapping[int, str]) -> str:
+    """The note on channels that are left out."""
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    return (
+        f"left out: {', '.join(map(short, names[:_MOST_NAMED]))}{more}: their values come by a formula, "
+        f"'{short(next(iter(formulas.values())))}', which is not run: export them as physical values"
+    )
+
+
+def _formula(conversion: Any) -> str:
+    """The formula of a conversion, or of one within it; empty where there is none."""
+    from asammdf.blocks import v2_v3_constants, v4_blocks, v4_constants
+
+    if conversion is None:
+        return ""
+    new = isinstance(conversion, v4_blocks.ChannelConversion)
+    kind = v4_constants.CONVERSION_TYPE_ALG if new else v2_v3_constants.CONVERSION_TYPE_FORMULA
+    if conversion.conversion_type == kind:
+        return str(conversion.formula) or "''"
+    inner = (_formula(one) for one in conversion.referenced_blocks.values() if not isinstance(one, bytes | str))
+    return next(filter(None, inner), "")

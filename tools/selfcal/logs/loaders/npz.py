@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_COLUMNS, MOST_META_BYTES, reading
-from selfcal.logs.loaders.table import Hints, Member, Table, parse_meta
+from selfcal.logs.loaders.table import Hints, Member, Table, check_numbers, parse_meta
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -26,6 +26,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         listed = archive.infolist()
         if len(listed) > MOST_COLUMNS:
             raise UserError(f"{path}: more than {MOST_COLUMNS} columns")
+        check_numbers(path, sum(info.file_size for info in listed) // 8)
         for info in listed:
             name = info.filename.removesuffix(".npy")
             if name in members or (name == "meta" and meta):

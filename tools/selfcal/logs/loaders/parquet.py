@@ -8,24 +8,26 @@ from typing import Any
 import numpy as np
 
 from selfcal.base.errors import UserError
-from selfcal.base.limits import MOST_COLUMNS, MOST_NUMBERS
-from selfcal.logs.loaders.table import Hints, Table, of_arrays
+from selfcal.base.limits import MOST_COLUMNS
+from selfcal.logs.loaders.table import Hints, Table, check_numbers, of_arrays
 
 
 def read(path: Path, _: Hints) -> list[Table]:
     """The table of a file. Raises UserError and what pyarrow raises."""
     from pyarrow import parquet, types
 
-    file = parquet.ParquetFile(path)
-    schema = file.schema_arrow
-    names = [
-        field.name
-        for field in schema
-        if types.is_integer(field.type) or types.is_floating(field.type) or types.is_timestamp(field.type)
-    ]
-    if len(names) > MOST_COLUMNS or file.metadata.num_rows * len(names) > MOST_NUMBERS:
-        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers, or {MOST_COLUMNS} columns")
-    read_in = file.read(columns=names, use_threads=False)
+    with path.open("rb") as stream:  # a name may be a URI
+        file = parquet.ParquetFile(stream, page_checksum_verification=True)
+        schema = file.schema_arrow
+        names = [
+            field.name
+            for field in schema
+            if types.is_integer(field.type) or types.is_floating(field.type) or types.is_timestamp(field.type)
+        ]
+        if len(names) > MOST_COLUMNS:
+            raise UserError(f"{path}: more than {MOST_COLUMNS} columns")
+        check_numbers(path, file.metadata.num_rows * len(names))
+        read_in = file.read(columns=names, use_threads=False)
     columns: dict[str, Any] = {}
     for name in names:
         field = schema.field(name)

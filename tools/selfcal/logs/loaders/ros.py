@@ -95,6 +95,9 @@ def read(path: Path, _: Hints) -> list[Table]:
     if path.is_file():
         with path.open("rb") as stream:
             first = stream.read(len(_ROS_1)) == _ROS_1
+    names = "".join(map(str, [path] if path.is_file() else path.iterdir()))
+    if not first and set("%?#") & set(names):  # of a URI: rosbags makes one of a name as it is, and opens another file
+        raise UserError(f"{path}: rename it: a ROS 2 bag with '%', '?' or '#' in a name cannot be opened")
     topics: dict[tuple[str, str], Topic] = {}
     with (Reader1 if first else Reader2)(path) as bag:
         kinds = {one.id: one.msgtype for one in bag.connections}

@@ -16,10 +16,12 @@ from selfcal.base.limits import (
     BLOCK_BYTES,
     MOST_COLUMNS,
     MOST_GROWTH,
+    MOST_NUMBERS,
     MOST_UNPACKED_BYTES,
     MOST_UNPACKED_SMALL,
     reading,
 )
+from selfcal.logs.loaders.damage import SOUND, Damaged
 
 #: What the user states beside the file: `dbc`, the path of a CAN database.
 Hints = Mapping[str, str]
@@ -39,20 +41,25 @@ class Table:
     """Columns of one clock. `members` by heading: `name[unit]`, or a plain name whose unit `meta` has.
 
     `source`: the topic, message or group that it is, empty where a file has no parts. `notes`: what a reader of the
-    results must know of it.
+    results must know of it. `damaged`: what of the whole file could not be read.
     """
 
     source: str
     members: Mapping[str, Member]
     meta: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
+    damaged: Damaged = SOUND
 
 
 def of_arrays(
-    source: str, arrays: Mapping[str, NDArray[Any]], meta: Mapping[str, Any] | None = None, notes: tuple[str, ...] = ()
+    source: str,
+    arrays: Mapping[str, NDArray[Any]],
+    meta: Mapping[str, Any] | None = None,
+    notes: tuple[str, ...] = (),
+    damaged: Damaged = SOUND,
 ) -> Table:
     """The table of arrays [n] that are in memory."""
-    return Table(source, {name: in_memory(array) for name, array in arrays.items()}, meta or {}, notes)
+    return Table(source, {name: in_memory(array) for name, array in arrays.items()}, meta or {}, notes, damaged)
 
 
 def in_memory(array: NDArray[Any]) -> Member:
@@ -82,6 +89,14 @@ def content(path: Path) -> bytes:
 def room(data: bytes) -> int:
     """Bytes that a whole file may unpack to."""
     return min(MOST_UNPACKED_BYTES, max(MOST_UNPACKED_SMALL, MOST_GROWTH * len(data)))
+
+
+def check_numbers(path: Path, numbers: int) -> None:
+    """Raise UserError for more numbers than are read, or than a packed file of this size may hold."""
+    if numbers > MOST_NUMBERS:
+        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts")
+    if 8 * numbers > max(MOST_UNPACKED_SMALL, MOST_GROWTH * path.stat().st_size):
+        raise UserError(f"{path}: unpacks to more than {MOST_GROWTH} times its size, as no sensor's readings do")
 
 
 def inflated(path: Path, inflater: Any, data: bytes, most: int, before: int = 0) -> bytes:

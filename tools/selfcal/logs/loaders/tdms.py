@@ -13,18 +13,23 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.base.limits import MOST_NUMBERS
+from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import TIMES
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
+
+#: Bytes before a segment's content; the bit of its second number that says in which order the others' bytes are.
+_LEAD, _BIG_ENDIAN, _NEVER_ENDED = 28, 1 << 6, 2**64 - 1
 
 
 def read(path: Path, _: Hints) -> list[Table]:
     """The tables of a file. Raises UserError and what nptdms raises."""
     from nptdms import TdmsFile
 
+    damaged = _cut(path)
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
     clocks: dict[tuple[str, int], NDArray[Any]] = {}
     numbers = 0
-    with TdmsFile.open(path) as file:
+    with path.open("rb") as stream, TdmsFile.open(stream) as file:  # of a path it would read the _index beside it too
         for group in file.groups():
             for channel in group.channels():
                 numbers += len(channel)
@@ -48,6 +53,23 @@ def read(path: Path, _: Hints) -> list[Table]:
             columns["t[s]"] = clocks[key]
     longest = {group: max(size for of, size in tables if of == group) for group, _ in tables}
     return [
-        of_arrays(group if size == longest[group] else f"{group}:{size}", columns)
+        of_arrays(group if size == longest[group] else f"{group}:{size}", columns, damaged=damaged)
         for (group, size), columns in tables.items()
     ]
+
+
+def _cut(path: Path) -> Damaged:
+    """What the last segment states that is not there: nptdms reads what there is. A segment is 28 bytes, with the
+    length of what follows as the third number. Source: NI's description of TDMS."""
+    at, size = 0, path.stat().st_size
+    with path.open("rb") as stream:
+        while at < size:
+            stream.seek(at)
+            head = stream.read(_LEAD)
+            if len(head) < _LEAD or head[:4] != b"TDSm":
+                return Damaged(size - at, 1)
+            length = int.from_bytes(head[12:20], "big" if head[4] & _BIG_ENDIAN else "little")
+            if length == _NEVER_ENDED:  # the writer did not come to its end
+                return Damaged()
+            at += _LEAD + length
+    return Damaged(at - size, 1, at) if at > size else Damaged()

@@ -29,11 +29,12 @@ from selfcal.base.limits import (
     BLOCK_BYTES,
     LONGEST_HEADING,
     MOST_COLUMNS,
-    MOST_GROWTH,
     MOST_LEADING_LINES,
     MOST_NUMBERS,
+    MOST_TEXT_GROWTH,
     reading,
 )
+from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import RECEIVED
 
 #: Bytes of a file from which on reading it shows its progress.
@@ -122,6 +123,8 @@ class TextTable:
         self._separator = self._separated(header, self._batch[0], number)
         self._decimal: str | None = None
         self._skip_bad, self._skipped = skip_bad, list[int]()
+        #: Lines that were left out.
+        self.damaged = Damaged()
         #: With `skip_bad`, after `columns`: int64[n], the place of each row among the lines after the header.
         self.places: NDArray[np.int64] | None = None
         self._origin: datetime | None = None
@@ -197,6 +200,7 @@ class TextTable:
             if self._lines.unfinished and batch and batch[0].strip():
                 # A line that was cut within its last number would be taken for another value.
                 note(f"{self.path}: line {self._row + lines} has no line end and may be cut off: left out")
+                self.damaged += Damaged(len(batch[0]), 1)
                 break
             filled = len(batch)
             while filled and not batch[filled - 1].strip():
@@ -394,6 +398,7 @@ class TextTable:
                 if not self._skip_bad:
                     self._fail(row + number, None if bad.place is None else names[bad.place][1], bad.what)
                 self._skipped.append(row + number)
+                self.damaged += Damaged(len(line) + 1, 1)
                 if len(self._skipped) > _SKIPPED_LEAST + _SKIPPED_MOST * (row + number):
                     raise UserError(
                         f"{self.path}: line {self._row + row + number}: {len(self._skipped)} lines so far are no rows "
@@ -635,9 +640,9 @@ class _Lines:
                     self._text(self._carry)  # says so
                 raise UserError(f"{self.path}: line {self._next + 1}: longer than {BLOCK_BYTES:,} bytes")
             self._unpacked += len(block)
-            if self._packed and self._unpacked > MOST_GROWTH * self._packed + BLOCK_BYTES:
-                more = f"unpacks to more than {MOST_GROWTH} times its size"
-                raise UserError(f"{self.path}: {more}: no sensor's readings do")
+            if self._packed and self._unpacked > MOST_TEXT_GROWTH * self._packed + BLOCK_BYTES:
+                more = f"unpacks to more than {MOST_TEXT_GROWTH} times its size, as no sensor's readings do"
+                raise UserError(f"{self.path}: {more}: unpack it if you know it")
             if end:
                 lines = self._text(data[:end]).replace("\r\n", "\n").removesuffix("\n").split("\n")
                 if self.number == 0 == self._next:

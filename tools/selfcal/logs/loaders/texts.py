@@ -40,7 +40,10 @@ def texts_in(path: Path) -> list[Text]:
         return [Text(path, path.name)]
     found = []
     with reading(path, "not a whole zip file"), zipfile.ZipFile(path) as archive:
-        for info in archive.infolist():
+        listed = archive.infolist()
+        if sum(info.compress_size for info in listed) > path.stat().st_size:
+            raise ValueError("its members overlap")
+        for info in listed:
             name = PurePosixPath(info.filename)
             if name.suffix.lower() in TEXT and "meta" not in (part.lower() for part in name.parts[:-1]):
                 label = path / printable(info.filename)

@@ -6,7 +6,8 @@ one source, `sensor.0`; a FIFO topic holds several samples a message. The autopi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.logs.loaders.damage import Bytes, mapped, sifted
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 Columns = dict[str, NDArray[Any]]
+#: Bytes before the first message, the kinds of messages, and bytes of the types of fields.
+_HEADER, _KINDS = 16, b"BFIMPQARDLCSO"
+_TYPES = {b"float": 4, b"double": 8, b"bool": 1, b"char": 1} | {
+    f"{sign}int{bits}_t".encode(): bits // 8 for sign in ("", "u") for bits in (8, 16, 32, 64)
+}
 #: Topics that are read, and the source that each belongs to.
 _SOURCES = {
     "sensor_gyro_fifo": "sensor_fifo",
@@ -32,7 +39,10 @@ def read(path: Path, _: Hints) -> list[Table]:
     """The tables of a ULog file. Raises UserError and what pyulog raises."""
     from pyulog import ULog
 
-    log = ULog(str(path), [*_SOURCES, "sensor_selection"])
+    with mapped(path) as data:
+        damaged, sound = sifted(data, _HEADER, _ends(data))
+    with path.open("rb") if sound is None else BytesIO(sound) as stream:
+        log = ULog(stream, [*_SOURCES, "sensor_selection"])
     found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
     order = list(_SOURCES)
     for one in sorted((one for one in log.data_list if one.name in _SOURCES), key=lambda one: order.index(one.name)):
@@ -46,8 +56,48 @@ def read(path: Path, _: Hints) -> list[Table]:
     tables = []
     for (source, instance), topics in found.items():
         name = source if source == "sensor_combined" else f"{source}.{instance}"
-        tables += [of_arrays(name, _columns(topic, data), meta, notes) for topic, data in topics.items()]
+        tables += [of_arrays(name, _columns(topic, data), meta, notes, damaged) for topic, data in topics.items()]
     return tables
+
+
+def _ends(data: Bytes) -> Callable[[int], int]:
+    """Where the message at a place ends. pyulog takes one of any kind and length, and passes by what follows.
+
+    A message is its length, its kind, and so many bytes. One of a topic (D) begins with the number of a subscription
+    (A), and has the fields of a format (F). Source: PX4's description of ULog."""
+    formats: dict[bytes, bytes] = {}
+    lengths: dict[bytes, tuple[int, int]] = {}
+
+    def end_of(at: int) -> int:
+        length, kind, end = int.from_bytes(data[at : at + 2], "little"), data[at + 2 : at + 3], 0
+        if kind and kind in _KINDS and 0 < length <= len(data) - at - 3:
+            end = at + 3 + length
+        if end and kind == b"D":
+            return end if length in lengths.get(data[at + 3 : at + 5], ()) else 0
+        if end and kind == b"F":
+            name, _, fields = data[at + 3 : end].partition(b":")
+            formats[name] = fields
+        elif end and kind == b"A":
+            lengths[data[at + 4 : at + 6]] = _lengths(data[at + 6 : end], formats, {})
+        return end
+
+    return end_of
+
+
+def _lengths(name: bytes, formats: Mapping[bytes, bytes], known: dict[bytes, tuple[int, int]]) -> tuple[int, int]:
+    """Bytes of a topic's message with its number: without the padding at its end, and with it."""
+    if name in known:
+        return known[name]
+    known[name] = 0, 0  # a format that has itself
+    bare = whole = 2
+    for part in formats.get(name, b"").rstrip(b";").split(b";"):
+        kind, _, label = part.strip().partition(b" ")
+        kind, _, count = kind.partition(b"[")
+        size = _TYPES[kind] if kind in _TYPES else _lengths(kind, formats, known)[1] - 2
+        whole += size * (int(count[:-1]) if count[:-1].isdigit() else 1)
+        bare = bare if label.startswith(b"_padding") else whole
+    known[name] = bare, whole
+    return known[name]
 
 
 def _columns(topic: str, data: Mapping[str, NDArray[Any]]) -> Columns:

@@ -2,12 +2,15 @@
 
 A record within the limits keeps the model's priors. So does one that moved: its readings show motion, not the sensor.
 The limits depend on the recording and the model alone, so that every verb and every target has the same.
+
+First N, the drift and the level are compared with the limits by Allan deviations. Then a bank shows on which ends the
+posteriors of the laws lean (`leaning`): a walk below the least K has no other sign. Those limits move along.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
@@ -15,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.bank.result import AxisResult
 from selfcal.base.errors import UserError
-from selfcal.logs.recording import Recording
+from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Gate, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.readings.rest import BIAS_SD, rest_of
@@ -29,6 +33,8 @@ NARROW = 10.0
 OUTSIDE_SD, MEDIAN_SD = 2.0, 1.2
 #: Its drift is outside where the deviation over some time is above all that the priors allow by so much.
 DRIFT_ABOVE = 1.5
+#: Means are the same that differ by less than this share of the largest: differences of a counter are rounded so.
+SAME = 1e-10
 #: Differences of neighbouring means that show a deviation.
 FEWEST, FEWEST_OF_DRIFT = 8, 24
 #: Median of the square of a normal value over its variance.
@@ -37,6 +43,20 @@ MEDIAN_SQUARE = 0.4549364
 MARKOV_PEAK = 0.62
 #: A level is so many sd of the bias that is laid for it.
 LEVEL_SD = 2.0
+#: A posterior leans on an end that lies within two of its deviations of its median: this share of the way from the
+#: median to the nearer quantile is left to the end. The farther quantile is within a factor of e of it: beyond that the
+#: record leaves the parameter open, and its prior holds it.
+LEANS_LEFT, LEANS_WITHIN = 0.2, 1.0
+#: Limits that a posterior leans on move by this share of their width, so many times at most.
+LEANS_MOVE, LEANS_MOST = 2.0 / 3.0, 4
+#: Nats by which a law must gain: of records that a model's limits hold, at most 1 in 20 gain so much (Markov's bound).
+LEANS_GAIN = math.log(20.0)
+#: A law counts from this probability on.
+LEANS_LAW = 0.01
+#: Bank intervals at most on which leaning is looked for.
+LEANS_INTERVALS = 20_000
+#: What a record cannot tell from nothing: K and sigma_m below so many N / T and N / sqrt(T), alpha below 1 / T.
+UNSEEN = 0.5
 #: The gate starts from so many times the noise: default.yaml has two to six.
 GATE_NOISE = 3.0
 #: What the JSON has of an axis's priors.
@@ -66,24 +86,32 @@ def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model
     for name in axes:
         with suppress(UserError):  # of another kind, or without a sample: said where the axis is read
             group, seen = model.group_of(name), at_rest(recording, name, model)
-            if seen is not None:
-                own[name] = about(group, seen)
+            if seen is None or known(group):
+                continue
+            laid_out = about(group, seen) if outside(group, seen) else dict(group.priors)
+            moved = moved_along(model, recording, name, laid_out, seen)
+            if moved != group.priors:
+                own[name] = moved
                 noise[group.name] = max(noise.get(group.name, 0.0), GATE_NOISE * seen.N)
-    if not own:
-        return model
+    return replace(_with_own(model, own), gate=_gate(model.gate, noise)) if own else model
+
+
+def _with_own(model: Model, own: Mapping[str, Mapping[str, Prior]]) -> Model:
+    """The model with own priors of axes, by name."""
     groups = tuple(
         replace(group, own_priors={**group.own_priors, **{name: own[name] for name in group.axes if name in own}})
         for group in model.groups
     )
-    return replace(model, groups=groups, gate=_gate(model.gate, noise))
+    return replace(model, groups=groups)
 
 
 def add_sources(document: Mapping[str, Any], model: Model, changed: Model) -> None:
-    """State in each axis of a document where its priors are from; `changed`: the model by `for_record`."""
+    """State in each axis of a document where its priors are from, and its own; `changed`: the model by `for_record`."""
     for name, axis in document["axes"].items():
         if "error" not in axis:
-            same = model.group_of(name).priors == changed.group_of(name).priors
-            axis["priors"] = OF_MODEL if same else OF_RECORD
+            before, after = (of.group_of(name).priors for of in (model, changed))
+            own = {key: prior_tree(prior) for key, prior in after.items() if prior != before.get(key)}
+            axis.update({"priors": OF_RECORD, "own_priors": own} if own else {"priors": OF_MODEL})
 
 
 def state_own(tree: dict[str, Any], model: Model) -> None:
@@ -113,11 +141,12 @@ def _gate(gate: Gate | None, noise: Mapping[str, float]) -> Gate | None:
 
 
 def at_rest(recording: Recording, name: str, model: Model) -> Seen | None:
-    """An axis that rested outside the priors of its group; None for one inside, or one that moved out of them."""
+    """An axis as it rested: motion counts where it takes the axis out of the priors. None if that leaves too little, or
+    nothing outside them."""
     group, own = model.group_of(name), recording.along(name)
     seen = seen_of(own, name, model)
     if seen is None or not outside(group, seen):
-        return None
+        return seen
     rest = rest_of(own, [axis for axis in model.axes if axis in own.columns])
     if not rest.moved:
         return seen
@@ -156,6 +185,7 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             mean = total[whole] / size[whole]
             level = level if tau else float(np.median(mean))
             step = np.diff(mean)[np.diff(place[whole]) == 1]
+            step[np.abs(step) < SAME * np.abs(mean).max()] = 0.0
             if step.size < (FEWEST_OF_DRIFT if tau else FEWEST):
                 break
             square = step * step
@@ -171,11 +201,16 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     return Seen(level, np.array(tau), np.array(deviations), np.array(counts))
 
 
+def known(group: Group) -> bool:
+    """Whether the limits of N are knowledge of the part."""
+    return group.priors["N"].max < NARROW * group.priors["N"].min
+
+
 def outside(group: Group, seen: Seen) -> bool:
     """Whether a resting axis lies outside the priors of its group: its noise, its drift or its level. Never of a group
     whose N is known."""
     N = group.priors["N"]
-    if N.max < NARROW * N.min:
+    if known(group):
         return False
     margin = math.exp(OUTSIDE_SD * MEDIAN_SD / math.sqrt(float(seen.differences[0])))
     beyond = not N.min / margin <= seen.N <= N.max * margin
@@ -216,6 +251,104 @@ def laid(
             most = max(scale * prior.max, DRIFT_MARGIN * (reach or {}).get(key, 0.0))
             own[key] = _limits(prior.law, scale * prior.min, most)
     return {**priors, **own}
+
+
+def moved_along(
+    model: Model, recording: Recording, name: str, priors: dict[str, Prior], seen: Seen
+) -> dict[str, Prior]:
+    """The `priors` of an axis with the limits moved that a posterior leans on. As they are where none does, or where no
+    law gains by it.
+
+    The laws are those of one drift term, without regressors, on the means of LEANS_INTERVALS intervals at most."""
+    recording = recording.along(name)
+    length_s = recording.duration_s
+    least = _unseen(seen, length_s)
+    if not _may_lean(priors, seen, least):
+        return priors
+    from selfcal.bank.library import Bank
+    from selfcal.model.tables import make_tables
+    from selfcal.readings.readings import look
+
+    plain = {law: weight for law, weight in model.hypotheses.items() if not model.laws[law].is_sum}
+    readings = look(recording, name, replace(model.group_of(name), priors=priors))
+    own, rate_hz = readings.recording, min(model.bank_rate_hz, LEANS_INTERVALS / length_s)
+    offset = float(np.nanmedian(readings.working))
+    samples = as_float(readings.working - offset)[:, None]
+
+    def report(chosen: Mapping[str, Prior]) -> AxisResult:
+        changed = replace(_with_own(model, {name: chosen}), hypotheses=plain, regressors=())
+        bank = Bank(make_tables(changed, own.rate_hz, (name,), bank_rate_hz=rate_hz), offset=offset)
+        bank.push(samples, own.missing_before)
+        return bank.report(0)
+
+    first = found = report(priors)
+    moved, gaining = priors, priors != model.group_of(name).priors  # only the model's own have to be outdone
+    for _ in range(LEANS_MOST):
+        further = {key: _moved(key, moved[key], end, least) for key, end in leaning(found, moved).items()}
+        further = {key: prior for key, prior in further.items() if prior != moved[key]}
+        if not further:
+            break
+        moved = {**moved, **further}
+        found = report(moved)
+        gaining = gaining or _gains(first, found, [key for key, prior in moved.items() if prior != priors[key]])
+    return moved if gaining else priors
+
+
+def leaning(found: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
+    """The parameters whose posterior under a law leans on an end of its prior: -1 the lower, 1 the upper one."""
+    ends: dict[str, int] = {}
+    for estimates in found.parameters.values():
+        for key, one in estimates.items():
+            prior = priors[key]
+            if key in RATIOS or not prior.law.endswith("uniform") or not one.q05 > 0.0:
+                continue
+            for end, near, far in (
+                (-1, one.q05 / prior.min, one.q95 / prior.min),
+                (1, prior.max / one.q95, prior.max / one.q05),
+            ):
+                middle = one.median / prior.min if end < 0 else prior.max / one.median
+                left = math.log(max(near, 1.0))
+                if left < LEANS_LEFT * (math.log(middle) - left) and math.log(far) < LEANS_WITHIN:
+                    ends[key] = end
+    return ends
+
+
+def _gains(first: AxisResult, found: AxisResult, moved: Collection[str]) -> bool:
+    """Whether limits `moved` are the record's own: a law that counts gains by them. Of a law whose alpha moved the sum
+    of all laws must gain: as alpha falls it becomes a walk, which may be one of them."""
+    gain = {law: found.log_evidence[law] - before for law, before in first.log_evidence.items()}
+    whole = [float(np.logaddexp.reduce(list(one.log_evidence.values()))) for one in (first, found)]
+    return whole[1] > whole[0] + LEANS_GAIN or any(
+        gain[law] > LEANS_GAIN and found.probability[law] > LEANS_LAW
+        for law, estimates in found.parameters.items()
+        if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
+    )
+
+
+def _unseen(seen: Seen, length_s: float) -> dict[str, float]:
+    """Of each parameter of a drift what the record cannot tell from nothing."""
+    size = UNSEEN * seen.N / math.sqrt(length_s)
+    return {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
+
+
+def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float]) -> bool:
+    """Whether the record may show more than the priors hold: what it cannot tell lies well below a least, or the drift
+    comes near a most."""
+    below = any(math.e * least[key] < prior.min for key, prior in priors.items() if key in least)
+    reach = float(seen.deviation[-1]) * math.sqrt(3.0 / float(seen.tau_s[-1]))
+    return below or reach > 0.5 * priors["K"].max
+
+
+def _moved(key: str, prior: Prior, end: int, least: Mapping[str, float]) -> Prior:
+    """A prior of the same width, moved towards an end, but to no size that the record cannot tell, and to no drift that
+    is white noise to the bank."""
+    if key == "alpha" and end > 0:
+        return prior
+    width = prior.max / prior.min
+    low = prior.min * width ** (end * LEANS_MOVE)
+    if end < 0:
+        low = min(prior.min, max(low, least.get(key, 0.0)))
+    return _limits(prior.law, low, low * width) if low != prior.min else prior
 
 
 def _limits(law: str, low: float, high: float) -> Prior:

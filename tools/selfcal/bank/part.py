@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 import yaml
 
+from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError, note, remark, short
 from selfcal.base.units import SENSORS, factor, parameter_unit
 from selfcal.logs.recording import Recording
 from selfcal.model.file import LONGEST_TEXT, Group, Model, Prior
-from selfcal.readings.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
 from selfcal.readings.readings import Readings, look
 from selfcal.readings.rest import rest_of
 

@@ -1,19 +1,22 @@
-"""Logs of frames: written by python-can's loggers, and read back as if the module sent them now."""
+"""Logs of frames, read as if the module sent them now."""
 
 from __future__ import annotations
 
+import base64
+import json
 import logging
 import math
 import re
 import struct
 import time
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO, cast
+from typing import TYPE_CHECKING, Any, TextIO
 
-from selfcal.base.errors import UserError
-from selfcal.wire.streams import McapFrames, McapLog
+from selfcal.base.errors import UserError, install
+from selfcal.logs.loaders.damage import SOUND, Damaged
 
 if TYPE_CHECKING:
     import can
@@ -23,14 +26,13 @@ WRITTEN = (".asc", ".blf", ".csv", ".log", ".mcap", ".trc")
 #: Those that are no text.
 BINARY = (".blf", ".mcap")
 
-#: Of Vector's BLF: size of the file's header, then an object's signature, size and kind; a container's own header.
-BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL"), struct.Struct("<4s4xLL")
+#: Of Vector's BLF: sizes of the file's header and of the file, then an object's signature, size and kind; a
+#: container's own header.
+BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL8xQ"), struct.Struct("<4s4xLL")
 BLF_CONTAINER, BLF_CONTAINER_HEAD, BLF_ZLIB = 10, 16, b"\x02\x00"
 #: Bytes that a container may unpack to; python-can and Vector write 128 KB.
 BLF_CONTAINER_MAX = 16 << 20
 
-#: s that a frame may wait on its way to the disk: what a killed monitor loses.
-FLUSH_S = 1.0
 
 #: A line of `candump` without -l, and the first line of the CSV files of GVRET and SavvyCAN.
 CANDUMP = re.compile(
@@ -60,71 +62,6 @@ class _NoFrame(ValueError):
     """A place of a log that is no frame, in words."""
 
 
-class FrameWriter:
-    """A new log of frames; its name's suffix chooses python-can's format, or MCAP, which takes the reports too. An
-    older log is never written over.
-
-    What a kill leaves is a log up to FLUSH_S before.
-    """
-
-    def __init__(self, path: Path | str) -> None:
-        import can
-
-        self.path = Path(path)
-        check_suffix(path)
-        try:
-            if self.path.is_file() and self.path.stat().st_size:
-                raise UserError(f"{path}: this log exists, and is not written over: delete it or give another name")
-            mcap = self.path.suffix.lower() == ".mcap"
-            self._writer = cast(Any, McapLog(self.path.open("wb")) if mcap else can.Logger(str(path)))
-            self._writer.file.flush()
-        except OSError as error:
-            raise UserError(f"{path}: cannot be written: {error.strerror or error}") from error
-        self._flushed = time.monotonic()
-        self._due = False
-
-    def write(self, frame: can.Message) -> None:
-        """Add a frame. Raises UserError where the disk is full."""
-        self._do(lambda: self._writer(frame))
-        self._due = True
-
-    def report(self, report: Mapping[str, Any], at_s: float) -> None:
-        """Add what streams.content() made of a report that came at `at_s`, where the format has a place for it."""
-        if isinstance(self._writer, McapLog):
-            self._do(lambda: self._writer.send(report, at_s))
-            self._due = True
-
-    def keep(self) -> None:
-        """Bring the frames to the file once FLUSH_S has passed. To be called from time to time."""
-        if self._due and time.monotonic() - self._flushed >= FLUSH_S:
-            self._flushed, self._due = time.monotonic(), False
-            self._do(self._flush)
-
-    def _flush(self) -> None:
-        block = getattr(self._writer, "_flush", None)  # python-can gathers 128 KB of a .blf
-        if block is not None:
-            block()
-        self._writer.file.flush()
-
-    def _do(self, what: Callable[[], None]) -> None:
-        try:
-            what()
-        except OSError as error:
-            raise UserError(f"{self.path}: cannot be written: {error.strerror or error}") from error
-
-    def __enter__(self) -> FrameWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._do(self._writer.stop)
-
-
-def check_suffix(path: Path | str) -> None:
-    """Raise UserError for a name that chooses no format."""
-    if Path(path).suffix.lower() not in WRITTEN:
-        raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
-
-
 class FrameLog:
     """The frames of a log, `speed` times as fast as they came; None: as fast as they are read.
 
@@ -148,8 +85,7 @@ class FrameLog:
         if not self.path.is_file():
             missing = "there is no such file" if not self.path.exists() else "this is no file"
             raise UserError(f"{path}: cannot read the frame log: {missing}")
-        if self.path.suffix.lower() == ".blf":
-            _check_blf(self.path)
+        self._unread = _check_blf(self.path) if self.path.suffix.lower() == ".blf" else SOUND
         try:
             suffix = self.path.suffix.lower()
             self._lines = None if suffix in BINARY else _Lines(self.path)
@@ -158,7 +94,7 @@ class FrameLog:
                 if self._lines is not None
                 else McapFrames(self.path)
                 if suffix == ".mcap"
-                else can.LogReader(self.path)
+                else can.BLFReader(self.path)
             )
             self._frames: Iterator[can.Message] = iter(self._reader)
             self._waiting = self._next()
@@ -170,6 +106,15 @@ class FrameLog:
                 lines = f"{self.malformed} line{'s' if self.malformed > 1 else ''}"
                 raise UserError(f"{path}: no frame log as python-can writes it: there is no frame in its {lines}")
             raise UserError(f"{path}: there is no frame in this log")
+
+    @property
+    def damaged(self) -> Damaged:
+        """What could not be read so far: lines of a text; at the end of a binary log what is after its first damage."""
+        if self._lines is not None:
+            return Damaged(self._lines.malformed_bytes, max(self.malformed, int(bool(self.damage))))
+        if self._unread or not self.damage:
+            return self._unread
+        return Damaged(self.path.stat().st_size - self._reader.file.tell(), 1)
 
     @property
     def malformed(self) -> int:
@@ -186,7 +131,8 @@ class FrameLog:
         if wait > timeout:
             time.sleep(timeout)
             return None
-        time.sleep(wait)
+        if wait > 0.0:
+            time.sleep(wait)  # of 0 s it takes 0.2 ms
         self._due = None
         self._last_s = frame.timestamp
         try:
@@ -194,8 +140,8 @@ class FrameLog:
         except Exception as error:
             self._waiting, self.damage = None, self._said(error)
         self.closed = self._waiting is None
-        if self.closed and not self.damage and _is_cut(self.path):
-            self.damage = "its last line is cut off"
+        if self.closed and not self.damage and (self._unread or _is_cut(self.path)):
+            self.damage = self._unread.words if self._unread else "its last line is cut off"
         return frame
 
     def _next(self) -> can.Message | None:
@@ -267,7 +213,7 @@ class _Lines:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self.malformed = 0
+        self.malformed = self.malformed_bytes = 0
         self._suffix = path.suffix.lower()
         self._passed = PASSED.get(self._suffix)
         self._file: TextIO = path.open(encoding="utf-8", errors="replace")
@@ -308,8 +254,10 @@ class _Lines:
 
     def _judge(self) -> None:
         """Count the last line if it is damaged."""
-        line, self._line = self._line.strip(), ""
-        self.malformed += bool(line) and not (self._passed is not None and self._passed.match(line))
+        size, line, self._line = len(self._line), self._line.strip(), ""
+        if line and not (self._passed is not None and self._passed.match(line)):
+            self.malformed += 1
+            self.malformed_bytes += size
 
     def close(self) -> None:
         self._file.close()
@@ -385,41 +333,49 @@ def _message(stamp: str, identifier: str, extended: bool, length: int, data: lis
     )
 
 
-def _check_blf(path: Path) -> None:
-    """Raises UserError for a BLF file on which python-can's reader would take all memory, or go round for ever.
+def _check_blf(path: Path) -> Damaged:
+    """What python-can's reader would pass by: it takes what a container that is cut off, or of which zlib finds the
+    checksum not to fit, holds up to there, and does not look for the end that the header states. Raises UserError for a
+    BLF file on which it would take all memory, or go round for ever.
 
     A file is a header and objects; an object's header tells its size, and a container holds objects, packed by zlib.
     """
+    damaged = SOUND
     with path.open("rb") as file:
         left = path.stat().st_size
         start = file.read(BLF_HEADER.size)
-        header = BLF_HEADER.unpack(start)[1] if len(start) == BLF_HEADER.size else 0
+        _, header, whole = BLF_HEADER.unpack(start) if len(start) == BLF_HEADER.size else (b"", 0, 0)
         if header > left:
             raise UserError(f"{path}: no frame log: its header is cut off")
         file.seek(max(header, len(start)))
         tail = b""
         while len(head := file.read(BLF_OBJECT.size)) == BLF_OBJECT.size:
             signature, size, kind = BLF_OBJECT.unpack(head)
-            if signature != b"LOBJ" or not BLF_OBJECT.size <= size <= left:
-                return  # python-can stops there
-            body = file.read(size - BLF_OBJECT.size)
+            if signature != b"LOBJ" or size < BLF_OBJECT.size:
+                break  # python-can stops there, and says so
+            body = file.read(min(size, left) - BLF_OBJECT.size)
             file.seek(size % 4, 1)
             if kind == BLF_CONTAINER:
-                tail = _check_objects(path, tail + _unpacked(path, body))
+                data, sound = _unpacked(path, body)
+                tail = _check_objects(path, tail + data)
+                if not sound or len(body) < size - BLF_OBJECT.size:
+                    damaged += Damaged(len(head) + len(body), 1, left - damaged.whole)
+    return Damaged(whole - left, 1, whole) if whole > left else damaged
 
 
-def _unpacked(path: Path, body: bytes) -> bytes:
-    """What a container holds, as far as it can be unpacked."""
-    data = body[BLF_CONTAINER_HEAD:]
+def _unpacked(path: Path, body: bytes) -> tuple[bytes, bool]:
+    """What a container holds, as far as it can be unpacked, and whether that is all."""
+    data, sound = body[BLF_CONTAINER_HEAD:], True
     if body[:2] == BLF_ZLIB:
         packed = zlib.decompressobj()
         try:
             data = packed.decompress(data, BLF_CONTAINER_MAX + 1)
+            sound = packed.eof
         except zlib.error:
-            data = b""
+            data, sound = b"", False
     if len(data) > BLF_CONTAINER_MAX:
         raise UserError(f"{path}: a part of this frame log unpacks to more than {BLF_CONTAINER_MAX >> 20} MB")
-    return data
+    return data, sound
 
 
 def _check_objects(path: Path, data: bytes) -> bytes:
@@ -433,3 +389,51 @@ def _check_objects(path: Path, data: bytes) -> bytes:
             return data[at:]
         at += size
     return b""
+
+
+class McapFrames:
+    """The frames of a file that McapLog wrote, as python-can's readers give them. A record of more than LARGEST bytes
+    ends it."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+
+    def __iter__(self) -> Iterator[can.Message]:
+        import can
+        from mcap.records import Channel, Message
+        from mcap.stream_reader import StreamReader
+
+        frames: set[int] = set()
+        for record in StreamReader(self._file, emit_chunks=True, record_size_limit=LARGEST).records:
+            if isinstance(record, Channel) and record.topic == FRAMES:
+                frames.add(record.id)
+            elif isinstance(record, Message) and record.channel_id in frames:
+                told = json.loads(record.data)
+                data = base64.b64decode(told["data"], validate=True)
+                yield can.Message(
+                    timestamp=record.log_time * 1e-9,
+                    arbitration_id=int(told["id"]),
+                    is_extended_id=bool(told["extended"]),
+                    dlc=len(data),
+                    data=data,
+                    check=True,
+                )
+
+    def stop(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+
+def check_suffix(path: Path | str) -> None:
+    """Raise UserError for a name that chooses no format, or one whose library is not installed."""
+    if Path(path).suffix.lower() not in WRITTEN:
+        raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
+    if str(path).lower().endswith(".mcap") and find_spec("mcap") is None:
+        raise UserError(f"{path}: mcap is not installed: {install('selfcal[mcap]')}")
+
+
+#: Topic and schema of raw frames in an MCAP file, and the size of one record there at most.
+FRAMES = "/selfcal/frames"
+
+
+LARGEST = 1 << 16

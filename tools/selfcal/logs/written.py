@@ -1,0 +1,148 @@
+"""A recording as a table that reads back as it was: what `convert` writes.
+
+A row is an instant at which a clock has a sample. `meta` has `clocks`: of each the rate, the start and the columns.
+Where samples are missing, or a clock has not every row, a column `sample` has the place of each on the even grid. Where
+the row's stamp does not give it to the bit, a column `late` has each sample's stamp less the grid's, s. Of the second
+clock they are `sample_1` and `late_1`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError
+from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, MOST_COLUMNS, MOST_RATE_HZ
+from selfcal.logs.timebase import Clock
+
+if TYPE_CHECKING:
+    from selfcal.logs.recording import Recording
+
+Floats = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+#: Headings, without a unit, of the columns beside those of the recording.
+SAMPLE, LATE = "sample", "late"
+#: Stamps of several clocks closer than this, as a share of the fastest axes' interval, are one row.
+_ONE_ROW = 0.01
+#: What `meta` of the log says of the log's own table.
+_OF_TABLE = ("columns", "rows", "rate_hz")
+#: Seconds from the first row to a clock's start, at most: 30 000 years.
+_LATEST_S = 1e12
+
+
+@dataclass(frozen=True)
+class Laid:
+    """A recording for `save`: columns by name, the unit and float64[n], NaN without a sample; stamps float64[n], s."""
+
+    columns: Mapping[str, tuple[str, Floats]]
+    t: Floats
+    meta: Mapping[str, Any]
+
+
+def laid_out(recording: Recording) -> Laid:
+    """The table of a recording."""
+    of: dict[int, list[str]] = {id(None): []}
+    for name, one in recording.columns.items():
+        of.setdefault(id(one.clock), []).append(name)
+    clocks = [recording.clock_of(names[0]) for names in of.values()]
+    stamps = [one.time_s if one.off_grid_s is None else one.time_s + one.off_grid_s for one in clocks]
+    t, rows = _rows(stamps, _ONE_ROW / recording.rate_hz)
+
+    def cells(values: NDArray[Any], at: Rows) -> Floats:
+        full = np.full(t.size, np.nan)
+        full[at] = values
+        return full
+
+    at = {name: place for names, place in zip(of.values(), rows, strict=True) for name in names}
+    table = {name: (one.unit, cells(one.values, at[name])) for name, one in recording.columns.items()}
+    for ending, clock, own in zip(_endings(len(clocks)), clocks, rows, strict=True):
+        if len(clocks) > 1 or clock.missing_before.any():
+            table[SAMPLE + ending] = ("", cells(clock.place, own))
+        if clock.off_grid_s is not None and not np.array_equal(t[own] - clock.time_s, clock.off_grid_s):
+            table[LATE + ending] = ("", cells(clock.off_grid_s, own))
+    entries = [
+        {"columns": names, "rate_hz": one.rate_hz, "start_s": one.start_s, "stamped": one.off_grid_s is not None}
+        for names, one in zip(of.values(), clocks, strict=True)
+    ]
+    kept = {key: value for key, value in recording.meta.items() if key not in _OF_TABLE}
+    return Laid(table, t, {**kept, "clocks": entries, "started_s": recording.started_s, "notes": list(recording.notes)})
+
+
+def _endings(clocks: int) -> list[str]:
+    return ["", *(f"_{number}" for number in range(1, clocks))]
+
+
+def marks_of(meta: Mapping[str, Any]) -> set[str]:
+    """Headings of the columns beside the recording's in a table with this `meta`; none where it states no clocks."""
+    endings = _endings(len(meta["clocks"])) if stated(meta) else []
+    return {name + ending for ending in endings for name in (SAMPLE, LATE)}
+
+
+def stated(meta: Mapping[str, Any]) -> bool:
+    """Whether `meta` states the clocks of its table. No table has more of them than columns."""
+    return isinstance(meta.get("clocks"), list) and 0 < len(meta["clocks"]) <= MOST_COLUMNS
+
+
+def _rows(stamps: Sequence[Floats], near_s: float) -> tuple[Floats, list[Rows]]:
+    """Stamps of the rows, float64[n], s, and the rows of each clock's samples. Stamps of several clocks that are nearer
+    than `near_s` share a row; each sample of one clock has a row of its own."""
+    if len(stamps) == 1:
+        return stamps[0], [np.arange(stamps[0].size)]
+    time, clock = np.concatenate(stamps), np.repeat(np.arange(len(stamps)), [one.size for one in stamps])
+    order = np.argsort(time, kind="stable")
+    time, clock = time[order], clock[order]
+    group = np.cumsum(np.diff(time, prepend=-np.inf) >= near_s)
+    by = np.lexsort((clock, group))
+    begins = (np.diff(group[by], prepend=-1) != 0) | (np.diff(clock[by], prepend=-1) != 0)
+    turn = np.empty(time.size, np.int64)  # of each sample among those of its clock in a group
+    turn[by] = np.arange(time.size) - np.maximum.accumulate(np.where(begins, np.arange(time.size), 0))
+    _, first, row = np.unique(group * (turn.max() + 1) + turn, return_index=True, return_inverse=True)
+    t = time[first]
+    alone = np.bincount(group)[group] == np.bincount(group, turn == 0)[group]
+    ours = alone & (clock == 0)  # a row that holds no second sample of a clock has the first clock's stamp
+    t[row[ours]] = time[ours]
+    return t, [row[clock == number] for number in range(len(stamps))]
+
+
+def clocks_of(
+    path: object, meta: Mapping[str, Any], t: Floats, marks: Mapping[str, Floats], places: Rows | None
+) -> list[tuple[list[str], Clock, Rows]]:
+    """Of each clock that `meta` states the columns' names, the clock and the rows of its samples in a table with the
+    stamps `t` [n], s, and the columns `marks` beside the recording's. `places` [n]: lines of the rows, some of which
+    were skipped. Raises UserError."""
+    found = []
+    for number, (entry, ending) in enumerate(zip(meta["clocks"], _endings(len(meta["clocks"])), strict=True)):
+        mark = marks.get(SAMPLE + ending)
+        rows = np.arange(t.size) if mark is None else np.flatnonzero(np.isfinite(mark))
+        lines = rows if places is None else places - places[:1]
+        place = lines if mark is None else mark[rows]
+        late = marks.get(LATE + ending)
+        stamps = t[rows] if late is None else late[rows]
+        try:
+            names, rate, start = (
+                [str(name) for name in entry["columns"]],
+                float(entry["rate_hz"]),
+                float(entry["start_s"]),
+            )
+            sound = LEAST_RATE_HZ <= rate <= MOST_RATE_HZ and abs(start) < _LATEST_S and rows.size > 1
+            sound &= bool(place[0] >= 0 and place[-1] < LONGEST and (place == np.rint(place)).all())
+            sound &= bool((np.diff(place) > 0).all() and np.isfinite(stamps).all())
+            stamped = bool(entry["stamped"])
+        except (TypeError, KeyError, ValueError, OverflowError, IndexError):
+            sound = False
+        if not sound:
+            raise UserError(
+                f"{path}: meta: clock {number + 1} does not fit the table, which was changed: convert the log again, "
+                "or give --rate HZ"
+            )
+        at: Rows = np.asarray(place, np.int64)
+        clock = Clock(rate, np.diff(at, prepend=np.int64(-1)) - 1, start_s=start)
+        if stamped:
+            clock = Clock(rate, clock.missing_before, stamps - clock.time_s if late is None else stamps, start)
+        found.append((names, clock, rows))
+    return found
