@@ -22,10 +22,11 @@ import pytest
 from scipy.stats import binom
 
 from selfcal.base.errors import UserError
+from selfcal.base.options import parse_pairs
 from selfcal.logs.loaders import FORMATS, check_library, child, format_of
 from selfcal.logs.loaders.headings import parse_scales
 from selfcal.logs.loaders.table import Hints
-from selfcal.logs.recording import Recording, load, parse_pairs
+from selfcal.logs.recording import Recording, load
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.wire.frame_writer import FrameWriter
