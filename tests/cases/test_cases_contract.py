@@ -69,9 +69,9 @@ NOT_AGAIN: Mapping[tuple[str, str], str] = {
 }
 #: Forms that another one has as a case.
 CASES_OF = {"first_order": ("static", "lag", "rate")}
-#: Causes of which `make test` compares two records, a column and a law: `compare` identifies and diagnoses both. Nor
-#: does it ask all verbs of a written model that is the first one but for what `simulate` makes. `make cases` asks all.
-COMPARED = ("temperature", "colored_noise")
+#: `compare` and `fleet` identify and diagnose several records: `make test` asks them for this cause. Nor does it ask all
+#: verbs of a written model that is the first one but for what `simulate` makes. `make cases` asks all.
+SEVERAL = "supply"
 #: Both axes are asked for where a cause is one of both.
 BOTH = ("shared", "motion")
 
@@ -164,7 +164,7 @@ def test_every_verb_reads_what_one_wrote(cause: str, form: str, base: Path, tmp_
     trees = [yaml.safe_load(path.read_text(encoding="utf-8")) | {"name": "", "simulate": {}} for path in (base, model)]
     for verb, call in chain(logs, model, axes, tmp_path).items():
         same = trees[0] == trees[1] and verb not in ("diagnose", "simulate")
-        if not CASE_RECORDS and (same or (verb == "compare" and cause not in COMPARED)):
+        if not CASE_RECORDS and (same or (verb in ("compare", "fleet") and cause != SEVERAL)):
             continue
         said = REFUSED.get((cause, form), {}).get(verb)
         if said is None:
