@@ -69,8 +69,8 @@ NOT_AGAIN: Mapping[tuple[str, str], str] = {
 }
 #: Forms that another one has as a case.
 CASES_OF = {"first_order": ("static", "lag", "rate")}
-#: `compare` and `fleet` identify and diagnose several records: `make test` asks them for this cause. Nor does it ask all
-#: verbs of a written model that is the first one but for what `simulate` makes. `make cases` asks all.
+#: `compare` and `fleet` identify and diagnose several records: `make test` asks them for this cause. Nor does it ask
+#: all verbs of a written model that is the first one but for what `simulate` makes. `make cases` asks all.
 SEVERAL = "supply"
 #: Both axes are asked for where a cause is one of both.
 BOTH = ("shared", "motion")
