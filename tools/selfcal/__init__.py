@@ -11,6 +11,8 @@ from typing import Any
 #: File of each verb; it has a function of its name.
 VERBS = {path.stem: path for path in sorted((Path(__file__).parent / "verbs").glob("[a-z]*.py"))}
 
+#: What scripts take beside the verbs, and where it is.
+_OTHERS = {"load": "logs.recording", "save": "logs.recording", "UserError": "base.errors"}
 #: Lines of /proc/cpuinfo that tell of the first core.
 MOST_LINES = 100
 
@@ -19,6 +21,8 @@ def __getattr__(name: str) -> Any:
     """The verb called `name`, imported when it is first asked for so that the command starts at once."""
     if name in VERBS:
         return getattr(import_module(f"selfcal.verbs.{name}"), name)
+    if name in _OTHERS:
+        return getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
     if name == "_library32":
         globals()[name] = import_module(f"selfcal._library32{'_fma' if _fma() else ''}")
         return globals()[name]
@@ -41,4 +45,4 @@ def _fma() -> bool:
 
 
 def __dir__() -> list[str]:
-    return [*globals(), *VERBS, "__version__"]
+    return [*globals(), *VERBS, *_OTHERS, "__version__"]
