@@ -38,6 +38,8 @@ STAGES = (
     "studies",
     "verbs",
 )
+#: Files beside those folders.
+TOP = {"__init__.py", "__main__.py", "cli.py"}
 #: What the head of a verb's file may import, so that `selfcal VERB --help` answers at once.
 LIGHT = ("selfcal.base", "selfcal.logs.loaders", "selfcal.verbs._shared")
 #: Files whose lines a person writes.
@@ -146,12 +148,16 @@ def imports(package: Path) -> dict[str, dict[str, bool]]:
         }
         edges = found.setdefault(name, {})
         for node in ast.walk(tree):
-            if isinstance(node, ast.ImportFrom) and node.module is not None:
-                for one in node.names:
-                    module = f"{node.module}.{one.name}"
-                    module = module if module in files else node.module
-                    if module in files and module != name and id(node) not in typed:
-                        edges[module] = edges.get(module, False) or id(node) in head
+            modules: list[str] = []
+            if isinstance(node, ast.Import):
+                modules = [one.name for one in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                base = ".".join(name.split(".")[: -node.level]) if node.level else ""
+                base = ".".join(filter(None, (base, node.module)))
+                modules = [full if (full := f"{base}.{one.name}") in files else base for one in node.names]
+            for module in modules:
+                if module in files and module != name and id(node) not in typed:
+                    edges[module] = edges.get(module, False) or id(node) in head
     return found
 
 
@@ -168,6 +174,8 @@ def stages(found: Mapping[str, Mapping[str, bool]]) -> list[str]:
                 said.append(f"tools: {name} imports {other} at its head: import it in the function")
     folders = {path.name for path in (ROOT / "tools" / "selfcal").iterdir() if any(path.glob("*.py"))}
     said += [f"tools/selfcal/{name}: a folder that is no stage" for name in sorted(folders - set(STAGES))]
+    top = {path.name for path in (ROOT / "tools" / "selfcal").glob("*.py")}
+    said += [f"tools/selfcal/{name}: belongs into a folder" for name in sorted(top - TOP)]
     way = circle({name: set(edges) for name, edges in found.items()})
     return [*said, *([f"tools: files import each other in a circle: {' > '.join(way)}"] if way else [])]
 

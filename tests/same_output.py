@@ -1,4 +1,5 @@
-"""What the verbs print and write, into a folder: two trees behave alike where `diff -r` of their folders says nothing.
+"""What the verbs print and write, into a folder. Two trees behave alike where `diff -r` of their folders shows nothing
+but seconds, memory and paths (rivals, fleet.csv.parts).
 
     .venv/bin/python tests/same_output.py before        on one tree; `after` on the other, then: diff -r before after
 

@@ -1,4 +1,4 @@
-// A model's tables, as Python hands them over (engines/library.py, firmware.py). They live as long as C looks at them.
+// A model's tables, as Python hands them over (bank/library.py, firmware.py). They live as long as C looks at them.
 #ifndef TABLES_HPP
 #define TABLES_HPP
 

@@ -75,8 +75,9 @@ def install(what: str) -> str:
 def called() -> str:
     """The command as the user called it, so that a printed line runs when it is pasted."""
     name = sys.argv[0]
-    if Path(name).name == "cli.py":
-        return f"{shlex.quote(sys.executable)} -m selfcal.cli"
+    module = {"cli.py": "selfcal.cli", "__main__.py": "selfcal"}.get(Path(name).name)
+    if module is not None:
+        return f"{shlex.quote(sys.executable)} -m {module}"
     if Path(name).name != "selfcal" or shutil.which("selfcal") == name:
         return "selfcal"
     return printable(shlex.quote(name))

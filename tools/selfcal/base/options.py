@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from inspect import Parameter
 from typing import Any
 
 from selfcal.base.errors import UserError
 
+#: Default of an option that must be typed, although the function has one.
+REQUIRED = Parameter.empty
 #: Size of one LSB, with its unit unless the column's usual one is meant.
 Scale = tuple[float, str | None]
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from selfcal.base.errors import UserError
-from selfcal.base.options import argument, option
+from selfcal.base.options import REQUIRED, argument, option
 from selfcal.logs.loaders import READ, Reading
 from selfcal.verbs._shared import End, Start
 
@@ -20,7 +20,8 @@ def part(
         Sequence[Path | str], argument(f"Recording at rest: {READ}; or --datasheet alone", "[LOG...]", kind=list[Path])
     ] = (),
     output: Annotated[
-        Path | str, option("Model file to write", "-o", "--output", metavar="MODEL.yaml", show_default=False)
+        Path | str,
+        option("Model file to write", "-o", "--output", metavar="MODEL.yaml", default=REQUIRED, show_default=False),
     ] = "part.yaml",
     *,
     name: Annotated[str | None, option("Of the part; default: the recording's", metavar="NAME")] = None,

@@ -1,0 +1,5 @@
+"""`python -m selfcal`: the command."""
+
+from selfcal.cli import main
+
+main()
