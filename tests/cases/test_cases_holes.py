@@ -127,7 +127,7 @@ import sys
 from functools import partial
 from pathlib import Path
 sys.path[:] = {path!r}
-from selfcal import ending
+from selfcal.base import ending
 from selfcal.batch.spread import spread
 from test_cases_holes import slow
 ending.install()

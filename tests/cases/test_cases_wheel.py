@@ -96,7 +96,7 @@ import selfcal
 selfcal._fma = lambda: sys.argv[1] == "fma"
 from selfcal import _library32
 from selfcal.bank.library import Bank
-from selfcal.model import DEFAULT, Model
+from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import make_tables
 for name in ("default", "sums"):
     bank = Bank(make_tables(Model.load(DEFAULT.with_name(f"{name}.yaml")), 10.0, ("gx", "ay"), bank_rate_hz=10.0))

@@ -251,7 +251,7 @@ def test_user_errors_are_one_line(options: list[str], complaint: str) -> None:
 
 def test_a_command_goes_to_its_node() -> None:
     """And the answer of another node is none: here node 4 says what node 2 was asked."""
-    from selfcal.verbs import command
+    from selfcal.wire import command
 
     assert command.frame(bytes(8), 0).arbitration_id == 0x208
     assert command.frame(bytes(8), 2).arbitration_id == 0x208 + 2 * 128
@@ -272,7 +272,7 @@ def test_a_command_goes_to_its_node() -> None:
         thread.start()
         with wire.open_bus("virtual", "selfcal-nodes") as link:
             link.bus.send(command.frame(command.payload("challenge"), 2))
-            assert command._await(link, "challenge", 10.0, 1, 2) == 2
+            assert command.answer_in(link, "challenge", 10.0, 1, 2) == 2
         thread.join()
     assert heard[0].arbitration_id == 0x208 + 2 * 128
 

@@ -70,7 +70,8 @@ def laid_out(recording: Recording) -> Laid:
         for names, one in zip(of.values(), clocks, strict=True)
     ]
     kept = {key: value for key, value in recording.meta.items() if key not in _OF_TABLE}
-    return Laid(table, t, {**kept, "clocks": entries, "started_s": recording.started_s, "notes": list(recording.notes)})
+    notes = [note for note in recording.notes if note != recording.damaged.words]  # this file is sound
+    return Laid(table, t, {**kept, "clocks": entries, "started_s": recording.started_s, "notes": notes})
 
 
 def _endings(clocks: int) -> list[str]:
