@@ -60,6 +60,7 @@ AGAIN_FORMS = {("periodic", "band"), ("quantization", "dead band")}
 NOT_AGAIN: Mapping[tuple[str, str], str] = {
     ("vibration", "static"): "no simulated axis is shaken",
     ("vibration", "lag"): "no simulated axis is shaken",
+    ("periodic", "half the rate"): "the simulated line is a sine, which has no value at half the rate",
     ("rate_change", "half"): "the model is of the rate that the record has throughout",
     ("unexplained", "flat"): "it has no model",
     ("variance_change", "by temperature"): "the simulated noise level follows no channel",

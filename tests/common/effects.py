@@ -202,6 +202,12 @@ def _lines(hz: float, *sizes: float) -> Effect:
     return effect
 
 
+def alternating(d: Drawn) -> Truth:
+    """A line at half the rate: every other reading is higher."""
+    d.y["gx"] += 0.04 * d.sign * np.cos(math.pi * np.arange(d.n))
+    return {"frequency_hz": 0.5 / d.dt, "amplitude": 0.04}
+
+
 def band(d: Drawn) -> Truth:
     """A line whose phase wanders."""
     phase = (0.13 * d.random.standard_normal(d.n)).cumsum()
@@ -376,7 +382,12 @@ FORMS: Mapping[str, Mapping[str, Effect]] = {
     "pulse": {"pulse": pulse},
     "two_level": {"popcorn": two_level},
     "turn_on": {"one": _settles(0.3, 70.0), "two": _settles(0.5, 12.0, -0.25, 150.0)},
-    "periodic": {"line": _lines(0.043, 0.03), "harmonics": _lines(0.071, 0.05, 0.045, 0.04, 0.035), "band": band},
+    "periodic": {
+        "line": _lines(0.043, 0.03),
+        "harmonics": _lines(0.071, 0.05, 0.045, 0.04, 0.035),
+        "half the rate": alternating,
+        "band": band,
+    },
     "oscillation": {"damped": oscillation},
     "flicker": {"flicker": flicker},
     "colored_noise": {

@@ -337,6 +337,52 @@ def test_a_wide_band_is_no_harmonic(tmp_path: Path) -> None:
     assert set(square["harmonics"]) <= {3, 5, 7, 9, 11}
 
 
+@pytest.mark.parametrize(("n", "turns"), [(3000, 0.0), (3001, 0.0), (2600, 0.4), (2600, 1.2), (2600, 4.0)])
+def test_a_line_at_half_the_rate_or_beside_it(n: int, turns: float, tmp_path: Path) -> None:
+    """`turns` a record below half of 49 Hz: one line, and none is left beside the written model. Truth: as drawn."""
+    random = np.random.default_rng([77, n])
+    f, k = 24.5 - turns * 49.0 / n, np.arange(n)
+    y = -0.3 + 0.06 * random.standard_normal(n) + 0.035 * np.cos(2.0 * np.pi * f * k / 49.0 + 0.7 * (turns > 0.0))
+    save(tmp_path / "log.npz", {"gx": ("deg/s", y)}, 49.0)
+    written = tmp_path / "extended.yaml"
+    (finding,) = diagnose(tmp_path / "log.npz", axes=["gx"], write_model=written)["axes"]["gx"]["findings"]
+    assert finding["cause"] == "periodic"
+    for key, truth in (("frequency_hz", f), ("amplitude", 0.035)):
+        found = finding["estimate"][key]
+        assert abs(found["median"] - truth) < 4.0 * found["sd"]
+    # 4 turns: sine and cosine are orthogonal but for 1 part in 25, so the amplitude is as well known as anywhere.
+    if turns in (0.0, 4.0):
+        assert found["sd"] < 1.1 * 0.06 * math.sqrt((1.0 if turns == 0.0 else 2.0) / n)
+    again = diagnose(tmp_path / "log.npz", axes=["gx"], model=written)["axes"]["gx"]
+    assert again["verdict"] == "adequate" and not again["findings"]
+
+
+def test_a_harmonic_at_half_the_rate(tmp_path: Path) -> None:
+    """One reading of 4 is higher: 4 Hz and its second harmonic, and none beside the written model."""
+    random, k = np.random.default_rng(78), np.arange(1600)
+    y = 0.2 + 0.05 * random.standard_normal(k.size) + 0.2 * (k % 4 == 3)
+    save(tmp_path / "log.npz", {"gx": ("deg/s", y)}, 16.0)
+    written = tmp_path / "extended.yaml"
+    (finding,) = diagnose(tmp_path / "log.npz", axes=["gx"], write_model=written)["axes"]["gx"]["findings"]
+    assert finding["estimate"]["frequency_hz"]["median"] == pytest.approx(4.0, abs=1e-3)
+    assert finding["estimate"]["harmonics"] == [2]
+    again = diagnose(tmp_path / "log.npz", axes=["gx"], model=written)["axes"]["gx"]
+    assert again["verdict"] == "adequate" and not again["findings"]
+
+
+def test_a_stated_step_after_the_record_hides_no_turn_on(tmp_path: Path) -> None:
+    """Its column is 0 throughout. Truth: the decay as drawn."""
+    tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+    later = {"name": "later", "kind": "step", "time_s": 9000.0, "sd": {"gyro": 1.0}, "probability": 0.5}
+    (tmp_path / "model.yaml").write_text(yaml.safe_dump({**tree, "regressors": [later]}), encoding="utf-8")
+    t = np.arange(1500.0)
+    y = 0.1 * np.random.default_rng(79).standard_normal(t.size) + 0.6 * np.exp(-t / 90.0)
+    save(tmp_path / "log.npz", {"gx": ("deg/s", y)}, 1.0)
+    (finding,) = diagnose(tmp_path / "log.npz", axes=["gx"], model=tmp_path / "model.yaml")["axes"]["gx"]["findings"]
+    assert finding["cause"] == "turn_on"
+    assert abs(finding["estimate"]["tau_s"]["median"] - 90.0) < 4.0 * finding["estimate"]["tau_s"]["sd"]
+
+
 @pytest.mark.parametrize("seed", [3, 20])
 def test_two_jumps_are_told_apart(seed: int, tmp_path: Path) -> None:
     """Two jumps of much the same worth. Truth: their times; the interval of one holds nothing of the other."""

@@ -29,6 +29,8 @@ BEYOND = 100.0
 SAME = 1.0 - 1e-7
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
 SLOWEST = 0.99
+#: A stated line whose sine stays below this is at half the rate, where the sine is rounding of the frequency.
+ROUNDED_SINE = 0.01
 #: Keys of a regressor that are times of the recording.
 TIMES = ("time_s", "start_s", "end_s")
 
@@ -152,6 +154,8 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             entry = {key: getattr(one, key) for key in ("kind", *REGRESSORS[one.kind]) if key != "unit"}
             entry |= {key: entry[key] - recording.start_s for key in TIMES if key in entry}
             for column, row in zip(one.columns, values.T, strict=True):
+                if one.kind == "periodic" and np.abs(row).max() < ROUNDED_SINE:
+                    continue
                 about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.offset
                 found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
         return tuple(found)

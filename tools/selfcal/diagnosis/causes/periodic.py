@@ -16,7 +16,7 @@ from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, finish, fit, moved
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
-from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array
+from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array, Mask
 
 #: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
 TURNS_LEAST, BAND_TURNS = 1.5, 3.0
@@ -103,10 +103,26 @@ def _band(state: State, record: Record) -> list[Look]:
     ]
 
 
-def _spread(line: Fit, n: int) -> float:
+def columns(f: float, record: Record) -> dict[str, Array]:
+    """Sine and cosine of a frequency, each [n], by the ends of their names. At half the rate the sine has no value."""
+    turns = 2.0 * math.pi * np.mod(f * record.time_s, 1.0)
+    return {**({".sin": np.sin(turns)} if f < 0.5 * record.rate_hz else {}), ".cos": np.cos(turns)}
+
+
+def _power(f: float, t: Array, w: Array, there: Mask) -> float:
+    """What a line gains in white noise `w` [n], 0 where it is not `there`: least squares, as sine and cosine are not
+    orthogonal near half the rate, and one column at it."""
+    turn = np.exp(-2j * math.pi * np.mod(f * t, 1.0))
+    z, twice, n = complex(turn @ w), complex((turn[there] ** 2).sum()), float(there.sum())
+    room = n**2 - abs(twice) ** 2
+    if room < 1e-9 * n**2:
+        return 0.5 * abs(z) ** 2 / n
+    return (n * abs(z) ** 2 - (twice.conjugate() * z**2).real) / room
+
+
+def _spread(c: Array, sd: Array, duration_s: float) -> float:
     """Standard deviation of a line's frequency, Hz: pi^2 n T^2 A^2 / (3 s^2) of information, T the record's length."""
-    sd = float(np.mean(line.sd[-2:])) / max(math.hypot(*line.c[-2:]), 1e-300)
-    return sd * math.sqrt(12.0) / (2.0 * math.pi * n * line.dt)
+    return float(np.mean(sd)) / max(math.hypot(*c), 1e-300) * math.sqrt(12.0) / (2.0 * math.pi * duration_s)
 
 
 def ln_lines(n: int, gain: float) -> float:
@@ -120,67 +136,65 @@ def ln_lines(n: int, gain: float) -> float:
 def _line(state: State, record: Record) -> list[Look]:
     """The strongest line, refitted exactly at its best frequency."""
     n = state.y.size
-    w = np.nan_to_num(state.whitened)
-    padded = next_fast_len(4 * n, real=True)
-    power = np.abs(rfft(w, padded)) ** 2 / np.isfinite(state.y).sum()
+    w, there, t = np.nan_to_num(state.whitened), np.isfinite(state.y), record.time_s
+    padded = 2 * next_fast_len(2 * n, real=True)
+    power = np.abs(rfft(w, padded)) ** 2 / there.sum()
     frequency = np.arange(power.size) / (padded * state.dt)
-    low = TURNS_LEAST / (n * state.dt)
-    power[(frequency < low) | (frequency > 0.5 / state.dt - low)] = 0.0
+    low, half = TURNS_LEAST / (n * state.dt), 0.5 * record.rate_hz
+    power[frequency < low] = 0.0
+    beside = frequency > half - low
+    power[beside] = [_power(float(f), t, w, there) for f in frequency[beside]]
     at = int(np.argmax(power))
     if net(float(power[at]), 2, ln_lines(n, float(power[at]))) <= 0.0:
         return []
-    t = record.time_s
-
-    def columns(f: float) -> Array:
-        turns = 2.0 * math.pi * np.mod(f * t, 1.0)
-        return np.array([np.sin(turns), np.cos(turns)])
-
     width = 1.0 / (n * state.dt)
-
-    def cost(f: float) -> float:
-        turns = np.exp(-2j * math.pi * np.mod(f * t, 1.0))
-        return -float(np.abs(turns @ w) ** 2)
 
     from scipy.optimize import minimize_scalar  # a quarter of a second to import: for who has a line alone
 
-    f = float(
+    best = float(
         minimize_scalar(
-            cost,
-            bounds=(frequency[at] - 0.5 * width, frequency[at] + 0.5 * width),
+            lambda f: -_power(f, t, w, there),
+            bounds=(frequency[at] - 0.5 * width, min(frequency[at] + 0.5 * width, half)),
             method="bounded",
             options={"xatol": 1e-4 * width},
         ).x
     )
-    pair = columns(f)
-    gain, chosen = state.with_columns(pair)
-    if f < 30.0 / (n * state.dt):
+
+    def fitted(f: float) -> tuple[float, Array, float, Fit]:
+        pair = np.array([*columns(f, record).values()])
+        return f, pair, *state.with_columns(pair)
+
+    f, pair, gain, chosen = fitted(best)
+    if f > half - low:  # a line at half the rate also fits beside it, with a column and a frequency more than it needs
+        one = fitted(half)
+        if net(gain - one[2], 2) < NET_LEAST:
+            f, pair, gain, chosen = one
+    if f < 30.0 * width:
         gain = min(gain, state.rich_gain(pair))
-    worth = net(gain, 2, ln_lines(n, gain))
+    worth = net(gain, len(pair), ln_lines(n, gain))
     if worth < 1.0:
         return []
-    spread = _spread(chosen, n)
-    if worth >= NET_LEAST:
+    c, sd = chosen.c[-len(pair) :], chosen.sd[-len(pair) :]
+    spread = _spread(c, sd, n * state.dt)
+    if worth >= NET_LEAST and f < half:
         # The null's drift has swallowed a part of a line: the frequency is the likeliest beside the one that is left.
-        move = 0.5 * spread
-        gains = [finish(state.series.beside(columns(f + k * move)), chosen.terms, chosen.theta) for k in (-1, 0, 1)]
-        low, middle, high = (one.ln_likelihood for one in gains)
-        bend = 2.0 * middle - low - high
+        move = min(0.5 * spread, 0.25 * (half - f))
+        three = [np.array([*columns(f + k * move, record).values()]) for k in (-1, 0, 1)]
+        gains = [finish(state.series.beside(one), chosen.terms, chosen.theta).ln_likelihood for one in three]
+        bend = 2.0 * gains[1] - gains[0] - gains[2]
         if bend > 0.0:
             spread = move / math.sqrt(bend)
-            f += move * min(4.0, max(-4.0, 0.5 * (high - low) / bend))
-            pair = columns(f)
-    amplitude = interval(math.hypot(*chosen.c[-2:]), float(np.mean(chosen.sd[-2:])), state.unit)
+            f += move * min(4.0, max(-4.0, 0.5 * (gains[2] - gains[0]) / bend))
+            pair = np.array([*columns(f, record).values()])
+    amplitude = interval(math.hypot(*c), float(np.mean(sd)), state.unit)
 
     def measure(state: State) -> dict[str, Any]:
         weight, means, sds = (of[0] for of in state.posterior(pair))
-        return {"amplitude": mixture(weight, np.hypot(*means.T), sds.mean(axis=1), state.unit)}
+        return {"amplitude": mixture(weight, np.linalg.norm(means, axis=1), sds.mean(axis=1), state.unit)}
 
     name = f"line_{f:.6g}Hz"
     entry = {"kind": "periodic", "frequency_hz": f}
-    added = (
-        Regressor(f"{name}.sin", "periodic", pair[0], "1", entry),
-        Regressor(f"{name}.cos", "periodic", pair[1], "1", entry),
-    )
+    added = [Regressor(name + end, "periodic", one, "1", entry) for end, one in columns(f, record).items()]
     return [
         Look(
             "periodic",
@@ -248,14 +262,13 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     if not found:
         return after
     f = float(found[0].estimate["frequency_hz"]["median"])
-    t = record.time_s
-    turns = 2.0 * math.pi * np.mod(f * t, 1.0)
-    pair = {".sin": np.sin(turns), ".cos": np.cos(turns)}
+    pair = columns(f, record)
     known = {one.name for one in before.regressors}
     return replace(
         after,
         regressors=tuple(
-            one if one.name in known else replace(one, values=pair[one.name[-4:]]) for one in after.regressors
+            one if one.name in known else replace(one, values=pair.get(one.name[-4:], np.zeros(before.y.size)))
+            for one in after.regressors
         ),
     )
 

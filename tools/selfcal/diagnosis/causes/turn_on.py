@@ -18,7 +18,7 @@ from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, sho
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import Fit, Series, run
+from selfcal.likelihood.fit import Fit, Series, ln_det, run
 from selfcal.likelihood.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, mixture, net
 from selfcal.likelihood.statemodel import Array, Terms
 
@@ -86,11 +86,12 @@ def left(series: Series, terms: Terms, theta: Array, k: int) -> Left:
     known = len(sums.G) - k
     model, place = sums.G[1:known, 1:known], [0, *range(known, len(sums.G))]
     cross = sums.G[1:known][:, place]
-    G = sums.G[np.ix_(place, place)] - cross.T @ np.linalg.pinv(model, rcond=1e-12, hermitian=True) @ cross
+    inverse = np.linalg.pinv(model, rcond=1e-12, hermitian=True)
+    G = sums.G[np.ix_(place, place)] - cross.T @ inverse @ cross
     spent = np.diag(G) < 1e-9 * np.diag(sums.G)[place]  # a candidate that the model has
     spent[0] = False
     G[spent], G[:, spent] = 0.0, 0.0
-    return Left(G, sums.n, sums.D, sums.n - known + 1, float(np.linalg.slogdet(model)[1]))
+    return Left(G, sums.n, sums.D, sums.n - known + 1, -ln_det(inverse))
 
 
 def looks(state: State, record: Record) -> list[Look]:
