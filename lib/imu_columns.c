@@ -61,7 +61,7 @@ static void weigh_columns(selfcal_imu_t *imu, selfcal_wide_t odds) {
     const selfcal_model_t *model = imu->bank.model;
     const uint8_t axis = imu->report.axis;
     const selfcal_wide_t gain = odds + ln_evidence(model, &self->report_with) - self->ln_without;
-    const float probability = isfinite(gain) ? (float)(1.0 / (1.0 + exp(gain < -700.0 ? 700.0 : -gain))) : 0.0F;
+    const float probability = isnan(gain) ? 0.0F : (float)(1.0 / (1.0 + exp(gain < -700.0 ? 700.0 : -gain)));
     selfcal_widest_coefficients(&self->report_with, model, self->coefficients, probability, self->sent[axis]);
     if (probability > 0.5F) {
         imu->report = self->report_with;

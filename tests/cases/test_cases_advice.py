@@ -21,7 +21,10 @@ from advice import advised
 from numpy.typing import NDArray
 
 from selfcal.base import units
+from selfcal.base.errors import UserError
 from selfcal.logs.recording import load, save
+from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.replay import replay
 
 from conftest import SHARED_CASES, case_records, run, shared_case
 
@@ -170,15 +173,21 @@ def test_swapped_words_have_no_advice_of_a_rate(tmp_path: Path) -> None:
     assert not answer(log, "--decimate", "50")[1]
 
 
-@pytest.mark.parametrize("share", [0.6, 0.95])
-def test_most_readings_beyond_the_range(share: float, tmp_path: Path) -> None:
-    """The same of any damage: here a byte in the place of the sign's."""
-    values = white(21)
+@pytest.mark.parametrize(("share", "limit"), [(0.6, math.inf), (0.95, math.inf), (0.8, 0.5)])
+def test_most_readings_beyond_the_range(share: float, limit: float, tmp_path: Path) -> None:
+    """The same of any damage: here a byte in the place of the sign's. It is a share of all readings, also where the
+    others are clipped, and so few of them are left."""
+    values = np.minimum(white(21), limit)
     values[np.random.default_rng(3).random(ROWS) < share] *= 4096.0
-    said, axes = answer(headed("t[s],gx[deg/s]", TIME, values)(tmp_path))
+    log = headed("t[s],gx[deg/s]", TIME, values)(tmp_path)
+    said, axes = answer(log)
     assert not axes
-    assert "of the readings are beyond the range" in said
+    line = f"{100.0 * float(np.mean(np.abs(values) > 300.0)):.0f} % of the readings are beyond the range of 300 deg/s"
+    assert line in said
     assert advised(said) == []
+    for verb in (diagnose, replay):  # of the same record the same line
+        with pytest.raises(UserError, match=line):
+            verb(log, axes=["gx"])
 
 
 def test_an_unknown_unit_of_the_temperature(tmp_path: Path) -> None:

@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import yaml
+from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.batch.plan import LEAST, Wish, _half_interval, coefficient_rows, rows_of
@@ -102,23 +104,61 @@ def test_the_information_is_that_of_known_cases() -> None:
 THERMAL = {"name": "warm", "kind": "column", "column": "temp", "unit": "degC", "reference": 20, "sd": {"gyro": 0.02}}
 
 
-@pytest.mark.parametrize(("name", "want"), [("walk", "warm within 10 %"), ("markov", "warm within 7 deg/h/degC")])
-def test_the_planned_swing_suffices(tmp_path: Path, name: str, want: str) -> None:
+#: Columns that are in proportion to the channel.
+FORMS: dict[str, dict[str, Any]] = {
+    "mean": {"window_s": 45.0},
+    "lag": {"form": "lag", "lag_s": 70.0},
+    "rate": {"kind": "rate", "window_s": 8.0, "sd": {"gyro": 2.0}},
+}
+
+
+def followed(form: str, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The column that readings [n] of a channel at 1 Hz make, at rest before the first, in numpy."""
+    if form == "lag":
+        column, at, keep = np.empty(z.size), float(z[0]), math.exp(-1.0 / 70.0)
+        for k in range(1, z.size):  # exact for a straight line between two readings
+            slope = z[k] - z[k - 1]
+            at = z[k] - 70.0 * slope + keep * (at - z[k - 1] + 70.0 * slope)
+            column[k] = at
+        column[0] = z[0]
+        return column
+    padded = np.concatenate([np.full(8, z[0]), z])
+    if form == "rate":
+        return np.asarray((z - padded[: z.size]) / 8.0)
+    sums = np.concatenate([[0.0], z.cumsum()])
+    last = np.arange(1, z.size + 1)
+    first = np.maximum(last - 45, 0)
+    return np.asarray((sums[last] - sums[first]) / (last - first)) if form == "mean" else z
+
+
+@pytest.mark.parametrize(
+    ("name", "want", "form"),
+    [
+        ("walk", "warm within 10 %", ""),
+        ("markov", "warm within 7 deg/h/degC", ""),
+        *(("walk", "warm within 10 %", form) for form in FORMS),
+    ],
+)
+def test_the_planned_swing_suffices(tmp_path: Path, name: str, want: str, form: str) -> None:
     """At the swing that is planned, of one sweep and of cycles, nine records of ten have the coefficient: the same
     shares of other records as for a length. A swing a tenth smaller is too small where records hardly differ. The
     closed form of the smallest variance, by the exact covariance of walk and white noise, needs less by a little."""
     records = case_records(60, 200)
     off = (0.1, 0.07) if records == 200 else (3.0 * math.sqrt(0.09 * 2 / records),) * 2
-    model = part(tmp_path, regressors=(THERMAL,), **PARTS[name][0])
+    thermal = THERMAL | FORMS.get(form, {})
+    if form == "rate":
+        del thermal["reference"]
+    model = part(tmp_path, regressors=(thermal,), **PARTS[name][0])
     document = plan(model, want=["N within 6 %", want], records=records)
     entry, loaded = document["wishes"][1], Model.load(model)
     samples = round(entry["duration_s"])
     assert document["duration_s"] == entry["duration_s"] == math.ceil(document["wishes"][0]["duration_s"])
     assert (entry["channel"], entry["unit"]) == ("temp", "degC")
-    most = 0.002 if name == "walk" else 7.0 / 3600.0
+    sd = thermal["sd"]["gyro"]
+    most = 0.1 * sd if name == "walk" else 7.0 / 3600.0
     assert entry["most"] == pytest.approx(most)
     swings = [one["swing"] for one in entry["cycling"]]
-    assert swings == sorted(swings, reverse=True)  # a drift hides slow changes more
+    assert swings == sorted(swings, reverse=True) or form in ("mean", "lag")  # a drift hides slow changes more
     for one in entry["cycling"]:
 
         def share(swing: float, cycles: float = one["cycles"]) -> float:
@@ -135,9 +175,9 @@ def test_the_planned_swing_suffices(tmp_path: Path, name: str, want: str) -> Non
         truth = PARTS[name][0]
         covariance = truth["K"] ** 2 * np.minimum.outer(at, at) + truth["N"] ** 2 * np.eye(samples)
         for one in entry["cycling"]:
-            z = 0.5 * one["swing"] * np.cos(2.0 * math.pi * one["cycles"] * (at + 0.5) / samples)
+            z = followed(form, 0.5 * one["swing"] * np.cos(2.0 * math.pi * one["cycles"] * (at + 0.5) / samples))
             design = np.stack([z, np.ones(samples)], axis=1)
-            least = np.linalg.inv(design.T @ np.linalg.solve(covariance, design) + np.diag([0.02**-2, 0.0]))[0, 0]
+            least = np.linalg.inv(design.T @ np.linalg.solve(covariance, design) + np.diag([sd**-2, 0.0]))[0, 0]
             assert 0.7 < 1.6449 * math.sqrt(least) / most <= 1.0
 
 
@@ -162,6 +202,26 @@ def test_wishes_that_are_none(tmp_path: Path) -> None:
         plan(model, want=["K within 20 %"], records=20)
     with pytest.raises(UserError, match="no law of"):
         plan(model, want=["B within 20 %"], records=20)
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        ({"form": "play", "width": 3.0}, "warm has `form: play`, which is not in proportion to temp: leave"),
+        ({"form": "square"}, "warm has `form: square`, which"),
+        ({"input": "variance"}, "warm has `input: variance`, which"),
+        ({"kind": "step", "time_s": 300.0}, "warm is of kind step, and has no channel that could be swung: leave"),
+        ({"sd": {"accel": 0.1}}, "gz has no regressor warm"),
+        ({"name": "warm_lag"}, "'bias within 0.001 deg/s', 'warm_lag within 10 %' or"),
+    ],
+)
+def test_a_coefficient_without_a_plan_has_its_reason(entry: dict[str, Any], said: str, tmp_path: Path) -> None:
+    whole = THERMAL | entry
+    if "kind" in entry:  # a step has none of a column's entries
+        whole = {key: whole[key] for key in ("name", "sd", *entry)}
+    model = part(tmp_path, regressors=(whole,), **PARTS["walk"][0])
+    with pytest.raises(UserError, match=re.escape(said)):
+        plan(model, want=["warm within 30 %"], records=4)
 
 
 def test_the_command(tmp_path: Path) -> None:

@@ -18,7 +18,6 @@ from selfcal.base import units
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
-from selfcal.readings.lattice import BELOW_LATTICE
 from selfcal.readings.readings import CLOCK_LEAST, Readings
 
 #: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
@@ -193,7 +192,7 @@ def with_readings(
     checks: dict[str, dict[str, Any]] = {}
     found = readings.lattice
     if found is not None:
-        told = {"value": found.coarseness, "limit": BELOW_LATTICE, "passed": not found.too_coarse_over(dt_s)}
+        told = {"value": found.coarseness, "limit": found.most, "passed": not found.too_coarse_over(dt_s)}
         white = {"counter_hz": found.white_hz} if found.carried and not told["passed"] else {}
         checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct, **white}
     if readings.clipped is not None:

@@ -27,7 +27,7 @@ from selfcal.model.file import Model
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
 from selfcal.model.tables import make_tables
 from selfcal.readings.gate import gated
-from selfcal.readings.readings import Readings, look
+from selfcal.readings.readings import Readings, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
 
 if TYPE_CHECKING:
@@ -104,6 +104,8 @@ def identify_axis(
     recording = recording.along(name)
     group, unit = model.group_of(name), recording.columns[name].unit
     regressors = offered(model, name)
+    if most := mostly_beyond(recording.in_unit(name, group.unit), group):
+        raise UserError(most)
     readings = look(recording, name, group)
     readings = readings.without([*moved, *moved_beside(recording, model, name, readings)])
     recording = readings.recording
@@ -112,8 +114,6 @@ def identify_axis(
     if readings.clipped is not None or readings.coarse > SPACING_LEAST:
         # What takes the place of clipped readings may lie beyond the range, and so may readings less an offset.
         beyond = np.abs(values) >= (group.range if readings.clipped is None and group.range > 0.0 else np.inf)
-        if beyond.all():
-            raise UserError(f"every reading is beyond the range of {group.range:g} {group.unit}: is the unit right?")
         values = np.where(beyond, np.nan, values)
         group = replace(group, range=0.0)
         tables = replace(tables, axes=(replace(tables.axes[0], range=0.0),))

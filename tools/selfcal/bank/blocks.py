@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.model.file import Group
 from selfcal.model.tables import Tables
+from selfcal.readings.readings import mostly_beyond
 
 #: Bank samples a report needs (SELFCAL_REPORT_MIN).
 REPORT_MIN = 3
 #: Averages that are too few where the rest of the readings, all but this share, are in averages of which most is lost.
 FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
-#: Share of readings beyond the range from which on the others are no readings of a sensor either.
-MOST_BEYOND = 0.5
 #: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
 MOST_DENSE = 10_000_000
 
@@ -64,12 +63,8 @@ def usable_blocks(
     found = f"{present.size} averages of {tables.dt_s:g} s"
     whole = float((tables.block / blocks.r[np.isfinite(blocks.mean)]).sum())
     each = int(np.isfinite(samples).sum())
-    beyond = blocks.kept_out.get("saturated", 0)
-    if beyond > MOST_BEYOND * each:
-        raise UserError(
-            f"{100.0 * beyond / each:.0f} % of the readings are beyond the range of {group.range:g} {group.unit}: is "
-            "the unit right, or are words of the log swapped or lost?"
-        )
+    if most := mostly_beyond(samples, group):
+        raise UserError(most)
     alone = f": --decimate {tables.block / tables.dt_s:.6g} takes each reading alone"
     if present.size < needed:
         more = alone if tables.block > 1 and each >= needed else ""

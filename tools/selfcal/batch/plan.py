@@ -6,7 +6,7 @@ identified. The length is the one at which SHARE of the records have what is
 wanted. The Fisher information of the spectrum says how that length changes with the rate.
 
 A wish of a regressor's coefficient asks for a swing of its channel in a record of that length. The channel follows a
-cosine of half a cycle (one sweep) or more. A cosine of amplitude A over n readings says n A^2 / (2 S) of the
+cosine of half a cycle (one sweep) or more. The column that it makes, of variance V over n readings, says n V / S of the
 coefficient, with S the spectrum at its frequency: that gives the swing, and the ensemble corrects it.
 """
 
@@ -35,7 +35,9 @@ from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.simulate import truth_of
 from selfcal.model.file import Model, Regressor
+from selfcal.model.forms import made
 from selfcal.model.laws import PLACES, Law
+from selfcal.model.regressors import channels_of, offered, sources_of
 from selfcal.model.tables import make_tables
 from selfcal.show.plot import COLORS
 
@@ -57,6 +59,8 @@ TINY = 1e-12
 _FEWEST = 8
 #: Cycles of a regressor's channel over the record: one sweep is half of one. Record without another wish, s.
 CYCLES, SWEEP_S = (0.5, 1.0, 4.0), 3600.0
+#: Forms whose column is in proportion to the channel.
+LINEAR = ("static", "lag", "rate")
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
 _LAW = re.compile(rf"law decided {_NUMBER} ?%")
 _SHARE, _VALUE = re.compile(rf"(\w+) within {_NUMBER} ?%"), re.compile(rf"(\w+) within {_NUMBER} (\S+)")
@@ -83,8 +87,9 @@ class Wish:
             return Wish(plain, "", 1.0 - float(match[1]) / 100.0)
         match = _SHARE.fullmatch(plain) or _VALUE.fullmatch(plain)
         if match is None or match[1] not in ("bias", *PLACES, *regressors):
+            also = "".join(f", '{name} within 10 %'" for name in regressors)
             raise UserError(
-                f"--want '{short(text)}': takes 'K within 20 %', 'bias within 0.001 {like}' or 'law decided 95 %'"
+                f"--want '{short(text)}': takes 'K within 20 %', 'bias within 0.001 {like}'{also} or 'law decided 95 %'"
             )
         if not 0.0 < float(match[2]) < math.inf:
             raise UserError(f"--want '{short(text)}': must be within more than 0")
@@ -100,9 +105,24 @@ class Wish:
         return Wish(plain, match[1], float(match[2]) * units.factor(unit, own), unit)
 
 
-def as_is(one: Regressor) -> bool:
-    """Whether its column is its channel's value."""
-    return one.kind == "column" and one.form == "static" and one.input == "value" and math.isnan(one.window_s)
+def refusal(model: Model, axis: str, one: Regressor) -> str:
+    """Why the coefficient of a regressor cannot be planned: plan swings a channel, in proportion to which the column
+    moves. Empty if it can."""
+    if one not in offered(model, axis):
+        return f"{axis} has no regressor {one.name}"
+    if one.kind not in ("column", "rate"):
+        return f"{one.name} is of kind {one.kind}, and has no channel that could be swung: leave this wish out"
+    if one.input == "value" and one.form in LINEAR:
+        return ""
+    what = f"form: {one.form}" if one.input == "value" else f"input: {one.input}"
+    return f"{one.name} has `{what}`, which is not in proportion to {one.column}: leave this wish out"
+
+
+def column_of(one: Regressor, channel: Floats, rate_hz: float) -> Floats:
+    """float64[n]: the column that a channel [n] at this rate makes. The window of a rate is of whole intervals."""
+    if one.kind == "rate":
+        one = replace(one, window_s=max(1, round(one.window_s * rate_hz)) / rate_hz)
+    return made(sources_of(one, channels_of((one,))), 1.0 / rate_hz, channel[:, None])[:, 0]
 
 
 class Ensemble:
@@ -183,10 +203,11 @@ def cycling(
     needed = (HALF_90 / wish.most) ** 2 - regressor.sd[model.group_of(axis).name] ** -2
     for cycles in CYCLES:
         omega = np.array([2.0 * math.pi * cycles / samples])
+        one_swing = column_of(regressor, swung(samples, cycles, 1.0), model.bank_rate_hz)
         power = [
             float(terms_of(bare.laws[law], truth, 1.0 / model.bank_rate_hz).spectrum(omega)[0]) for law, truth in parts
         ]
-        swing = math.sqrt(8.0 * float(np.quantile(power, SHARE)) * max(needed, 0.0) / samples)
+        swing = math.sqrt(float(np.quantile(power, SHARE)) * max(needed, 0.0) / (samples * float(one_swing.var())))
         if swing > 0.0:
             rows = spread(
                 partial(coefficient_rows, replace(model, regressors=(regressor,)), axis, samples, cycles, swing),
@@ -201,6 +222,11 @@ def cycling(
     return found
 
 
+def swung(samples: int, cycles: float, swing: float) -> Floats:
+    """[n]: so many cycles of a channel about 0."""
+    return np.asarray(0.5 * swing * np.cos(2.0 * math.pi * cycles * (np.arange(samples) + 0.5) / samples))
+
+
 def coefficient_rows(model: Model, axis: str, samples: int, cycles: float, swing: float, seed: int) -> list[Row]:
     """Half the 90 % interval of the coefficient of the model's only regressor, whose channel follows a cosine."""
     from selfcal.bank.library import Bank
@@ -208,10 +234,10 @@ def coefficient_rows(model: Model, axis: str, samples: int, cycles: float, swing
     (regressor,), group = model.regressors, model.group_of(axis)
     law, truth = part_of(replace(model, regressors=()), axis, seed)
     y, _ = simulate_bank_samples(model.laws[law], truth, model.bank_rate_hz, samples, seed)
-    off = 0.5 * swing * np.cos(2.0 * math.pi * cycles * (np.arange(samples) + 0.5) / samples)
+    about = regressor.offset
+    column = column_of(regressor, swung(samples, cycles, swing) + about, model.bank_rate_hz)
     bank = Bank(make_tables(model, model.bank_rate_hz, (axis,)))
-    column = (regressor.reference + off).astype(np.float32)[:, None]
-    bank.push((y + regressor.sd[group.name] * off)[:, None], None, column)
+    bank.push((y + regressor.sd[group.name] * (column - about))[:, None], None, column.astype(np.float32)[:, None])
     return [{"half": HALF_90 * bank.report(0, 1).coefficients[law][0][1]}]
 
 

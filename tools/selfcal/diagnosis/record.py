@@ -19,7 +19,17 @@ from selfcal.model.file import REGRESSORS, Group, Model
 from selfcal.model.file import Regressor as Stated
 from selfcal.model.forms import variance_of
 from selfcal.model.regressors import columns_of, offered
-from selfcal.readings.readings import RateChange, Readings, Rows, evened, look, own_rows, readings_of, thinned
+from selfcal.readings.readings import (
+    RateChange,
+    Readings,
+    Rows,
+    evened,
+    look,
+    mostly_beyond,
+    own_rows,
+    readings_of,
+    thinned,
+)
 
 #: Samples that a diagnosis needs at least, and takes at most, gaps included.
 LEAST, MOST = 200, 10_000_000
@@ -180,7 +190,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     for name in known:
         clock, group = recording.clock_of(name), model.group_of(name)
         values = recording.in_unit(name, group.unit)
-        if _beyond(values[np.isfinite(values)], group) or clock.rate_hz * dt < SLOWEST:
+        if _beyond(values[np.isfinite(values)], group) or mostly_beyond(values, group) or clock.rate_hz * dt < SLOWEST:
             continue
         if _original(recording, name, tuple(states)) is not None:
             continue
@@ -235,7 +245,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
             stated_lsb=group.lsb,
             redrawn=each > 1,
             block=each,
-            below_lattice=found is not None and (found.too_coarse if each == 1 else found.too_coarse_over(dt)),
+            below_lattice=found is not None and found.too_coarse_over(dt),
         )
     present = np.isfinite(on_grid(base, np.zeros(base.missing_before.size))[0])
     channels: dict[str, Array] = {}
@@ -292,6 +302,8 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
     values = recording.in_unit(name, group.unit)
     if _beyond(values[np.isfinite(values)], group):
         return f"readings beyond {BEYOND:g} times the range of {group.range:g} {group.unit}: is the unit right?"
+    if most := mostly_beyond(values, group):
+        return most
     own = recording.clock_of(name).rate_hz
     if own < SLOWEST * recording.rate_hz:
         return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"

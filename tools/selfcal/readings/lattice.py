@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 #: lattice. A reading that toggles between two values has at least 2, however little noise there was before rounding.
 #: At 1.9 that noise is 0.44 steps and N a fifth too large; below, rounding is white noise of step^2 / 12.
 BELOW_LATTICE = 1.9
-#: Seconds that show whether rounding errors are carried on: sums of a second then scatter by less than this share of
-#: what rounding by itself makes of them.
-CARRIED_SECONDS, CARRIED_SHARE = 120, 0.5
+#: Sums that show whether rounding errors are carried on, of a second and of so many readings at least: they scatter by
+#: less than this share of what rounding by itself makes of them. That takes a lattice coarser than the noise.
+CARRIED_SUMS, CARRIED_READINGS, CARRIED_SHARE, CARRIED_FROM = 120, 8, 0.5, 1.0
 #: Difference of two remainders of sums that follow each other, each uniform in a step: its share in the scatter.
 REMAINDERS = 0.25
 #: Least variance that is told of a counter, steps^2 in a second: what 120 seconds show is as uncertain as 0.04.
@@ -45,9 +45,14 @@ class Lattice:
     carried: float = 0.0
 
     @property
+    def most(self) -> float:
+        """Coarseness beyond which the noise is below the lattice. Of a counter it is: else no remainder would show."""
+        return CARRIED_FROM if self.carried else BELOW_LATTICE
+
+    @property
     def too_coarse(self) -> bool:
         """Rounding is no white noise: what is told of the noise is the lattice's."""
-        return self.coarseness > BELOW_LATTICE
+        return self.coarseness > self.most
 
     @property
     def white_hz(self) -> float:
@@ -64,27 +69,26 @@ class Lattice:
 def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | None:
     """The lattice of readings [n] at `rate_hz`, None if they lie on none or are all the same, or if it is FINE.
 
-    Their noise is the scatter about means of 1 s, or that of differences where a second holds fewer than four: a drift
-    has no part in either.
+    Their noise is the scatter about means of 1 s, or of CARRIED_READINGS where a second holds fewer, unless that of
+    differences is less: a drift has no part in it. Remainders that are carried on have the larger part in differences.
     """
     carried = 0.0
     unique = np.unique(values)
     step = _step(unique)
     if step <= 0.0 or not _throughout(unique, step):
         return None
-    second = round(rate_hz)
-    count = values.size // second if second >= 4 else 0
-    if count:
-        within = values[: count * second].reshape(count, second)
-        noise = math.sqrt(float(within.var(axis=1).mean()) * second / (second - 1.0))
-    else:
-        noise = float(np.diff(values).std()) / math.sqrt(2.0)
+    size = max(round(rate_hz), CARRIED_READINGS)
+    count = values.size // size
+    within = values[: count * size].reshape(count, size)
+    noise = math.sqrt(float(within.var(axis=1).mean()) * size / (size - 1.0)) if count else math.inf
+    if size > rate_hz:
+        noise = min(noise, float(np.diff(values).std()) / math.sqrt(2.0))
     coarseness = step / noise if noise > 0.0 else math.inf
-    if count >= CARRIED_SECONDS and BELOW_LATTICE < coarseness < math.inf:
+    if count >= CARRIED_SUMS and CARRIED_FROM < coarseness < math.inf:
         sums = within.sum(axis=1) / step
         scatter = 0.5 * float((np.diff(sums) ** 2).mean())
-        if scatter < CARRIED_SHARE * second / coarseness**2:
-            carried = max(CARRIED_LEAST, scatter - REMAINDERS)
+        if scatter < CARRIED_SHARE * size / coarseness**2:
+            carried = max(CARRIED_LEAST, (scatter - REMAINDERS) * rate_hz / size)
     return Lattice(step, coarseness, unique.size, carried) if coarseness >= FINE else None
 
 

@@ -84,6 +84,8 @@ class Clipped:
 
 #: A model file has a range to six digits: readings at the limit that it states may lie so much beyond.
 ROUNDED = 1e-5
+#: Share of readings beyond the range from which on the others are no readings of a sensor either.
+MOST_BEYOND = 0.5
 #: An axis moves with others if its mean square is so many standard deviations above that of the rest. A wild reading
 #: counts as so many of it at most.
 LOUDER_SD, WILD = 6.0, 30.0
@@ -184,19 +186,35 @@ def look(recording: Recording, axis: str, group: Group) -> Readings:
     return seen
 
 
+def within(values: NDArray[np.floating[Any]], group: Group) -> Mask:
+    """Which readings [n] are no farther than the range of the part."""
+    found: Mask = np.abs(values) <= (group.range * (1.0 + ROUNDED) if group.range > 0.0 else math.inf)
+    return found
+
+
+def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
+    """What to say where most readings [n] lie beyond the range: then the others are none either. Empty elsewhere."""
+    there = _known(values)
+    share = 1.0 - float(within(there, group).mean()) if there.size else 0.0
+    if share <= MOST_BEYOND:
+        return ""
+    said = f"{100.0 * share:.0f} % of the readings are beyond the range of {group.range:g} {group.unit}: is the unit "
+    return f"{said}right, or are words of the log swapped or lost?"
+
+
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis of an evened and thinned recording."""
     values = recording.in_unit(axis, group.unit)
     none = np.zeros(values.size, bool)
     # Readings beyond the part's range are none: the engines leave them out.
-    inside = np.abs(values) <= (group.range * (1.0 + ROUNDED) if group.range > 0.0 else math.inf)
+    inside = within(values, group)
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
         return Readings(recording, values, values, values, None, none, none)
     sound = values if inside.all() else np.where(inside, values, np.nan)
     lattice = lattice_of(_known(sound), recording.rate_hz)
     recurring = recurring_of(sound, recording.rate_hz)
-    if recurring is not None and uneven_of(sound, lattice) is not None:
-        recurring = None  # a dead band takes its counts from its neighbours
+    if recurring is not None and ((lattice is not None and lattice.carried) or uneven_of(sound, lattice) is not None):
+        recurring = None  # the codes of a counter recur; a dead band takes its counts from its neighbours
     if recurring is not None:
         values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
         lattice = lattice_of(_known(sound), recording.rate_hz)
@@ -228,7 +246,7 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     return replace(found, slower=stretches)
 
 
-def _known(values: Array) -> Array:
+def _known(values: NDArray[Any]) -> NDArray[Any]:
     """Those of the values that are finite; no copy where all are."""
     finite = np.isfinite(values)
     return values if finite.all() else values[finite]

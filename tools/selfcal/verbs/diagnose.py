@@ -136,7 +136,7 @@ def diagnose(
             means = None
             with suppress(UserError):  # a recording that is too short for means is looked at once
                 means = of_recording(recording, loaded, FIRST_HZ, names)
-            if means is not None:
+            if means is not None and record.axes:
                 first = looked_at(means, names, ending, doing)
                 show_first(recording, first, [name for name in names if name in record.axes], ending)
         seen = looked_at(record, names, ending, doing) if not ending.asked else {}

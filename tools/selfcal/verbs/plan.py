@@ -35,16 +35,17 @@ def plan(
 
     `axis`: the first that the `simulate` entry states, else the first of all. A wish of a parameter is of the records
     whose law has it. `plot`: a picture of what is reached over the length.
-    A wish of a coefficient, of a regressor of kind `column`, has `cycling`: the swing of its channel that it takes over
-    the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its prior's sd.
+    A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
+    it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
+    prior's sd.
     Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.batch.plan import SCHEMA, SHARE, SWEEP_S, Ensemble, Wish, as_is, cycling, picture, rates
+    from selfcal.batch.plan import SCHEMA, SHARE, SWEEP_S, Ensemble, Wish, cycling, picture, rates, refusal
     from selfcal.batch.spread import record_seeds
     from selfcal.model.file import Model
-    from selfcal.model.regressors import coefficient_unit, offered
+    from selfcal.model.regressors import coefficient_unit
 
     check_writable(json, plot, inputs=(model,))
     if plot is not None:
@@ -56,13 +57,15 @@ def plan(
     group = loaded.group_of(name)
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
-    columns = {one.name: one for one in offered(loaded, name) if as_is(one)}
-    sizes = {one.name: (coefficient_unit(group.unit, one.unit), one.sd[group.name]) for one in columns.values()}
+    columns = {one.name: one for one in loaded.regressors}
+    sizes = {key: (coefficient_unit(group.unit, one.unit), one.sd.get(group.name, 1.0)) for key, one in columns.items()}
     wishes = [Wish.of(text, group.unit, sizes) for text in want]
     there = {parameter for law in loaded.laws.values() for parameter in law.parameters} | {"", "bias", *columns}
     for wish in wishes:
         if wish.parameter not in there:
             raise UserError(f"--want '{wish.text}': no law of {loaded.path} has {wish.parameter}")
+        if wish.parameter in columns and (reason := refusal(loaded, name, columns[wish.parameter])):
+            raise UserError(f"--want '{wish.text}': {reason}")
     seeds = record_seeds(records, seed)
     plain = replace(loaded, regressors=())
     ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
@@ -83,8 +86,9 @@ def plan(
     for entry, wish in zip(entries, wishes, strict=True):
         if wish.parameter in columns:
             entry["duration_s"] = samples / loaded.bank_rate_hz
-            entry["channel"], entry["unit"] = columns[wish.parameter].column, columns[wish.parameter].unit
-            entry["cycling"] = cycling(loaded, name, wish, columns[wish.parameter], samples, seeds, scheduler)
+            one = columns[wish.parameter]
+            entry["channel"], entry["unit"] = one.column, one.channel_unit
+            entry["cycling"] = cycling(loaded, name, wish, one, samples, seeds, scheduler)
     all_known = all(one["duration_s"] is not None for one in entries)
     document: dict[str, Any] = {
         "schema": SCHEMA,
