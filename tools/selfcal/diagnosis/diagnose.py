@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -17,7 +18,7 @@ from selfcal.adequacy.identify import identify_axis, moved_beside
 from selfcal.base.ending import Held, Stopped, abandon
 from selfcal.base.errors import UserError, note, printable
 from selfcal.base.progress import Doing
-from selfcal.diagnosis import words
+from selfcal.diagnosis import hidden, words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
@@ -86,6 +87,23 @@ def looked_at(record: Record, names: Sequence[str], ending: Held, doing: Doing) 
         stopped.set()
         pool.shutdown(wait=False)
     return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
+
+
+def shared_by(found: Mapping[str, Diagnosed], model: Model) -> hidden.Hidden | None:
+    """What moves several axes and nobody recorded; None: nothing does, or the model file states it."""
+    if model.hidden_input is not None:
+        return None
+    states = {name: one.state for name, one in found.items() if not one.unfinished}
+    grids = Counter((state.y.size, state.dt) for state in states.values())
+    most = max(grids, key=lambda grid: grids[grid], default=None)
+    return hidden.together({name: state for name, state in states.items() if (state.y.size, state.dt) == most})
+
+
+def entry_of(shared: hidden.Hidden, found: Mapping[str, Diagnosed], recording: Recording) -> dict[str, Any]:
+    """The finding of all axes for the document."""
+    units = {name: recording.columns[name].unit for name in shared.names}
+    record = found[shared.names[0]].record
+    return hidden.entry(shared, {name: found[name].state for name in shared.names}, units, record.start_s)
 
 
 def less_stated(one: Diagnosed, model: Model) -> Diagnosed:
@@ -180,6 +198,22 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         markup=False,
         soft_wrap=True,
     )
+    for shared in document.get("findings", []):
+        colour = "bold red" if shared["confirmed"] else "yellow"
+        console.print(
+            f"{', '.join(shared['axes'])}: {shared['cause']}",
+            style=colour,
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+        held = "" if shared["confirmed"] else "; not confirmed on held-out time"
+        for line in (
+            shared["words"],
+            f"evidence {shared['evidence_nats']:.1f} nats{held}",
+            f"next: {shared['record_next']}",
+        ):
+            console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
     for name, axis in document["axes"].items():
         if "error" in axis:
             console.print(f"{name}: no result: {axis['error']}", highlight=False, markup=False, soft_wrap=True)

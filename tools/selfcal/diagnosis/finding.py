@@ -3,32 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
+from selfcal.likelihood.heldout import HeldOut
 from selfcal.likelihood.state import Look, Regressor, State
 
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
-#: A finding whose gain lies so many standard deviations below 0 is none.
-HARM_SD = 2.0
-
-
-@dataclass(frozen=True)
-class HeldOut:
-    """The contract's `gain` of one finding, or None with the `reason`."""
-
-    gain: dict[str, Any] | None
-    reason: str | None = None
-
-    @property
-    def harms(self) -> bool:
-        """Whether the finding predicts the rest of the record clearly worse."""
-        if self.gain is None:
-            return False
-        score = self.gain["log_score_per_sample"]
-        return bool(score["after"] - score["before"] < -HARM_SD * score["sd"])
 
 
 @dataclass(frozen=True)

@@ -17,17 +17,13 @@ from scipy.special import gammaln, logsumexp, softmax
 
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
-from selfcal.diagnosis.finding import HeldOut
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, passed, run
+from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
 from selfcal.readings.readings import Rows
 
-#: How far ahead the bias is predicted, s.
-HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
-#: Pieces of the held-out time whose scatter gives the uncertainty.
-PIECES = 24
 #: Predictions of the bias at most.
 PREDICTIONS = 300
 #: Samples to score, and between the first and the last prediction, at least.

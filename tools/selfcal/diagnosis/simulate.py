@@ -31,9 +31,11 @@ DRAWS = 2**32
 def added_by(
     applied: Sequence[Mapping[str, Any]], model: Model, rate_hz: float, seed: int
 ) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
-    """Adds the effects that a cause forms by itself to `values` [axes, n] before the read-out; None without any."""
+    """Adds the effects that a cause forms by itself, and the quantity that moves several axes, to `values` [axes, n]
+    before the read-out; None without any."""
     own = [(form, one["axes"]) for one in applied if (form := CAUSES[one["id"]].add) is not None]
-    if not own:
+    hidden = model.hidden_input
+    if not own and hidden is None:
         return None
 
     def add(values: NDArray[np.float64], temperature: NDArray[np.float64], supply: NDArray[np.float64]) -> None:
@@ -44,8 +46,23 @@ def added_by(
                 place = model.axes.index(name)
                 random = np.random.default_rng([seed, number, place])
                 values[place] += form(keys, Channels(time_s, temperature, supply, axes, random))
+        if hidden is not None:
+            random = np.random.default_rng([seed, len(own), len(model.axes)])
+            course = _markov(hidden.deviation, hidden.alpha / rate_hz, temperature.size, random)
+            for name, loading in hidden.loadings.items():
+                values[model.axes.index(name)] += loading * course
 
     return add
+
+
+def _markov(deviation: float, rate: float, n: int, random: np.random.Generator) -> NDArray[np.float64]:
+    """A Gauss-Markov process [n] of this rate a sample."""
+    from scipy.signal import lfilter
+
+    steps = random.standard_normal(n) * math.sqrt(-math.expm1(-2.0 * rate))
+    steps[0] = random.standard_normal()
+    found: NDArray[np.float64] = deviation * lfilter([1.0], [1.0, -math.exp(-rate)], steps)
+    return found
 
 
 def read_out(

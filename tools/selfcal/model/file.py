@@ -237,6 +237,18 @@ class GridNodes:
 
 
 @dataclass(frozen=True)
+class HiddenInput:
+    """One quantity that nobody recorded and that moves several axes, a Gauss-Markov process: its standard deviation,
+    its bandwidth `alpha`, 1/s, what a unit of it does to each axis, in the axis' unit, and the correlation of the white
+    noise of pairs of axes beside it (`gx-gy`). The bank of one axis knows nothing of it: its law is the axis' total."""
+
+    deviation: float
+    alpha: float
+    loadings: Mapping[str, float]
+    noise_correlation: Mapping[str, float]
+
+
+@dataclass(frozen=True)
 class Model:
     """A checked model file. `hypotheses` holds prior probabilities that sum to 1, `laws` the law of each; `simulate`
     the entry of that name, its `axes` and `effects` always. `beyond`: regressors that a bank has no column left for:
@@ -258,6 +270,7 @@ class Model:
     half_life_s: float = 0.0  # of what the bank remembers; 0: it forgets nothing
     gate: Gate | None = None
     handling: Handling = NOT_HANDLED
+    hidden_input: HiddenInput | None = None
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -761,12 +774,38 @@ class _Reader:
                 truth[key] = self.number(truth[key], f"{where}.{key}", low=-math.inf if key == "bias" else 0.0)
         return {**fields, "axes": truths, "effects": texts}
 
+    def hidden_input(self, tree: Any, axes: Collection[str]) -> HiddenInput:
+        fields = self.only(tree, ("law", "loadings", "noise_correlation"), "hidden_input")
+        law = self.entry(fields, "law", "hidden_input")
+        if not isinstance(law, list) or len(law) != 1:
+            raise self.fail("hidden_input.law", "must be a list of one term: kind: markov, deviation, alpha")
+        term = self.only(law[0], ("kind", "deviation", "alpha"), "hidden_input.law")
+        if term.get("kind") != "markov":
+            raise self.fail("hidden_input.law", f"the kind must be markov, not {shown(term.get('kind'))}")
+        deviation, alpha = (
+            self.number(self.entry(term, key, "hidden_input.law"), f"hidden_input.law.{key}")
+            for key in ("deviation", "alpha")
+        )
+        numbers = []
+        for key, low in (("loadings", -math.inf), ("noise_correlation", -1.0)):
+            entries = fields.get(key) or {}
+            if not isinstance(entries, dict):
+                raise self.fail(f"hidden_input.{key}", "must be a mapping")
+            for name in entries:
+                if not all(one in axes for one in str(name).split("-")):
+                    raise self.fail(f"hidden_input.{key}", f"the model has no axis {shown(name)}")
+            numbers.append(
+                {name: self.number(one, f"hidden_input.{key}.{name}", low=low) for name, one in entries.items()}
+            )
+        return HiddenInput(deviation, alpha, *numbers)
+
     def model(self) -> Model:
         needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
         raw = self.tree() if self._tree is None else self._tree
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {shown(raw.get('schema'))}")
-        tree = self.only(raw, (*needed, "regressors", "half_life_s", "gate", "handle", "correlation_time_s"), "")
+        more = ("regressors", "half_life_s", "gate", "handle", "correlation_time_s", "hidden_input")
+        tree = self.only(raw, (*needed, *more), "")
         name = self.text(tree, "name", "")
         sensor = self.only(self.entry(tree, "sensor", ""), ("name", "rate_hz", "filter_taps"), "sensor")
         weights, laws = self.hypotheses(tree)
@@ -804,6 +843,7 @@ class _Reader:
             beyond=tuple(one for one in regressors if one not in kept),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
+            hidden_input=self.hidden_input(tree["hidden_input"], axes) if tree.get("hidden_input") else None,
             handling=self.handling({} if tree.get("handle") is None else tree["handle"], bool(tree.get("regressors"))),
         )
 

@@ -88,6 +88,7 @@ def diagnose(
     from selfcal.base.results import Diagnosis
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
+    from selfcal.diagnosis import hidden
     from selfcal.diagnosis.diagnose import (
         FIRST_FROM,
         FIRST_HZ,
@@ -96,9 +97,11 @@ def diagnose(
         add_posteriors,
         below_lattice,
         by_identify,
+        entry_of,
         less_stated,
         looked_at,
         options_given,
+        shared_by,
         show_first,
         why_not,
     )
@@ -171,7 +174,13 @@ def diagnose(
             doing.now("held-out gain")
             tree = extended(loaded, record, found)
             out = left_out(loaded, found)
+            doing.now("what the axes share")
+            shared = shared_by(found, loaded) if not ending.asked else None
+            if shared is not None:
+                tree["hidden_input"] = hidden.stated(shared)
             document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])
+            if shared is not None:
+                document["findings"] = [entry_of(shared, found, recording)]
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
