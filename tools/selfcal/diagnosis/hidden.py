@@ -135,7 +135,11 @@ def _means(state: State, block: int) -> Array:
         0.0 if column.cause in MAY_BE_ITS_OWN else c
         for column, c in zip(state.regressors, state.best.c[1:], strict=True)
     ]
-    residual = state.y - np.array([state.best.c[0], *size]) @ state.series.columns
+    return _blocks(state.y - np.array([state.best.c[0], *size]) @ state.series.columns, block)
+
+
+def _blocks(residual: Array, block: int) -> Array:
+    """Means [k] of blocks; NaN where half are missing."""
     k = residual.size // block
     cells = residual[: k * block].reshape(k, block)
     there = np.isfinite(cells)
@@ -311,6 +315,45 @@ def _sentence(axes: Mapping[str, Any], jumps: Sequence[Mapping[str, float]], tim
         f"One quantity that nobody recorded moves {len(axes)} axes together, over some {time_constant_s:.2g} s. "
         f"Its share of each axis' drift: {shares}.{jumped}"
     )
+
+
+def carried(hidden: Hidden, states: Mapping[str, State]) -> dict[str, Any] | None:
+    """What the quantity gains on a second recording by the models of the first, all axes together; None: it has not the
+    axes. `states`: of the second recording."""
+    if not set(hidden.names) <= states.keys():
+        return None
+    block = max(1, round(hidden.dt / states[hidden.names[0]].dt))
+    y = np.array([_blocks(states[name].y, block) for name in hidden.names]) / hidden.scale[:, None]
+    y = np.where(np.isfinite(y), without_lines(np.array([_bridged(row) for row in y])), np.nan)
+    scores = [np.nansum(course(model, y).scores(), axis=1) for model in (hidden.null, hidden.model)]
+    more = course(hidden.model, y).ln_likelihood - course(hidden.null, y).ln_likelihood
+    n = float(np.isfinite(y).any(axis=0).sum())
+    pieces = [part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]
+    sd = float(np.std(pieces, ddof=1)) / math.sqrt(PIECES)
+    before = float(scores[0].mean())
+    score = {"before": before, "after": before + more / n, "sd": sd, "samples": int(n)}
+    return {"log_score_per_sample": score}
+
+
+def own_laws(hidden: Hidden) -> dict[str, dict[str, Any]]:
+    """By axis the drift that it has beside the quantity, as `simulate` in a model file has it: the larger of a walk and
+    a Gauss-Markov process over half the record."""
+    found = {}
+    half = 0.5 * hidden.y.shape[1]
+    for name, (ln_n, ln_rho, ln_markov, ln_rate), scale in zip(
+        hidden.names, hidden.model.own, hidden.scale, strict=True
+    ):
+        white = math.exp(ln_n) * float(scale)
+        walk, markov = (
+            math.exp(2.0 * ln_rho) * half,
+            2.0 * math.exp(2.0 * ln_markov) * -math.expm1(-math.exp(ln_rate) * half),
+        )
+        if walk > markov:
+            found[name] = {"hypothesis": "random_walk", "K": digits(white * math.exp(ln_rho) / math.sqrt(hidden.dt))}
+        else:
+            sigma_m, alpha = digits(white * math.exp(ln_markov)), digits(math.exp(ln_rate) / hidden.dt)
+            found[name] = {"hypothesis": "gauss_markov", "sigma_m": sigma_m, "alpha": alpha}
+    return found
 
 
 def stated(hidden: Hidden) -> dict[str, Any]:

@@ -178,9 +178,15 @@ def diagnose(
             shared = shared_by(found, loaded) if not ending.asked else None
             if shared is not None:
                 tree["hidden_input"] = hidden.stated(shared)
+                for name, law in hidden.own_laws(shared).items():
+                    kept = {key: tree["simulate"]["axes"][name][key] for key in ("bias", "N")}
+                    tree["simulate"]["axes"][name] = {**law, **kept}
             document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])
             if shared is not None:
                 document["findings"] = [entry_of(shared, found, recording)]
+                if second is not None:
+                    on_second = of_recording(second, loaded, 1.0 / shared.dt)
+                    document["findings"][0]["gain_on"] = hidden.carried(shared, on_second.axes)
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")

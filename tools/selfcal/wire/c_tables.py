@@ -75,6 +75,8 @@ def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
     """What of the model comes to nothing."""
     if model.left_out:
         yield model.left_out
+    if model.hidden_input is not None:
+        yield f"{model.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"
     if model.gate is not None and gate_table(model, tables) is None:
         yield f"{model.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
     if tables.handling.outlier_sd and tables.block == 1:
