@@ -38,8 +38,9 @@ MOST_MODEL_VALUES = 10_000
 LEAST_RATE_HZ, MOST_RATE_HZ = 1e-6, 1e6
 #: Sampling rates in one recording.
 MOST_CLOCKS = 8
-#: Samples that a recording spans, those missing included: each number up to here is a float64.
-LONGEST = 2**53
+#: What a recording spans: seconds, and samples, those missing included. A law beside the model takes 20 000 intervals,
+#: each of at most 10^6 s and 2^32 samples (lib/bank.c).
+LONGEST_S, LONGEST = 1e10, 2**46
 
 
 @contextmanager

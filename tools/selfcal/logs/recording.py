@@ -30,6 +30,7 @@ from selfcal.base.errors import UserError, cell, note, short, shown
 from selfcal.base.limits import (
     LEAST_RATE_HZ,
     LONGEST_HEADING,
+    LONGEST_S,
     MOST_CLOCKS,
     MOST_HEADINGS,
     MOST_META_BYTES,
@@ -1291,6 +1292,8 @@ def _on_clocks(
             skipped = np.diff(lines, prepend=lines[0]) - np.diff(at, prepend=at[0]) if places is not None else None
             return clock_of(path, _at(time, at), noise_s, rate, lambda row, what: fail(int(at[row]), what), skipped)
         assert rate is not None
+        if lines[-1] / rate > LONGEST_S:
+            raise UserError(f"{path}: {lines[-1] + 1} rows at {rate:g} Hz: a recording spans at most {LONGEST_S:g} s")
         return clock_of_rows(lines, rate)
 
     axes: dict[str, NDArray[np.bool_]] = {}

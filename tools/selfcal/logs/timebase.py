@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
-from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, MOST_RATE_HZ
+from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.sampling import Ambiguous, on_other_grid, sampling, thinned_grid
 
 #: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
@@ -203,9 +203,9 @@ def clock_of(
     """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
     states it. `skipped` [n]: lines without a stamp just before each. Raises UserError, by `fail` for a row."""
     start = float(time[0])
+    if not time[-1] <= LONGEST_S:
+        _too_long(time, fail)
     time = time - start if start else time
-    if not np.isfinite(time[-1]):
-        raise UserError(f"{path}: column 't' spans more than a number can hold")
     rows = np.arange(time.size) if skipped is None else _with_skipped(time, skipped, noise_s)
     if rows[-1] < time.size:
         found, missing = _sampling(path, time, noise_s, rate, fail)
@@ -224,6 +224,8 @@ def clock_of(
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
         raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
+    if time[-1] * rate >= LONGEST:
+        _too_long(time, fail)
     grid = Clock(rate, missing, start_s=-missing[0] / rate).time_s
     off_grid = np.subtract(time, grid, out=grid)
     return Clock(rate, missing, off_grid, start)
@@ -264,11 +266,18 @@ def _sampling(
         if bursts is not None:
             return bursts
         fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
-    if not 0.0 < dt < math.inf or not time[-1] / dt < LONGEST:
+    if not 0.0 < dt < math.inf:
         raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
     if rate is not None and bursts is None and on_other_grid(time, 1.0 / rate, missing):
         raise _disagrees(path, rate)
     return float(f"{1.0 / dt:.10g}"), missing
+
+
+def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:
+    steps = np.diff(time, prepend=0.0)
+    row = int(np.argmax(steps))
+    what = f"a recording spans at most {LONGEST_S:g} s, and {LONGEST:.2g} samples: leave the row out"
+    fail(row, f"the time stamp is {steps[row]:.3g} s after the one before: {what}")
 
 
 def _disagrees(path: object, rate: float) -> UserError:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
-from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, MOST_COLUMNS, MOST_RATE_HZ
+from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_COLUMNS, MOST_RATE_HZ
 from selfcal.logs.timebase import Clock
 
 if TYPE_CHECKING:
@@ -31,8 +31,6 @@ SAMPLE, LATE = "sample", "late"
 _ONE_ROW = 0.01
 #: What `meta` of the log says of the log's own table.
 _OF_TABLE = ("columns", "rows", "rate_hz")
-#: Seconds from the first row to a clock's start, at most: 30 000 years.
-_LATEST_S = 1e12
 
 
 @dataclass(frozen=True)
@@ -130,8 +128,9 @@ def clocks_of(
                 float(entry["rate_hz"]),
                 float(entry["start_s"]),
             )
-            sound = LEAST_RATE_HZ <= rate <= MOST_RATE_HZ and abs(start) < _LATEST_S and rows.size > 1
-            sound &= bool(place[0] >= 0 and place[-1] < LONGEST and (place == np.rint(place)).all())
+            sound = LEAST_RATE_HZ <= rate <= MOST_RATE_HZ and abs(start) < LONGEST_S and rows.size > 1
+            sound &= bool(place[0] >= 0 and place[-1] < min(LONGEST, LONGEST_S * rate))
+            sound &= bool((place == np.rint(place)).all())
             sound &= bool((np.diff(place) > 0).all() and np.isfinite(stamps).all())
             stamped = bool(entry["stamped"])
         except (TypeError, KeyError, ValueError, OverflowError, IndexError):

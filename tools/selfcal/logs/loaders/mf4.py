@@ -1,20 +1,19 @@
 """ASAM MDF by asammdf: a table a channel group, on the group's own master channel. Units are the channels'.
 
+A sample that the file calls invalid is missing.
 A conversion by a formula is code to asammdf, and never run: its channel is left out with a note.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_COLUMNS
-from selfcal.logs.loaders.table import Hints, Table, of_arrays
-
-#: Channels that a note names.
-_MOST_NAMED = 6
+from selfcal.logs.loaders.table import Hints, Table, left_out, of_arrays
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -22,14 +21,15 @@ def read(path: Path, _: Hints) -> list[Table]:
     from asammdf import MDF
 
     tables: list[Table] = []
-    left_out: list[str] = []
+    without: list[str] = []
     with MDF(path) as file:
         groups: list[Any] = file.groups
         for number, group in enumerate(groups):
             columns: dict[str, Any] = {}
             formulas = {index: text for index, one in enumerate(group.channels) if (text := _formula(one.conversion))}
-            notes = (_told([group.channels[index].name for index in formulas], formulas),) if formulas else ()
-            left_out += notes
+            why = f"a formula, '{short(next(iter(formulas.values()), ''))}', which is not run"
+            notes = left_out([group.channels[index].name for index in formulas], why)
+            without += notes
             for channel in group.channels:
                 if hasattr(channel, "attachment"):
                     channel.attachment = None  # which may be another file
@@ -41,15 +41,18 @@ def read(path: Path, _: Hints) -> list[Table]:
             for index in range(len(group.channels[:MOST_COLUMNS])):
                 if index == clock or index in formulas:
                     continue
-                signal = file.get(group=number, index=index)
-                if signal.samples.dtype.kind in "iuf" and signal.samples.ndim == 1:
-                    columns[f"{signal.name}[{signal.unit}]" if signal.unit else signal.name] = signal.samples
+                signal = file.get(group=number, index=index, ignore_invalidation_bits=True)  # they would be dropped
+                samples, invalid = signal.samples, signal.invalidation_bits
+                if samples.dtype.kind in "iuf" and samples.ndim == 1:
+                    if invalid is not None and invalid.any():
+                        samples = np.where(invalid, np.nan, samples)
+                    columns[f"{signal.name}[{signal.unit}]" if signal.unit else signal.name] = samples
                     columns["t[s]"] = signal.timestamps
             name = getattr(group.channel_group, "acq_name", "") or f"group {number}"
             if columns:
                 tables.append(of_arrays(f"{name}", columns, notes=notes))
-    if left_out and not tables:
-        raise UserError(f"{path}: {left_out[0]}")
+    if without and not tables:
+        raise UserError(f"{path}: {without[0]}")
     names = [table.source for table in tables]
     if len(set(names)) < len(names):
         tables = [
@@ -57,15 +60,6 @@ def read(path: Path, _: Hints) -> list[Table]:
             for k, one in enumerate(tables)
         ]
     return tables
-
-
-def _told(names: list[str], formulas: Mapping[int, str]) -> str:
-    """The note on channels that are left out."""
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    return (
-        f"left out: {', '.join(map(short, names[:_MOST_NAMED]))}{more}: their values come by a formula, "
-        f"'{short(next(iter(formulas.values())))}', which is not run: export them as physical values"
-    )
 
 
 def _formula(conversion: Any) -> str:

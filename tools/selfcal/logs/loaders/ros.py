@@ -6,6 +6,7 @@ have one layout in every ROS, so that the definitions in a bag, which rosbags wo
 
 from __future__ import annotations
 
+import shlex
 import struct
 from array import array
 from collections.abc import Mapping
@@ -23,6 +24,8 @@ LAYOUTS = {"sensor_msgs/msg/Imu": 37, "sensor_msgs/msg/Temperature": 2}
 #: Place of the first axis, and its unit, by the first letter of the axes here.
 _AXES = {"g": (13, "rad/s"), "a": (25, "m/s^2")}
 _ROS_1 = b"#ROSBAG V2.0"
+#: Bytes before the content of a -wal, and the place in a database of the form that a reader has to know.
+_WAL_HEAD, _WAL_READ = 32, 19
 #: Places by which messages may lie out of the order of their stamps, as threads write them.
 _DISORDER = 64
 #: Share of accelerations of exactly 0 from which on a topic has the gyro and the accelerometer in turn.
@@ -95,7 +98,12 @@ def read(path: Path, _: Hints) -> list[Table]:
     if path.is_file():
         with path.open("rb") as stream:
             first = stream.read(len(_ROS_1)) == _ROS_1
-    names = "".join(map(str, [path] if path.is_file() else path.iterdir()))
+    parts = [path] if path.is_file() else list(path.iterdir())
+    for part in parts:
+        if _has_wal(part):
+            step = f"sqlite3 {shlex.quote(str(part))} 'pragma wal_checkpoint(truncate)'"
+            raise UserError(f"{path}: messages are in {part.name}-wal, which is not read: bring them in by {step}")
+    names = "".join(map(str, parts))
     if not first and set("%?#") & set(names):  # of a URI: rosbags makes one of a name as it is, and opens another file
         raise UserError(f"{path}: rename it: a ROS 2 bag with '%', '?' or '#' in a name cannot be opened")
     topics: dict[tuple[str, str], Topic] = {}
@@ -108,6 +116,15 @@ def read(path: Path, _: Hints) -> list[Table]:
     if not topics:
         raise no_topic(path, kinds.values())
     return [topic.table(name) for (name, _kind), topic in topics.items()]
+
+
+def _has_wal(path: Path) -> bool:
+    """Whether what is newest in a database is in a -wal beside it. Source: sqlite.org/fileformat2.html, 1.3.3 and 4."""
+    log = path.with_name(f"{path.name}-wal")
+    if not log.is_file() or log.stat().st_size <= _WAL_HEAD:
+        return False
+    with path.open("rb") as stream:
+        return stream.read(_WAL_READ + 1)[_WAL_READ:] == b"\2"
 
 
 def no_topic(path: Path, kinds: object) -> UserError:

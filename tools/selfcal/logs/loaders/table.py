@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,9 @@ from selfcal.base.limits import (
     reading,
 )
 from selfcal.logs.loaders.damage import SOUND, Damaged
+
+#: Channels that a note names.
+_MOST_NAMED = 6
 
 #: What the user states beside the file: `dbc`, the path of a CAN database.
 Hints = Mapping[str, str]
@@ -60,6 +63,13 @@ def of_arrays(
 ) -> Table:
     """The table of arrays [n] that are in memory."""
     return Table(source, {name: in_memory(array) for name, array in arrays.items()}, meta or {}, notes, damaged)
+
+
+def left_out(names: Sequence[str], by: str) -> tuple[str, ...]:
+    """The note on channels that are left out, if there are any. `by`: what their values take that is not done."""
+    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+    named = f"{', '.join(map(short, names[:_MOST_NAMED]))}{more}"
+    return (f"left out: {named}: their values come by {by}: export them as physical values",) if names else ()
 
 
 def in_memory(array: NDArray[Any]) -> Member:

@@ -5,17 +5,18 @@ Units are those of the channels (`unit_string`). Without a channel of times a wa
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.base.errors import UserError
+from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_NUMBERS
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import TIMES
-from selfcal.logs.loaders.table import Hints, Table, of_arrays
+from selfcal.logs.loaders.table import Hints, Table, left_out, of_arrays
 
 #: Bytes before a segment's content; the bit of its second number that says in which order the others' bytes are.
 _LEAD, _BIG_ENDIAN, _NEVER_ENDED = 28, 1 << 6, 2**64 - 1
@@ -28,6 +29,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     damaged = _cut(path)
     tables: dict[tuple[str, int], dict[str, NDArray[Any]]] = {}
     clocks: dict[tuple[str, int], NDArray[Any]] = {}
+    unscaled: dict[str, str] = {}
     numbers = 0
     with path.open("rb") as stream, TdmsFile.open(stream) as file:  # of a path it would read the _index beside it too
         for group in file.groups():
@@ -35,6 +37,9 @@ def read(path: Path, _: Hints) -> list[Table]:
                 numbers += len(channel)
                 if numbers > MOST_NUMBERS:
                     raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers")
+                if unknown := _unknown_scale(channel.properties, group.properties, file.properties):
+                    unscaled[channel.name] = unknown
+                    continue
                 values = np.asarray(channel[:])
                 unit = str(channel.properties.get("unit_string", ""))
                 name = channel.name
@@ -48,14 +53,29 @@ def read(path: Path, _: Hints) -> list[Table]:
                 if isinstance(step, float) and step > 0.0:
                     begin = float(channel.properties.get("wf_start_offset", 0.0))
                     clocks[key] = begin + step * np.arange(values.size)
+    notes = left_out(list(unscaled), f"a scale, '{short(next(iter(unscaled.values()), ''))}', that is not known")
+    if notes and not tables:
+        raise UserError(f"{path}: {notes[0]}")
     for key, columns in tables.items():
         if key in clocks and not any(name.split("[")[0].lower() in ("t", *TIMES) for name in columns):
             columns["t[s]"] = clocks[key]
     longest = {group: max(size for of, size in tables if of == group) for group, _ in tables}
     return [
-        of_arrays(group if size == longest[group] else f"{group}:{size}", columns, damaged=damaged)
+        of_arrays(group if size == longest[group] else f"{group}:{size}", columns, notes=notes, damaged=damaged)
         for (group, size), columns in tables.items()
     ]
+
+
+def _unknown_scale(*stated: Mapping[str, Any]) -> str:
+    """The type of the scale of raw readings that nptdms leaves out, as it does not know it; or nothing. `stated`:
+    properties, of which the first with a scale count."""
+    from nptdms.scaling import get_scaling
+
+    for properties in stated:
+        types = [str(value) for name, value in properties.items() if name.endswith("_Scale_Type")]
+        if types and properties.get("NI_Scaling_Status") != "scaled":
+            return ", ".join(types) if get_scaling(properties, {}, {}) is None else ""
+    return ""
 
 
 def _cut(path: Path) -> Damaged:
