@@ -180,7 +180,7 @@ def _multicast() -> bool:
 needs_multicast = pytest.mark.skipif(not _multicast(), reason="NO MULTICAST: ip route add 239.74.163.2 dev lo")
 
 
-def _forked(one: Format, path: Path, hints: Hints, answer: int) -> int:
+def _forked(one: Format, path: Path, hints: Hints, answer: int, _folder: str) -> int:
     """As the product's child, without the start of a new Python and of the reader's library for each file."""
     for module in (f"selfcal.logs.loaders.{one.module}", one.library):
         if module:

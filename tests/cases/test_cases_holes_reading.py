@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import errno
 import gzip
+import json
 import os
+import re
 import resource
+import shlex
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import time
 import zipfile
 from collections.abc import Callable
@@ -23,14 +27,19 @@ import numpy as np
 import pytest
 
 from selfcal.base.errors import UserError
-from selfcal.base.limits import reading
+from selfcal.base.limits import read_text, reading
+from selfcal.base.output import check_writable
 from selfcal.logs.framelog import WRITTEN
 from selfcal.logs.loaders import FORMATS, TEXT, ZIP, child
 from selfcal.logs.loaders.table import Hints
 from selfcal.logs.recording import load, save
+from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.fleet import fleet
+from selfcal.verbs.identify import identify
 from selfcal.verbs.response import response
+from selfcal.wire.command import read_key
+from selfcal.wire.frame_writer import FrameWriter
 
 from conftest import COMMAND, run
 
@@ -312,6 +321,24 @@ def slow_bag(path: Path, rows: int) -> Path:
     return path
 
 
+def by_file(bag: Path, zeros: int = 0, parts: int = 1) -> Path:
+    """A ROS 2 folder whose database is packed as a file, with `zeros` behind it, which SQLite passes by; so often."""
+    from rosbags.rosbag2.reader import zstd
+
+    database = bag / "ros2.db3"
+    packed = zstd.compress(database.read_bytes() + bytes(zeros))
+    for k in range(parts):
+        (bag / f"{k}.db3.zstd").write_bytes(packed)
+    database.unlink()
+    text = (bag / "metadata.yaml").read_text()
+    text = re.sub(r"compression_format: .*", "compression_format: zstd", text)
+    text = re.sub(r"compression_mode: .*", "compression_mode: FILE", text)
+    listed = re.escape("- ros2.db3")
+    text = re.sub(f"( *){listed}\n", lambda m: "".join(f"{m[1]}- {k}.db3.zstd\n" for k in range(parts)), text)
+    (bag / "metadata.yaml").write_text(text)
+    return bag
+
+
 def readers() -> list[str]:
     """Command lines of the readers that are at work."""
     lines = []
@@ -325,13 +352,29 @@ def readers() -> list[str]:
 
 @pytest.mark.parametrize("verb", [("fleet", "-o", "f.csv"), ("identify",)])
 def test_a_command_ends_with_its_readers(verb: tuple[str, ...], tmp_path: Path) -> None:
-    """SIGTERM while readers are at work: command and readers are gone within 2 s on an idle machine; 10 s here."""
-    names = [slow_bag(tmp_path / f"{k}.db3", 3000 + k).name for k in range(2 if verb[0] == "fleet" else 1)]
-    process = subprocess.Popen([*COMMAND, verb[0], *names, *verb[1:]], cwd=tmp_path, stderr=subprocess.DEVNULL)
+    """SIGTERM while readers are at work: command and readers are gone within 2 s on an idle machine; 10 s here. What
+    they unpacked goes with them."""
+    names = [f"bag{k}" for k in range(2 if verb[0] == "fleet" else 1)]
+    for k, name in enumerate(names):
+        bag = logs.write_ros2(logs.Drawn(seconds=0.1), tmp_path).rename(tmp_path / name)
+        (bag / "ros2.db3").unlink()
+        slow_bag(bag / "ros2.db3", 3000 + k)
+        (bag / "metadata.yaml").write_text((bag / "metadata.yaml").read_text().replace("name: /imu/data", "name: imu"))
+        by_file(bag)
+    left = tmp_path / "left"
+    left.mkdir()
+    process = subprocess.Popen(
+        [*COMMAND, verb[0], *names, *verb[1:]],
+        cwd=tmp_path,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, "TMPDIR": str(left)},
+    )
     mine = f"{names[-1]} "
     begun = time.monotonic()
-    while not any(mine in line for line in readers()) and time.monotonic() < begun + 60.0:
+    while len(list(left.rglob("*.db3"))) < len(names) and time.monotonic() < begun + 60.0:
+        assert process.poll() is None
         time.sleep(0.05)
+    time.sleep(0.2)
     assert any(mine in line for line in readers())
     process.terminate()
     told = time.monotonic()
@@ -340,6 +383,7 @@ def test_a_command_ends_with_its_readers(verb: tuple[str, ...], tmp_path: Path) 
         time.sleep(0.02)
     print(f"{verb[0]}: ended in {time.monotonic() - told:.2f} s")
     assert not any(mine in line for line in readers())
+    assert not list(left.iterdir())
 
 
 # ----------------------------------------------------------------------------------------------------- no space is left
@@ -484,7 +528,161 @@ def test_a_small_file_takes_little_memory(name: str, tmp_path: Path) -> None:
     assert int(grown_kb) < 16_000_000 * 16 / 5 / 1024 + 90_000  # and pyarrow
 
 
+@pytest.mark.parametrize(("mib", "parts", "sound"), [(50, 1, True), (70, 1, False), (50, 2, False)])
+def test_a_packed_bag_has_a_bound(
+    mib: int, parts: int, sound: bool, tmp_path: Path, short: logs.Drawn, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A database of a few KB may unpack to 64 MiB, all parts of a bag together. Nothing stays."""
+    bag = by_file(logs.write_ros2(short, tmp_path), mib << 20, parts)
+    left = tmp_path / "left"
+    left.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(left))
+    if sound:
+        assert load(bag).samples == short.t.size
+    else:
+        with pytest.raises(UserError, match=f"^{bag}: unpacks to more than 200 times its size"):
+            load(bag)
+    assert not list(left.iterdir())
+
+
+# ------------------------------------------------------------------------------------------------ numbers that are none
+
+
+@pytest.mark.usefixtures("forked")
+@pytest.mark.parametrize("folder", [False, True])
+def test_messages_beside_a_database(folder: bool, tmp_path: Path, short: logs.Drawn) -> None:
+    """A recorder that was killed: half of its messages are in the -wal. Truth: by the step that the line names, all."""
+    bag = logs.write_ros2(short, tmp_path)
+    with sqlite3.connect(bag / "ros2.db3") as database:
+        database.execute("CREATE TABLE kept AS SELECT * FROM messages WHERE id % 2")
+        database.execute("DELETE FROM messages WHERE id % 2")
+    database.execute("PRAGMA journal_mode = wal")
+    database.execute("INSERT INTO messages SELECT * FROM kept")
+    database.commit()
+    killed = Path(shutil.copytree(bag, tmp_path / "killed"))
+    database.close()
+    log = killed if folder else killed / "ros2.db3"
+    with pytest.raises(UserError, match=r"messages are in ros2\.db3-wal, which is not read: bring them in by ") as told:
+        load(log)
+    _, name, step = shlex.split(str(told.value).partition(" in by ")[2])
+    with sqlite3.connect(name) as copy:
+        copy.execute(step)
+    copy.close()
+    assert load(log).samples == short.t.size
+
+
+@pytest.mark.usefixtures("forked")
+def test_invalid_samples_of_an_mdf_are_missing(tmp_path: Path) -> None:
+    """Each channel has its own. Truth: the samples are their numbers, at 25 Hz; those called invalid are not there."""
+    from asammdf import MDF, Signal
+
+    count = np.arange(600)
+    invalid = {"Gyro_X": count < 60, "Gyro_Y": count >= 540, "Gyro_Z": (count > 300) & (count < 361)}
+    with MDF(version="4.10") as file:
+        kinds = dict(zip(invalid, ("f8", "i2", "f4"), strict=True))
+        file.append(
+            [
+                Signal(count.astype(kinds[name]), count / 25.0, unit="deg/s", name=name, invalidation_bits=none)
+                for name, none in invalid.items()
+            ]
+        )
+        file.save(tmp_path / "log.mf4")
+    recording = load(tmp_path / "log.mf4")
+    place = np.rint(recording.time_s * 25.0).astype(int)
+    for axis, none in zip(("gx", "gy", "gz"), invalid.values(), strict=True):
+        truth = np.where(none, np.nan, count)
+        assert recording.columns[axis].values == pytest.approx(truth[place], nan_ok=True)
+
+
+@pytest.mark.usefixtures("forked")
+@pytest.mark.parametrize("level", ["channel", "group", "file"])
+def test_a_scale_that_is_not_known(level: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """nptdms gives raw counts for it. Truth: gy has a scale of its own, 0.5 deg/s a count."""
+    from nptdms import ChannelObject, GroupObject, RootObject, TdmsWriter
+
+    foreign = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "LookUp"}
+    linear = {"NI_Number_Of_Scales": 1, "NI_Scale[0]_Scale_Type": "Linear", "NI_Scale[0]_Linear_Slope": 0.5,
+              "NI_Scale[0]_Linear_Y_Intercept": 0.0}  # fmt: skip
+    at = {name: foreign if name == level else {} for name in ("channel", "group", "file")}
+    own = {"unit_string": "deg/s", "wf_increment": 0.05}
+    raw = np.arange(80, dtype=np.int16)
+    root, group = RootObject(at["file"]), GroupObject("IMU", at["group"])
+    gx = ChannelObject("IMU", "gx", raw, {**own, **at["channel"]})
+    gy = ChannelObject("IMU", "gy", raw, {**own, **linear})
+    with TdmsWriter(tmp_path / "log.tdms") as writer:
+        writer.write_segment([root, group, gx, gy])
+    recording = load(tmp_path / "log.tdms")
+    assert list(recording.columns) == ["gy"]
+    assert recording.columns["gy"].values == pytest.approx(0.5 * raw)
+    line = "left out: gx: their values come by a scale, 'LookUp', that is not known: export them as physical values"
+    assert line in capsys.readouterr().err
+    with TdmsWriter(tmp_path / "all.tdms") as writer:
+        writer.write_segment([root, group, gx])
+    with pytest.raises(UserError, match=line):
+        load(tmp_path / "all.tdms")
+
+
+def stamped(path: Path, rate: float, last: float) -> Path:
+    """800 rows of noise, the last of which has another stamp."""
+    noise = np.random.default_rng(10).normal(size=800)
+    rows = [f"{k / rate if k < 799 else last!r},{value:.4f}\n" for k, value in enumerate(noise.tolist())]
+    path.write_text("t[s],gy[deg/s]\n" + "".join(rows))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rate", "last"), [(40.0, 2e10), (40.0, 4e12), (40.0, 6e18), (40.0, 1e305), (2e5, 9e8), (0.01, 3e10)]
+)
+def test_a_stamp_beyond_all_counts(rate: float, last: float, tmp_path: Path) -> None:
+    """More seconds, or samples, than a tool counts: the line is named."""
+    line = r"log\.csv: line 801: column 't': the time stamp is \S+ s after the one before: a recording spans at most"
+    with pytest.raises(UserError, match=line):
+        load(stamped(tmp_path / "log.csv", rate, last))
+
+
+def test_the_longest_gap_is_counted(tmp_path: Path) -> None:
+    """Just within the bound. Truth: the samples that fill the gap; `identify` has a result."""
+    log = stamped(tmp_path / "log.csv", 40.0, 9.9e9)
+    assert load(log).lost == pytest.approx(40.0 * 9.9e9, rel=1e-3)
+    assert "error" not in identify(log)["axes"]["gy"]
+
+
+def test_a_rate_beyond_all_counts(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text("gx[deg/s]\n" + "0\n1\n" * 6000)
+    with pytest.raises(UserError, match="12000 rows at 1e-06 Hz: a recording spans at most"):
+        load(tmp_path / "log.csv", rate=1e-6)
+
+
 # ---------------------------------------------------------------------------------------------- what verbs stumble over
+
+
+def test_a_named_pipe_holds_nothing(tmp_path: Path) -> None:
+    """As what is read beside a log, and as an output: refused, by a link too."""
+    for suffix in (".yaml", ".asc", ".mcap"):
+        os.mkfifo(tmp_path / f"pipe{suffix}")
+        (tmp_path / f"link{suffix}").symlink_to(tmp_path / f"pipe{suffix}")
+    for name in ("pipe", "link"):
+        for read in (Model.load, read_key, lambda path: read_text(path, 9, "")):
+            with pytest.raises(UserError, match=f"^{tmp_path / name}.yaml: is a named pipe: write it into a file"):
+                read(tmp_path / f"{name}.yaml")
+        for suffix, write in ((".yaml", check_writable), (".asc", FrameWriter), (".mcap", FrameWriter)):
+            with pytest.raises(UserError, match=f"^{tmp_path / name}{suffix}: cannot be written: it is a named pipe"):
+                write(tmp_path / f"{name}{suffix}")
+
+
+def test_a_pipe_of_the_shell_is_read_and_written(tmp_path: Path) -> None:
+    """`--model <(...) --json >(...)`."""
+    log = stamped(tmp_path / "log.csv", 30.0, 799 / 30.0)
+    model, its_end = os.pipe()
+    answer, to = os.pipe()
+    os.write(its_end, DEFAULT.read_bytes())
+    os.close(its_end)
+    command = [*COMMAND, "identify", log, "--model", f"/dev/fd/{model}", "--json", f"/proc/self/fd/{to}"]
+    done = subprocess.run(command, pass_fds=(model, to), capture_output=True, text=True, check=False, timeout=60.0)
+    os.close(to)
+    assert done.returncode == 0, done.stderr
+    with os.fdopen(answer, encoding="utf-8") as text:
+        assert "gy" in json.load(text)["axes"]
 
 
 @pytest.mark.parametrize("factor", [1.0, -20.0])

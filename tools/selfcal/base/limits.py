@@ -30,6 +30,8 @@ MOST_HEADINGS = 30_000
 MOST_UNPACKED_BYTES, MOST_UNPACKED_SMALL = 1 << 30, 1 << 26
 #: Objects in an R file: each value of a text column is one.
 MOST_R_OBJECTS = 200_000
+#: Names of streams that are open already, be it on a regular file.
+STREAMS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
 #: Metadata of a recording, and a model file.
 MOST_META_BYTES, MOST_MODEL_BYTES = 1 << 20, 1 << 18
 #: Values in a model file, each alias counted as if it were written out.
@@ -60,6 +62,8 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
         what = f"cannot be read: {error.strerror}" if error.strerror else f"{otherwise}: {first_line(error)}"
         if error.errno == errno.ENOSPC:
             what = f"no space left in {tempfile.gettempdir()} to unpack it: TMPDIR names another folder"
+        if error.errno == errno.EFBIG:  # by the bound of child.py
+            what = f"unpacks to more than {MOST_GROWTH} times its size, as no sensor's readings do"
         raise UserError(f"{path}: {what}") from error
     except MemoryError as error:
         raise UserError(f"{path}: too large for this machine's memory") from error
@@ -69,8 +73,15 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
         raise UserError(f"{path}: {otherwise}: {first_line(error)}") from error
 
 
+def named_pipe(path: Path) -> bool:
+    """Whether a path is a pipe of the file system, which may hold its reader or writer for ever. Raises OSError."""
+    return path.is_fifo() and not any(str(one).startswith(STREAMS) for one in (path, path.resolve()))
+
+
 def read_text(path: Path, most: int, otherwise: str) -> str:
     """The text of a file of at most `most` bytes, UTF-8. Raises UserError; FileNotFoundError where there is none."""
+    if named_pipe(path):
+        raise UserError(f"{path}: is a named pipe: write it into a file first")
     with path.open("rb") as stream, reading(path, otherwise):
         data = stream.read(most + 1)
         if len(data) > most:

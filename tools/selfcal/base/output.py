@@ -7,8 +7,10 @@ import json
 import math
 import os
 import secrets
+import shutil
 import stat
 import sys
+import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -16,9 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from selfcal.base.errors import UserError
-
-#: Names of streams that are open already, be it on a regular file.
-_STREAMS = ("/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
+from selfcal.base.limits import STREAMS, named_pipe
 
 
 def check_place(path: Path | str) -> None:
@@ -26,6 +26,8 @@ def check_place(path: Path | str) -> None:
     path = Path(path)
     if path.is_dir():
         raise UserError(f"{path}: cannot be written: it is a folder; give a file name")
+    if named_pipe(path):
+        raise UserError(f"{path}: cannot be written: it is a named pipe, which may have no reader; give a file name")
     if not path.parent.is_dir():
         raise UserError(f"{path}: cannot be written: there is no folder '{path.parent}'; make it first")
 
@@ -89,7 +91,7 @@ class _Pending:
         check_place(path)
         place = path.resolve()  # a link's target is replaced, not the link
         mode = place.stat().st_mode if place.exists() else None
-        if str(path).startswith(_STREAMS) or (mode is not None and not stat.S_ISREG(mode)):
+        if str(path).startswith(STREAMS) or (mode is not None and not stat.S_ISREG(mode)):
             return _Pending(path, path, None)
         # The suffix stays: writers choose the form by it.
         temporary = place.with_name(f".selfcal-{secrets.token_hex(4)}{place.suffix}")
@@ -102,6 +104,18 @@ class _Pending:
             self.temporary.chmod(stat.S_IMODE(self.mode))
         with self.temporary.open("rb") as written:
             os.fsync(written.fileno())
+
+
+@contextmanager
+def temporary_folder() -> Iterator[str]:
+    """A folder for what others unpack, which goes at the end, however they ended; "" where none can be made."""
+    folder = ""
+    with contextlib.suppress(OSError):
+        folder = tempfile.mkdtemp(prefix="selfcal-")
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def write_text(path: Path | str, text: str) -> None:

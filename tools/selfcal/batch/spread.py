@@ -14,6 +14,7 @@ import logging
 import multiprocessing
 import os
 import signal
+import tempfile
 import threading
 import time
 from collections import deque
@@ -31,7 +32,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
 from selfcal.base.errors import UserError, first_line, install, note, printable, shown
-from selfcal.base.output import whole
+from selfcal.base.output import temporary_folder, whole
 from selfcal.base.progress import EVERY_S
 
 #: Whatever a function makes a record of; it is pickled.
@@ -166,8 +167,9 @@ def _piece(function: Callable[[Job], list[Row]], work: Work) -> tuple[int, list[
     return k, [row for job in jobs for row in function(job)]
 
 
-def _obedient() -> None:
-    """A worker ends with its command, however that ends. Ctrl-C is the command's own."""
+def _obedient(folder: str) -> None:
+    """A worker ends with its command, however that ends. Ctrl-C is the command's own. `folder`: for temporary files."""
+    tempfile.tempdir = folder or None
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
@@ -189,16 +191,17 @@ def workers(count: int | None = None) -> Iterator[ProcessPoolExecutor]:
     ends the workers at once.
     """
     others = multiprocessing.active_children()
-    pool = ProcessPoolExecutor(count, initializer=_obedient)
-    try:
-        yield pool
-    except BaseException:
-        for worker in multiprocessing.active_children():
-            if worker not in others:
-                worker.terminate()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)  # and wait: a manager thread left to the interpreter's end races with it
+    with temporary_folder() as folder:
+        pool = ProcessPoolExecutor(count, initializer=_obedient, initargs=(folder,))
+        try:
+            yield pool
+        except BaseException:
+            for worker in multiprocessing.active_children():
+                if worker not in others:
+                    worker.terminate()
+            raise
+        finally:
+            pool.shutdown(cancel_futures=True)  # and wait: a manager thread left to the interpreter's end races with it
 
 
 def _here(

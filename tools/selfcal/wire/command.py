@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from selfcal.base.errors import UserError, called
+from selfcal.base.limits import MOST_META_BYTES, read_text
 from selfcal.wire.dbc_file import NODE_IDS
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of
 
@@ -81,7 +82,7 @@ def frame(data: bytes, node: int = 0) -> can.Message:
 def read_key(path: Path | str) -> bytes:
     """A key file: 32 hexadecimal digits. Raises UserError for anything else."""
     try:
-        key = bytes.fromhex(Path(path).read_text(encoding="ascii").strip())
+        key = bytes.fromhex(read_text(Path(path), MOST_META_BYTES, "no key").strip())
     except FileNotFoundError as error:
         make = f"{called()} command new-key --key {shlex.quote(str(path))}"
         raise UserError(f"{path}: there is no such key; --key names the module's, `{make}` makes one") from error

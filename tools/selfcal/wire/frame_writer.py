@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.base.errors import UserError
+from selfcal.base.output import check_place
 from selfcal.logs.framelog import check_suffix
 from selfcal.wire.streams import McapLog
 
@@ -33,6 +34,7 @@ class FrameWriter:
         try:
             if self.path.is_file() and self.path.stat().st_size:
                 raise UserError(f"{path}: this log exists, and is not written over: delete it or give another name")
+            check_place(self.path)
             mcap = self.path.suffix.lower() == ".mcap"
             self._writer = cast(Any, McapLog(self.path.open("wb")) if mcap else can.Logger(str(path)))
             self._writer.file.flush()

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, printable
-from selfcal.base.limits import MOST_COLUMNS, MOST_NUMBERS, reading
+from selfcal.base.limits import MOST_COLUMNS, MOST_GROWTH, MOST_NUMBERS, MOST_UNPACKED_SMALL, reading
+from selfcal.base.output import temporary_folder
 from selfcal.logs.loaders import Format
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
@@ -40,8 +41,9 @@ _PR_SET_PDEATHSIG = 1
 #: What comes before the JSON: its size.
 _SIZE = struct.Struct("=Q")
 
-#: What starts a reader: (format, path, hints, descriptor for the answer) -> number of its process.
-Start = Callable[[Format, Path, Hints, int], int]
+#: What starts a reader: (format, path, hints, descriptor for the answer, folder for what it unpacks) -> number of its
+#: process. The folder goes after it, however it ended; "" is none.
+Start = Callable[[Format, Path, Hints, int, str], int]
 
 
 def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None) -> list[Table]:
@@ -49,22 +51,23 @@ def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None)
     ends = time.monotonic() + _seconds(path)
     pipe, its_end = os.pipe()
     number, code = 0, 0
-    try:
+    with temporary_folder() as folder:
         try:
-            number = (start or _spawned)(one, path, hints, its_end)
+            try:
+                number = (start or _spawned)(one, path, hints, its_end, folder)
+            finally:
+                os.close(its_end)
+            return _answered(pipe, ends)
+        except EOFError:
+            code = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
+            number = 0
+        except TimeoutError:
+            code = -signal.SIGXCPU
         finally:
-            os.close(its_end)
-        return _answered(pipe, ends)
-    except EOFError:
-        code = os.waitstatus_to_exitcode(os.waitpid(number, 0)[1])
-        number = 0
-    except TimeoutError:
-        code = -signal.SIGXCPU
-    finally:
-        os.close(pipe)
-        if number:
-            os.kill(number, signal.SIGKILL)
-            os.waitpid(number, 0)
+            os.close(pipe)
+            if number:
+                os.kill(number, signal.SIGKILL)
+                os.waitpid(number, 0)
     if code == -signal.SIGXCPU:
         raise UserError(f"{path}: reading it takes more than {_seconds(path):.0f} s: it is damaged, or too long")
     if code >= 0:
@@ -107,9 +110,13 @@ def _received(pipe: int, size: int, ends: float) -> bytearray:
     return data
 
 
+def _parts(path: Path) -> list[Path]:
+    return list(path.iterdir()) if path.is_dir() else [path]
+
+
 def _bytes(path: Path) -> int:
     """Bytes of a file, or of a folder's files. A hole has none; a disk that packs files does so to a sixteenth."""
-    found = [part.stat() for part in (path.iterdir() if path.is_dir() else [path])]
+    found = [part.stat() for part in _parts(path)]
     return sum(min(one.st_size, 16 * 512 * one.st_blocks) for one in found)
 
 
@@ -117,7 +124,7 @@ def _seconds(path: Path) -> float:
     return _LEAST_S + _S_PER_BYTE * _bytes(path)
 
 
-def _spawned(one: Format, path: Path, hints: Hints, answer: int) -> int:
+def _spawned(one: Format, path: Path, hints: Hints, answer: int, folder: str) -> int:
     # -P: no module is imported from the folder that the user is in, where files of strangers may lie.
     what = [one.module, str(path), json.dumps(dict(hints)), str(os.getpid())]
     command = [sys.executable, "-P", "-m", "selfcal.logs.loaders.child", *what]
@@ -127,6 +134,8 @@ def _spawned(one: Format, path: Path, hints: Hints, answer: int) -> int:
         (os.POSIX_SPAWN_OPEN, 2, os.devnull, os.O_WRONLY, 0),
     ]
     environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+    if folder:
+        environment["TMPDIR"] = folder
     return os.posix_spawn(sys.executable, command, environment, file_actions=streams)
 
 
@@ -136,6 +145,9 @@ def answer(module: str, path: Path, hints: Hints, to: int) -> None:
     most = min(_MOST_BYTES, _LEAST_BYTES + _PER_BYTE * _bytes(path))
     _bound(resource.RLIMIT_AS, most, most)
     _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
+    # What it unpacks into files: each part of a folder, but for its index, into one.
+    most = max(MOST_UNPACKED_SMALL, MOST_GROWTH * _bytes(path)) // max(1, len(_parts(path)) - path.is_dir())
+    _bound(resource.RLIMIT_FSIZE, most, most)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     arrays: list[NDArray[np.uint8]] = []
     try:
