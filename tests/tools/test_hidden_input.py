@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from selfcal.diagnosis import hidden
+from selfcal.diagnosis import hidden, module
 from selfcal.likelihood.joint import bins_of, course, fitted
 from selfcal.likelihood.state import NET_LEAST
 from selfcal.logs.recording import load, save
@@ -70,7 +70,9 @@ def test_loadings_and_share_are_those_drawn() -> None:
     random = np.random.default_rng(31)
     truth = random.uniform(0.4, 0.8, 6) * random.choice([-1.0, 1.0], 6)
     y = drawn(random, 6, 3600) + np.outer(truth, markov(random, 3600, 60.0))
-    found = hidden.together(states(y))
+    seen = module.together(states(y), {})
+    assert seen is not None
+    found = seen.hidden
     assert found is not None
     assert found.gain > 100.0
     loading = found.model.loading * found.scale * np.sign(found.model.loading @ truth)
@@ -92,11 +94,16 @@ def test_axes_of_their_own_share_nothing() -> None:
 
 
 def test_a_jump_of_five_axes_is_none() -> None:
-    """One event at one time is no quantity that wanders: each axis names its step."""
+    """One event at one time is no quantity that wanders: a step of five axes."""
     random = np.random.default_rng(5)
     y = drawn(random, 6, 3600)
     y[:5, 1800:] += np.array([1.4, -1.8, 2.0, 1.2, -2.2])[:, None]
-    assert hidden.together(states(y)) is None
+    seen = module.together(states(y), {})
+    assert seen is not None
+    assert seen.hidden is None
+    (event,) = seen.events
+    assert event.cause == "step"
+    assert event.act.axes == [0, 1, 2, 3, 4]
 
 
 def test_the_filter_is_the_dense_likelihood() -> None:

@@ -111,6 +111,7 @@ class Cause:
     id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
     unsure       words instead where the estimate has `source`: which axis is the source is not shown.
     looks        candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
+    at           the look at it with a known shape, on an axis that it is known to act on.
     most         times at most that the loop names it on an axis; 0: as often as it is found.
     before_motion  looks that motion must not be taken for: they come before motion.
     slow         a drift of another law may show it: `identify` weighs more laws.
@@ -146,6 +147,7 @@ class Cause:
     record_next: str
     unsure: str = ""
     looks: Looks | None = None
+    at: Callable[[State, Record, Sequence[float]], Look] | None = None
     most: int = 0
     before_motion: Looks | None = None
     slow: bool = False
@@ -173,6 +175,11 @@ class Cause:
     common: bool = False
     add: Callable[[Mapping[str, Any], Channels], Array] | None = None
     spoil: Callable[[Array, Mapping[str, Any], float, float, Random], None] | None = None
+
+    def located(self, state: State, record: Record, theta: Sequence[float]) -> Look:
+        """The look at it with the shape `theta`."""
+        assert self.at is not None, self.id
+        return self.at(state, record, theta)
 
     def effect(self, look: Look) -> dict[str, Any] | None:
         """Keys of `--effect` for a finding; None: the simulator cannot make it."""

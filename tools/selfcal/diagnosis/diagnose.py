@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import suppress
@@ -93,17 +92,15 @@ def shared_by(found: Mapping[str, Diagnosed], model: Model) -> hidden.Hidden | N
     """What moves several axes and nobody recorded; None: nothing does, or the model file states it."""
     if model.hidden_input is not None:
         return None
-    states = {name: one.state for name, one in found.items() if not one.unfinished}
-    grids = Counter((state.y.size, state.dt) for state in states.values())
-    most = max(grids, key=lambda grid: grids[grid], default=None)
-    return hidden.together({name: state for name, state in states.items() if (state.y.size, state.dt) == most})
+    return next((one.hidden for one in found.values() if one.hidden is not None), None)
 
 
 def entry_of(shared: hidden.Hidden, found: Mapping[str, Diagnosed], recording: Recording) -> dict[str, Any]:
     """The finding of all axes for the document."""
     units = {name: recording.columns[name].unit for name in shared.names}
-    record = found[shared.names[0]].record
-    return hidden.entry(shared, {name: found[name].state for name in shared.names}, units, record.start_s)
+    record = next(one.record for one in found.values() if one.hidden is shared)
+    states = {**record.axes, **{name: one.state for name, one in found.items() if one.hidden is shared}}
+    return hidden.entry(shared, states, units, record.start_s)
 
 
 def less_stated(one: Diagnosed, model: Model) -> Diagnosed:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from selfcal.diagnosis.hidden import Hidden
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.heldout import HeldOut
@@ -38,7 +39,7 @@ class Finding:
 class Diagnosed:
     """One axis after the loop: what it began as, what it is, and what was found in which record. `harmful`: looks that
     predict held-out time clearly worse, which are no findings. `stated`: what the model file has already, which is none
-    either. `unfinished`: why it is not done, "" if it is."""
+    either. `unfinished`: why it is not done, "" if it is. `hidden`: what moves several axes, this one among them."""
 
     first: State
     state: State
@@ -49,6 +50,7 @@ class Diagnosed:
     harmful: list[Look] = field(default_factory=list)
     stated: list[Finding] = field(default_factory=list)
     unfinished: str = ""
+    hidden: Hidden | None = None
 
     @property
     def by_gain(self) -> list[Finding]:

@@ -119,10 +119,28 @@ class Option:
 
 def side_looks(state: State, record: Record, cause: str) -> list[Look]:
     """The look at a side channel, if it was recorded."""
-    if cause not in record.channels:
-        return []
+    return look(state, [_side(record, cause)]) if cause in record.channels else []
+
+
+def side_at(state: State, record: Record, cause: str, theta: Sequence[float]) -> Look:
+    """The look at a side channel that is known to act: in the form that shows best, else by the lag `theta`, or as it
+    is."""
+    channel = _side(record, cause)
+    found = look(state, [channel])
+    if found:
+        return found[0]
+    form, number = ("lag", theta[0]) if theta else ("static", math.nan)
+    option = column_of(channel, state, form, number, 0.0 if theta else channel.widths_s[1])
+    gain, fit = state.with_columns(option.columns)
+    chosen = _Tried(option, gain, net(gain), fit)
+    changes = {"regressors": (*state.regressors, *option.regressors)}
+    estimate = _estimate(state, channel, chosen)
+    return Look(cause, gain, chosen.net, estimate, changes, measure=partial(_measured, channel, chosen))
+
+
+def _side(record: Record, cause: str) -> Channel:
     values = record.channels[cause]
-    channel = Channel(
+    return Channel(
         cause,
         cause,
         record.channel_names[cause],
@@ -133,7 +151,6 @@ def side_looks(state: State, record: Record, cause: str) -> list[Look]:
         noisy=True,
         ln_looks=LN_SMOOTHINGS + LN_SLOW,
     )
-    return look(state, [channel])
 
 
 def look(state: State, channels: Sequence[Channel]) -> list[Look]:

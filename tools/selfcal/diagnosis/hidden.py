@@ -13,45 +13,49 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from selfcal.base import units as unit_module
 from selfcal.diagnosis.model_tree import digits
+from selfcal.likelihood.fit import best
 from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES
 from selfcal.likelihood.joint import (
     LEAST_AXES,
-    Bins,
     Course,
     Joint,
-    Jump,
     ahead,
     bins_of,
+    bridged_rows,
     course,
     fitted,
-    jump,
+    without_each,
     without_lines,
 )
-from selfcal.likelihood.state import NET_LEAST, State, interval, net
+from selfcal.likelihood.state import NET_LEAST, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import Array
 
 #: Its name in the document.
 ID = "hidden_input"
 #: Probability, before the record, that the quantity moves an axis.
 P_ACTS = 0.5
-#: Means of this length at least, s: whatever the rate, a quantity that wanders slowly is in them.
-MEANS_S = 1.0
-#: Means that the joint model takes at least, and the share of them that an axis may lack.
-LEAST, GAPS = 600, 0.3
+#: What an axis that the quantity moves must show, nats.
+ACTS = 3.0
+#: Samples of which an error ahead is taken, at least.
+LEAST = 60
 #: Correlation times that the search begins at.
 LN_LOOKS = math.log(2.0)
 #: Jumps that are named at most.
 JUMPS = 8
-#: Evidence of a jump that is beyond doubt, nats: before the quantity is weighed its wandering looks like jumps.
-CERTAIN = 25.0
-#: Causes of columns that the quantity may be behind.
-MAY_BE_ITS_OWN = ("cross_axis", "vibration", "step")
-#: A jump that one size of the quantity explains to this share is the quantity's own.
-PATTERN = 0.7
+
+
+@dataclass(frozen=True)
+class On:
+    """What the quantity does to an axis: a unit of it does `size` +- `sd`, in the axis' unit; the `probability` that it
+    acts, and its `column`, which no model file can state."""
+
+    size: float
+    sd: float
+    probability: float
+    column: Regressor
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,9 @@ class Hidden:
     @cached_property
     def halves(self) -> tuple[tuple[Joint, Course], tuple[Joint, Course]]:
         """Models of the first half, without the quantity and with it, and their filters over all."""
-        models = _both(self.y[:, : self.y.shape[1] // 2], self.dt)
+        bins = bins_of(bridged_rows(self.y[:, : self.y.shape[1] // 2]))
+        null = fitted(bins, self.dt, False, self.null)
+        models = (null, fitted(bins, self.dt, True, null))
         return (models[0], course(models[0], self.y)), (models[1], course(models[1], self.y))
 
     @property
@@ -101,26 +107,35 @@ class Hidden:
     @cached_property
     def jumps(self) -> list[dict[str, float]]:
         """Jumps beyond the quantity's own wandering, in time: `time_s`, `size` in its unit, `evidence_nats`."""
-        gains = self.course.of_f.copy()
-        gains[: max(3, gains.size // 200)] = 0.0
-        least = float(ndtri(math.exp(-NET_LEAST) / gains.size) ** 2) / 2.0
-        found = []
+        y, found, seen = self.y, [], self.course
+        t = np.arange(y.shape[1])
         for _ in range(JUMPS):
+            score, known = seen.of_f.T
+            gains = 0.5 * score**2 / np.maximum(known, 1e-300)
+            gains[: max(3, gains.size // 200)] = 0.0
             at = int(np.argmax(gains))
-            if gains[at] < least:
+            if net(float(gains[at]), 1, math.log(gains.size)) < NET_LEAST:
                 break
-            size = float(self.course.shock[at, 0] / self.course.known[at, 0, 0]) / self.step
-            found.append({"time_s": at * self.dt, "size": size, "evidence_nats": float(gains[at])})
-            beside = max(1, round(30.0 / self.dt))
-            gains[max(0, at - beside) : at + beside + 1] = 0.0
+            size = float(score[at] / known[at])
+            found.append({"time_s": at * self.dt, "size": size / self.step, "evidence_nats": float(gains[at])})
+            y = y - np.outer(self.model.loading, np.where(t >= at, size * np.exp(-self.model.rate * (t - at)), 0.0))
+            seen = course(self.model, y, smooth=True)
         return sorted(found, key=lambda one: one["time_s"])
 
-    def column(self, name: str, n: int, dt: float) -> Array:
-        """The quantity as the other axes show it, in its unit, on a grid of n samples `dt` s apart."""
-        values = self.columns[self.names.index(name)] / self.step
+    def on(self, state: State) -> On:
+        """What it does to an axis, by the quantity as the other axes show it."""
+        state = state.without({ID})
+        values = self.columns[self.names.index(state.axis)] / self.step
         middle = (np.arange(values.size) + 0.5) * self.dt
-        found: Array = np.interp((np.arange(n) + 0.5) * dt, middle, values)
-        return found
+        column = np.interp((np.arange(state.y.size) + 0.5) * state.dt, middle, values)
+        fits = [state.fitted_with(terms, column) for terms in state.near()]
+        free = [state.fitted_with(terms, np.empty((0, column.size))) for terms in state.near()]
+        fit = best(fits)
+        size, sd = float(fit.c[-1]), float(fit.sd[-1])
+        gain = fit.ln_likelihood - best(free).ln_likelihood
+        ln_odds = math.log(P_ACTS / (1.0 - P_ACTS)) + gain - math.log1p(abs(size) / sd)
+        probability = 1.0 / (1.0 + math.exp(-max(-700.0, min(700.0, ln_odds))))
+        return On(size, sd, probability, Regressor(ID, ID, column, "1", {}))
 
     def correlation(self, one: str, two: str) -> float:
         """Of the white noise of two axes."""
@@ -128,17 +143,7 @@ class Hidden:
         return float(self.model.correlation[at[0], at[1]])
 
 
-def _means(state: State, block: int) -> Array:
-    """Means [k] of the readings less the columns of the model; NaN where half are missing. Columns of another axis, and
-    jumps, may be the quantity's own and stay in."""
-    size = [
-        0.0 if column.cause in MAY_BE_ITS_OWN else c
-        for column, c in zip(state.regressors, state.best.c[1:], strict=True)
-    ]
-    return _blocks(state.y - np.array([state.best.c[0], *size]) @ state.series.columns, block)
-
-
-def _blocks(residual: Array, block: int) -> Array:
+def blocks(residual: Array, block: int) -> Array:
     """Means [k] of blocks; NaN where half are missing."""
     k = residual.size // block
     cells = residual[: k * block].reshape(k, block)
@@ -148,88 +153,29 @@ def _blocks(residual: Array, block: int) -> Array:
     return np.where(2 * count >= block, total / np.maximum(count, 1), np.nan)
 
 
-def together(states: Mapping[str, State]) -> Hidden | None:
-    """What moves several axes beyond their own drifts; None: nothing, or too few axes or means to tell.
+def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
+    """The model of records y [m, n] with the quantity; None: it is not worth its numbers. `null`: without it."""
+    m = len(y)
+    if m < LEAST_AXES:
+        return None
+    bins = bins_of(bridged_rows(y))
+    model = fitted(bins, dt, True, null)
+    if net(model.value - null.value, m + 1, LN_LOOKS) < NET_LEAST:
+        return None
+    # A drift that one axis has beside a walk and a Gauss-Markov process would be taken for the quantity.
+    if (without_each(bins, model) > ACTS).sum() < LEAST_AXES:
+        return None
+    gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
+    return model if net(gain, m + 1, LN_LOOKS) >= NET_LEAST else None
 
-    `states`: of one grid, with what was found in their models. Jumps beyond doubt come first. Those that have the
-    quantity's pattern are its own."""
-    dt = max((state.dt for state in states.values()), default=1.0)
-    block = max(1, round(MEANS_S / dt))
-    found = {name: _means(state, block) for name, state in states.items() if not state.below_lattice}
-    found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}
-    if len(found) < LEAST_AXES or min(y.size for y in found.values()) < LEAST:
-        return None
-    y = np.array(list(found.values()))
-    scale = np.array([np.nanstd(np.diff(row)) for row in y]) / math.sqrt(2.0)
-    y = (y - np.nanmean(y, axis=1)[:, None]) / scale[:, None]
-    span = block * dt
-    y = np.where(np.isfinite(y), without_lines(np.array([_bridged(row) for row in y])), np.nan)
-    if not _worth(*_both(y, span), len(found)):
-        return None
-    sure, calm = _jumps(fitted(_bins(y), span, False), y, CERTAIN)
-    null, model = _both(calm, span)
-    gain = course(model, calm).ln_likelihood - course(null, calm).ln_likelihood
-    if not _worth(null, model, len(found)) or net(gain, len(found) + 1, LN_LOOKS) < NET_LEAST:
-        return None
-    kept = [one for one in sure if _alike(one, model.loading) < PATTERN]
-    for one in kept:
-        y[:, one.at :] -= one.size[:, None]
-    at = range(len(found))
+
+def of_model(names: Sequence[str], model: Joint, y: Array, scale: Array, dt: float) -> Hidden:
+    """What is known of the quantity in a model of records y [m, n] less what was found in them."""
+    null = fitted(bins_of(bridged_rows(y)), dt, False, model)
+    gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
+    at = range(len(names))
     columns = np.array([_of_others(model, y, [k for k in at if k != one]) for one in at])
-    return Hidden(tuple(found), model, null, y, scale, span, gain, columns)
-
-
-def _both(y: Array, dt: float) -> tuple[Joint, Joint]:
-    """The models without the quantity and with it."""
-    bins = _bins(y)
-    null = fitted(bins, dt, False)
-    return null, fitted(bins, dt, True, null)
-
-
-def _worth(null: Joint, model: Joint, axes: int) -> bool:
-    return net(model.value - null.value, axes + 1, LN_LOOKS) >= NET_LEAST
-
-
-def _bins(y: Array) -> Bins:
-    return bins_of(np.array([_bridged(row) for row in y]))
-
-
-def _alike(jump: Jump, loading: Array) -> float:
-    """Share of a jump's information that one size of the quantity explains: 1 where it has the loadings' pattern."""
-    held = np.isfinite(jump.sd)
-    if held.sum() < 2:
-        return 0.0
-    a, b, weight = jump.size[held], loading[held], jump.sd[held] ** -2.0
-    return float((weight * a * b).sum() ** 2 / ((weight * a**2).sum() * max((weight * b**2).sum(), 1e-300)))
-
-
-def _jumps(model: Joint, y: Array, least: float) -> tuple[list[Jump], Array]:
-    """Jumps of two axes or more with this much evidence, and the records less them. One of a single axis is left to
-    the axis. One that is the quantity's own (`Course.of_f`) is passed over."""
-    found: list[Jump] = []
-    y = y.copy()
-    passed = np.zeros(y.shape[1], bool)
-    edge = max(4, y.shape[1] // 200)
-    passed[:edge] = passed[-edge:] = True
-    for _ in range(JUMPS):
-        seen = course(model, y, smooth=True)
-        gains = np.where(passed, 0.0, seen.of_levels)
-        at = int(np.argmax(gains))
-        one = jump(seen, at, y.shape[1])
-        if one.evidence < least:
-            break
-        held = np.isfinite(one.sd)
-        passed[max(0, at - 3) : at + 4] = True
-        if held.sum() < 2 or seen.of_f[max(0, at - 2) : at + 3].max() > PATTERN * gains[at]:
-            continue
-        found.append(one)
-        y[:, at:] -= one.size[:, None]
-    return found, y
-
-
-def _bridged(row: Array) -> Array:
-    there = np.flatnonzero(np.isfinite(row))
-    return np.interp(np.arange(row.size), there, row[there])
+    return Hidden(tuple(names), model, null, y, scale, dt, gain, columns)
 
 
 def _of_others(model: Joint, y: Array, others: Sequence[int]) -> Array:
@@ -251,7 +197,7 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
         read = hidden.y[axis, half + steps - 1 :]
         errors = [ahead(model, one, steps)[half : half + read.size, axis] - read for model, one in (before, after)]
         good = np.isfinite(errors[0]) & np.isfinite(errors[1])
-        if good.sum() < LEAST // 10:
+        if good.sum() < LEAST:
             continue
         rms = [factor * math.sqrt(float((error[good] ** 2).mean())) for error in errors]
         parts = np.array([[part.mean() for part in np.array_split(error[good] ** 2, 8)] for error in errors])
@@ -275,17 +221,15 @@ def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str],
     axes: dict[str, Any] = {}
     scores = []
     for name in hidden.names:
-        state = states[name]
-        gain, fit = state.with_columns(hidden.column(name, state.y.size, state.dt))
-        size, sd = float(fit.c[-1]), float(fit.sd[-1])
-        factor = unit_module.factor(state.unit, units[name])
+        on = hidden.on(states[name])
+        factor = unit_module.factor(states[name].unit, units[name])
         known = held_out(hidden, name, units[name], factor)
         score = known["log_score_per_sample"]
         scores.append((score["samples"] * (score["after"] - score["before"]), score["samples"] * score["sd"]))
-        ln_odds = math.log(P_ACTS / (1.0 - P_ACTS)) + gain - math.log1p(abs(size) / sd)
+        loading = interval(on.size * factor, on.sd * factor, units[name])
         axes[name] = {
-            "estimate": {"loading": interval(size * factor, sd * factor, units[name]), "share": hidden.share(name)},
-            "probability": 1.0 / (1.0 + math.exp(-max(-700.0, min(700.0, ln_odds)))),
+            "estimate": {"loading": loading, "share": hidden.share(name)},
+            "probability": on.probability,
             "gain": known,
         }
     more, sd = sum(one for one, _ in scores), math.sqrt(sum(each**2 for _, each in scores))
@@ -323,8 +267,8 @@ def carried(hidden: Hidden, states: Mapping[str, State]) -> dict[str, Any] | Non
     if not set(hidden.names) <= states.keys():
         return None
     block = max(1, round(hidden.dt / states[hidden.names[0]].dt))
-    y = np.array([_blocks(states[name].y, block) for name in hidden.names]) / hidden.scale[:, None]
-    y = np.where(np.isfinite(y), without_lines(np.array([_bridged(row) for row in y])), np.nan)
+    y = np.array([blocks(states[name].y, block) for name in hidden.names]) / hidden.scale[:, None]
+    y = np.where(np.isfinite(y), without_lines(bridged_rows(y)), np.nan)
     scores = [np.nansum(course(model, y).scores(), axis=1) for model in (hidden.null, hidden.model)]
     more = course(hidden.model, y).ln_likelihood - course(hidden.null, y).ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())

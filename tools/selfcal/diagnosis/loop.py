@@ -8,7 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from selfcal.base.ending import Stopped
-from selfcal.diagnosis import integrity, score
+from selfcal.diagnosis import integrity, module, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
@@ -16,6 +16,7 @@ from selfcal.diagnosis.record import Record, carried
 from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import work
+from selfcal.likelihood.heldout import harmful
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State
 from selfcal.readings.motion import Moved
 
@@ -68,6 +69,7 @@ def diagnose_record(
             found[name] = Diagnosed(spoilt.get(name, states[name]), states[name], record, unfinished=INTERRUPTED)
     seen: dict[str, Seen] = {name: {} for name in states}
     record = _integrity(record, found, handled, advance, works, seen)
+    record = _together(record, found, advance)
 
     def walk(name: str) -> None:
         one, spent = found[name], ""
@@ -196,6 +198,42 @@ def _integrity(
                 found[name].findings.append(Finding(lattice, 0, before, states[name]))
         if name in found:
             found[name].state = states[name]
+    return replace(record, axes=states)
+
+
+def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
+    """What acts on several axes goes into the model of each. One that predicts held-out time worse on all is none."""
+    advance("all axes together")
+    states = dict(record.axes)
+    seen = module.together(states, record.channels, record.since_power_on_s + record.start_s)
+    if seen is None:
+        return record
+    if seen.hidden is not None:
+        for name in seen.hidden.names:
+            on = seen.hidden.on(states[name])
+            if name in found:
+                found[name].hidden = seen.hidden
+            if on.probability >= 0.5:
+                states[name] = states[name].refit(regressors=(*states[name].regressors, on.column))
+    for event in seen.events:
+        names = [seen.names[k] for k in event.act.axes]
+        theta = module.sharpened(event, [states[name] for name in names], seen.dt)
+        findings = {}
+        for name in names:
+            look = CAUSES[event.cause].located(states[name], record, theta)
+            after = states[name].refit(**look.changes)
+            look = replace(look, net=max(look.net, event.evidence))
+            others = tuple(other for other in names if other != name)
+            held_out = score.gain(look, states[name], after, record)
+            findings[name] = Finding(look, 0, states[name], after, shared_with=others, held_out=held_out)
+        if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
+            continue
+        for name, finding in findings.items():
+            states[name] = finding.after
+            if name in found:
+                found[name].findings.append(finding)
+    for name, one in found.items():
+        one.state = states[name]
     return replace(record, axes=states)
 
 

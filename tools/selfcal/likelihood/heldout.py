@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +25,11 @@ class HeldOut:
     @property
     def harms(self) -> bool:
         """Whether the finding predicts the rest of the record clearly worse."""
-        if self.gain is None:
-            return False
-        score = self.gain["log_score_per_sample"]
-        return bool(score["after"] - score["before"] < -HARM_SD * score["sd"])
+        return harmful([self])
+
+
+def harmful(parts: Sequence[HeldOut]) -> bool:
+    """Whether what was found on some axes predicts the rest of the record clearly worse, all axes together."""
+    scores = [one.gain["log_score_per_sample"] for one in parts if one.gain is not None]
+    more = sum(one["samples"] * (one["after"] - one["before"]) for one in scores)
+    return bool(more < -HARM_SD * math.hypot(*(one["samples"] * one["sd"] for one in scores)))

@@ -15,9 +15,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Mask
@@ -30,17 +32,23 @@ TAPERS = 8
 SINGLE, AN_OCTAVE = 64, 24
 #: A bin so far above the level of its neighbours, in units of their mean, holds a line, and so many bins beside it.
 LINE, LINE_BESIDE, NEIGHBOURS = 14.0, 2, 200
+#: The same of a line that its axis shows by itself beyond doubt.
+CLEAR_LINE = 40.0
 #: Correlation times of f that a fit begins at, s.
 STARTS_S = (30.0, 300.0)
+#: The shortest one, s: faster is noise that the axes share.
+FASTEST_S = 10.0
 #: Prior standard deviations of ln sizes and ln rates about the middle of their limits: they keep what the record does
 #: not know from running away, and change ln likelihood by a few tenths elsewhere.
 PRIOR_SD = 3.0
 #: Probability that an axis has a jump that is somewhere; widths of its size, in its own standard deviations.
 P_AXIS, WIDTHS = 0.3, (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 #: A filter has settled when its covariance changes by less than this share a step.
-SETTLED = 1e-9
+SETTLED = 1e-7
 #: Numbers of an axis' own drift: ln of white noise, walk a step, Gauss-Markov deviation, rate a sample.
 OWN = 4
+#: Samples whose columns are whitened before they are summed up.
+CHUNK = 256
 
 Spectra = NDArray[np.complex128]
 
@@ -68,28 +76,43 @@ class Bins:
         return value, slope
 
 
-def _lines(power: Array) -> tuple[Mask, Array]:
-    """Bins [n] of a spectrum that hold a line, or lie beside one, and the level [n] about each."""
+def _lines(power: Array, least: float = LINE) -> Mask:
+    """Bins [n] of a spectrum that hold a line, or lie beside one."""
     half = min(NEIGHBOURS, max(8, power.size // 8))
     groups = np.arange(power.size) // half
     level = np.array([np.median(power[groups == one]) for one in range(groups[-1] + 1)])[groups] / math.log(2.0)
     found = np.zeros(power.size, bool)
-    for at in np.flatnonzero(power > LINE * level):
+    for at in np.flatnonzero(power > least * level):
         if at >= SINGLE // 4:
             found[max(0, at - LINE_BESIDE) : at + LINE_BESIDE + 1] = True
-    return found, level
-
-
-def without_lines(y: Array) -> Array:
-    """Records [m, n] without gaps, whose lines are brought down to the level of the noise about them."""
-    spectra = np.fft.rfft(np.diff(y, axis=1), axis=1)
-    for row in spectra:
-        power = np.abs(row) ** 2
-        lines, level = _lines(power)
-        row[lines] *= np.sqrt(np.minimum(1.0, level / np.maximum(power, 1e-300)))[lines]
-    steps = np.fft.irfft(spectra, y.shape[1] - 1, axis=1)
-    found: Array = y[:, :1] + np.concatenate([np.zeros((y.shape[0], 1)), np.cumsum(steps, axis=1)], axis=1)
     return found
+
+
+def bridged_rows(y: Array) -> Array:
+    """Records [m, n] with their gaps bridged."""
+    found = np.array(y)
+    for row in found:
+        there = np.flatnonzero(np.isfinite(row))
+        row[:] = np.interp(np.arange(row.size), there, row[there])
+    return found
+
+
+def without_lines(y: Array) -> tuple[Array, Mask]:
+    """Records [m, n] without gaps less their lines, and the frequencies [n // 2 + 1] at which that was done.
+
+    A line is taken to 0 Hz and its slow amplitude out. The amplitude goes on as its mirror at the ends, so that one
+    whose frequency wanders does not ring there."""
+    n = y.shape[1]
+    where = np.any([_lines(np.abs(row) ** 2, CLEAR_LINE) for row in np.fft.rfft(np.diff(y, axis=1), axis=1)], axis=0)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
+    found, pad = y - y.mean(axis=1)[:, None], n // 8
+    for first, end in edges.reshape(-1, 2):
+        turn = np.exp(2j * math.pi * 0.5 * (first + end - 1) / (n - 1) * np.arange(n))
+        slow = np.fft.fft(np.pad(found * turn.conj(), ((0, 0), (pad, pad)), "reflect"), axis=1)
+        slow[:, np.abs(np.fft.fftfreq(slow.shape[1])) > 0.5 * (end - first) / (n - 1)] = 0.0
+        found = found - 2.0 * (np.fft.ifft(slow, axis=1)[:, pad : pad + n] * turn).real
+    place = np.minimum(np.rint(np.arange(n // 2 + 1) * (where.size - 1) / (n // 2)), where.size - 1)
+    return found, where[place.astype(int)]
 
 
 def bins_of(y: Array) -> Bins:
@@ -101,7 +124,7 @@ def bins_of(y: Array) -> Bins:
     z = (z * math.sqrt(2.0 / n))[:, :, 2:-1]
     turn = 2.0 * math.pi * np.arange(2, 2 + z.shape[2]) / n
     power = (np.abs(z) ** 2).mean(axis=0)
-    kept = ~np.any([_lines(row)[0] for row in power], axis=0)
+    kept = ~np.any([_lines(row) for row in power], axis=0)
     z, turn = z[:, :, kept], turn[kept]
     place = np.arange(turn.size)
     octave = np.log2(np.maximum(place, SINGLE) / SINGLE)
@@ -131,6 +154,26 @@ class Joint:
     def without_f(self) -> Joint:
         """The same model less f."""
         return replace(self, loading=np.zeros_like(self.loading))
+
+    def stiffer(self, by: float) -> Joint:
+        """The same with own drifts smaller by exp(-by)."""
+        return replace(self, own=self.own - by * np.array([0.0, 1.0, 1.0, 0.0]))
+
+    def of_means(self, block: int) -> Joint:
+        """The same of means of so many samples, for columns that are slow beside them."""
+        by = math.log(block)
+        return replace(self, own=self.own + by * np.array([-0.5, 1.0, 0.5, 1.0]), rate=self.rate * block)
+
+    def precision(self, turn: Array) -> Array:
+        """Inverse spectrum [k, m, m] of the first differences at angles `turn` [k] above 0."""
+        bins = Bins(np.empty(0), turn, np.empty(0))
+        S = bins.white[:, None, None] * (self.correlation * np.outer(self.white, self.white))
+        place = np.arange(self.white.size)
+        scale = np.exp(2.0 * self.own[:, 0])
+        drift = [np.exp(2.0 * one[2]) * bins.markov(math.exp(one[3]))[0] + np.exp(2.0 * one[1]) for one in self.own]
+        S[:, place, place] += np.stack(drift, axis=1) * scale
+        S += bins.markov(self.rate)[0][:, None, None] * np.outer(self.loading, self.loading)
+        return np.asarray(np.linalg.inv(S))
 
     def of(self, axes: Sequence[int]) -> Joint:
         """The model of some of the axes."""
@@ -232,21 +275,24 @@ def _strictly(values: Array, m: int) -> Array:
 
 
 def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
-    """The model of most likelihood, with f or without. `start`: the one without f, for f to be added to."""
+    """The model of most likelihood, with f or without. `start`: one near it, to which f is added if it has none."""
     from scipy.optimize import minimize  # a quarter of a second to import: for records of several axes alone
 
     cost, m = _Cost(bins, f), bins.power.shape[1]
     size, rate = np.log(SIZE_LIMITS), np.log(np.array(ALPHA_LIMITS) * dt)
     rate[1] = min(rate[1], math.log(2.0))
     bounds = [(-4.0, 4.0), tuple(size), tuple(size), tuple(rate)] * m + [(-9.0, 9.0)] * (m * (m - 1) // 2)
-    bounds += [(-50.0, 50.0)] * m + [tuple(rate)] if f else []
+    common = (rate[0], min(rate[1], math.log(dt / FASTEST_S)))
+    bounds += [(-50.0, 50.0)] * m + [common] if f else []
     own = np.tile([0.0, -4.0, -1.5, math.log(0.01 * dt)], (m, 1)) if start is None else start.own
     root = np.linalg.cholesky(np.eye(m) if start is None else start.correlation)
     root = root / np.diag(root)[:, None]
     own = np.clip(own, *np.array(bounds[:OWN]).T)
     head = np.concatenate([own.ravel(), root[_lower(m)]])
     tries = [head]
-    if f:
+    if f and start is not None and start.loading.any():
+        tries = [np.concatenate([head, start.loading / start.white, [math.log(start.rate)]])]
+    elif f:
         vector = _together(bins, own)
         tries = [np.concatenate([head, vector, [np.clip(math.log(dt / tau), *bounds[-1])]]) for tau in STARTS_S]
     best = min(
@@ -255,6 +301,20 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     )
     own, _, correlation, loading, ln_rate = cost.parts(best.x)
     return Joint(own, correlation, loading * np.exp(own[:, 0]), math.exp(ln_rate), -float(best.fun))
+
+
+def without_each(bins: Bins, model: Joint) -> Array:
+    """What ln likelihood loses [m] where f does not move an axis."""
+    cost = _Cost(bins, True)
+    root = np.linalg.cholesky(model.correlation)
+    root = (root / np.diag(root)[:, None])[_lower(cost.m)]
+    relative = model.loading / model.white
+
+    def value(loading: Array) -> float:
+        return cost(np.concatenate([model.own.ravel(), root, loading, [math.log(model.rate)]]))[0]
+
+    found: Array = np.array([value(np.where(np.arange(cost.m) == k, 0.0, relative)) for k in range(cost.m)])
+    return found - value(relative)
 
 
 def _together(bins: Bins, own: Array) -> Array:
@@ -269,38 +329,42 @@ def _together(bins: Bins, own: Array) -> Array:
 
 
 @dataclass(frozen=True)
+class Gain:
+    """Of the filter at one sample: covariance before it, gain, inverse root of the innovations' covariance, and the
+    axes that are `there`."""
+
+    P: Array
+    K: Array
+    inverse: Array
+    there: Mask
+
+
+@dataclass(frozen=True)
 class Course:
     """What filter and smoother make of a record. `ln_likelihood`; `innovations` [n, m] of each axis (NaN: missing) and
     their variances `spread` [n, m]; `predicted` [n, s]: the states before each sample. Of the smoother: the states
-    [n, s]; `shock` [n, s] and `known` [n, 1 + m, 1 + m]: score of a jump of each state just before each sample, and the
-    information of jumps of f and of the levels."""
+    [n, s]; `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its product
+    with them; `shock` [n, m] and `known` [n, m, m]: score of a jump of each level just before each sample, and its
+    information; `gains`: of the filter at each sample."""
 
     ln_likelihood: float
     innovations: Array
     spread: Array
     predicted: Array
     states: Array = field(default_factory=lambda: np.empty((0, 0)))
-    shock: Array = field(default_factory=lambda: np.empty((0, 0)))
+    weights: Array = field(default_factory=lambda: np.empty((0, 0)))
+    of_f: Array = field(default_factory=lambda: np.empty((0, 2)))
     known: Array = field(default_factory=lambda: np.empty((0, 0, 0)))
+    gains: Sequence[Gain] = ()
+
+    @cached_property
+    def shock(self) -> Array:
+        """Score [n, m] of a jump of each level just before each sample."""
+        return np.asarray(np.cumsum(self.weights[::-1], axis=0)[::-1])
 
     def scores(self) -> Array:
         """ln likelihood [n, m] of each reading given the past of all axes; NaN where it is missing."""
         found: Array = -0.5 * (np.log(2.0 * math.pi * self.spread) + self.innovations**2 / self.spread)
-        return found
-
-    @cached_property
-    def of_f(self) -> Array:
-        """Gain of ln likelihood [n] by a jump of f."""
-        return 0.5 * self.shock[:, 0] ** 2 / np.maximum(self.known[:, 0, 0], 1e-300)
-
-    @cached_property
-    def of_levels(self) -> Array:
-        """The same [n] by a jump of every level, each of its own size."""
-        r, m = self.shock[:, 1 : self.known.shape[1]], self.known.shape[1] - 1
-        firm = self.known[:, 1:, 1:] + 1e-12 * np.trace(self.known[:, 1:, 1:], axis1=1, axis2=2)[
-            :, None, None
-        ] * np.eye(m)
-        found: Array = 0.5 * np.einsum("ni,ni->n", r, np.linalg.solve(firm, r[:, :, None])[:, :, 0])
         return found
 
 
@@ -313,35 +377,42 @@ def ahead(model: Joint, found: Course, steps: int) -> Array:
     return predicted
 
 
+def _dynamics(model: Joint) -> tuple[Array, Array, Array]:
+    """Decay of the states a sample, their noise, and how the axes read them. States: f, then walk and Gauss-Markov
+    drift of each axis."""
+    m = model.loading.size
+    own, scale = model.own, np.exp(2.0 * model.own[:, 0])
+    decay = np.concatenate([[math.exp(-model.rate)], np.ones(m), np.exp(-np.exp(own[:, 3]))])
+    noise = np.concatenate([[1.0], scale * np.exp(2.0 * own[:, 1]), scale * np.exp(2.0 * own[:, 2])])
+    noise *= np.concatenate([[-math.expm1(-2.0 * model.rate)], np.ones(m), -np.expm1(-2.0 * np.exp(own[:, 3]))])
+    return decay, noise, np.hstack([model.loading[:, None], np.eye(m), np.eye(m)])
+
+
 def course(model: Joint, y: Array, smooth: bool = False) -> Course:
-    """Filter records y [m, n] (NaN: missing). States: f, then walk and Gauss-Markov drift of each axis. The levels are
-    unknown: the walks begin with a wide prior.
+    """Filter records y [m, n] (NaN: missing). The levels are unknown: the walks begin with a wide prior.
 
     Backwards runs r' = H' S^-1 v + L' r (de Jong, Biometrika 75, 1988): the score of a jump of each state; its
     information runs likewise (Harvey & Koopman, J. Bus. Econ. Stat. 10, 1992)."""
     m, n = y.shape
-    size = 1 + 2 * m
+    decay, noise, H = _dynamics(model)
+    size = decay.size
     work.count(n, size)
-    own, scale = model.own, np.exp(2.0 * model.own[:, 0])
-    decay = np.concatenate([[math.exp(-model.rate)], np.ones(m), np.exp(-np.exp(own[:, 3]))])
-    variance = scale * np.exp(2.0 * own[:, 2])
-    noise = np.concatenate([[1.0], scale * np.exp(2.0 * own[:, 1]), variance])
-    noise *= np.concatenate([[-math.expm1(-2.0 * model.rate)], np.ones(m), -np.expm1(-2.0 * np.exp(own[:, 3]))])
-    H = np.hstack([model.loading[:, None], np.eye(m), np.eye(m)])
+    scale = np.exp(2.0 * model.own[:, 0])
     R = model.correlation * np.outer(model.white, model.white)
     wide = 1e6 * max(1.0, float(scale.max()))
-    P = np.diag(np.concatenate([[1.0], np.full(m, wide), variance]))
+    P = np.diag(np.concatenate([[1.0], np.full(m, wide), scale * np.exp(2.0 * model.own[:, 2])]))
     x = np.zeros(size)
     present: Mask = np.isfinite(y)
     whole: Mask = np.all(present, axis=0)
     innovations, spread = np.full((n, m), np.nan), np.full((n, m), np.nan)
-    kept: list[tuple[Array, Array, Array, Array]] = []
+    gains: list[Gain] = []
+    kept: list[Array] = []
     predicted = np.empty((n, size))
     total, first = 0.0, np.ones(m, bool)
-    gain: tuple[Array, Array, Array, Array, float, Array] | None = None
+    steady: tuple[Gain, Array, float, Array] | None = None
     for t in range(n):
         at = slice(None) if whole[t] else np.flatnonzero(present[:, t])
-        if gain is None or not whole[t]:
+        if steady is None or not whole[t]:
             h = H[at]
             S = h @ P @ h.T + R[np.ix_(present[:, t], present[:, t])]
             if h.shape[0]:
@@ -355,84 +426,111 @@ def course(model: Joint, y: Array, smooth: bool = False) -> Course:
             P_next = after * np.outer(decay, decay) + np.diag(noise)
             P_next = 0.5 * (P_next + P_next.T)
             settled = whole[t] and float(np.abs(P_next - P).max()) < SETTLED * float(np.abs(np.diag(P_next)).max())
-            now = (P, K, inverse, h, ln_det, np.diag(S))
-            gain = now if settled else None
+            now = (Gain(P, K, inverse, present[:, t]), h, ln_det, np.diag(S))
+            steady = now if settled else None
             P = P_next
         else:
-            now = gain
-        at_P, K, inverse, h, ln_det, variances = now
+            now = steady
+        gain, h, ln_det, variances = now
         v = y[at, t] - h @ x
-        u = inverse @ v
+        u = gain.inverse @ v
         predicted[t] = x
         if smooth:
-            kept.append((at_P, K, inverse, v))
+            gains.append(gain)
+            kept.append(u)
         if first.any():  # the first reading of an axis sets its level
             first &= ~present[:, t]
         else:
             total -= 0.5 * (float(u @ u) + ln_det)
         innovations[t, at], spread[t, at] = v, variances
-        x = decay * (x + K @ v)
+        x = decay * (x + gain.K @ v)
     if not smooth:
         return Course(total, innovations, spread, predicted)
     r, N = np.zeros(size), np.zeros((size, size))
-    states, shock, known = np.empty((n, size)), np.empty((n, size)), np.empty((n, 1 + m, 1 + m))
-    steady: Array | None = None
+    states, weights, of_f, known = np.empty((n, size)), np.zeros((n, m)), np.empty((n, 2)), np.empty((n, m, m))
+    constant = False
     for t in range(n - 1, -1, -1):
-        at_P, K, inverse, v = kept[t]
-        h = H if whole[t] else H[present[:, t]]
-        weight = inverse.T @ inverse
-        L = np.diag(decay) @ (np.eye(size) - K @ h)
-        r = h.T @ (weight @ v) + L.T @ r
-        same = t + 1 < n and kept[t + 1][0] is at_P
-        if steady is None or not same:
-            N_next = h.T @ weight @ h + L.T @ N @ L
-            steady = N_next if same and float(np.abs(N_next - N).max()) < 1e-9 * float(np.abs(N_next).max()) else None
+        gain = gains[t]
+        same = t + 1 < n and gains[t + 1] is gain
+        if not same:
+            h = H if whole[t] else H[gain.there]
+            whiten = gain.inverse.T @ gain.inverse
+            L, back = decay[:, None] * (np.eye(size) - gain.K @ h), (decay[:, None] * gain.K).T
+            own = h.T @ whiten @ h
+        e = gain.inverse.T @ kept[t]
+        weights[t, slice(None) if whole[t] else gain.there] = e - back @ r
+        r = h.T @ e + L.T @ r
+        if not (constant and same):
+            N_next = own + L.T @ N @ L
+            constant = same and float(np.abs(N_next - N).max()) < SETTLED * float(np.abs(N_next).max())
             N = N_next
-        states[t] = predicted[t] + at_P @ r
-        shock[t], known[t] = r, N[: 1 + m, : 1 + m]
-    return Course(total, innovations, spread, predicted, states, shock, known)
+        states[t] = predicted[t] + gain.P @ r
+        of_f[t], known[t] = (r[0], N[0, 0]), N[1 : 1 + m, 1 : 1 + m]
+    return Course(total, innovations, spread, predicted, states, weights, of_f, known, gains)
+
+
+def information(model: Joint, found: Course, columns: Array) -> Array:
+    """Information [k, m, m] of each column [k, n] on every axis, beside the levels. `found`: with its smoother."""
+    decay, _, H = _dynamics(model)
+    (k, n), m = columns.shape, model.loading.size
+    total, X = np.zeros((k, m, m)), np.zeros((decay.size, k * m))
+    eye, block = np.eye(m), np.zeros((CHUNK, m, k * m))
+    for begin in range(0, n, CHUNK):
+        work.count(CHUNK, k)
+        block[:] = 0.0
+        for t in range(begin, min(n, begin + CHUNK)):
+            gain = found.gains[t]
+            read = (eye[:, None, :] * columns[:, t][None, :, None]).reshape(m, k * m)
+            V = (read - H @ X)[gain.there]
+            block[t - begin, : V.shape[0]] = gain.inverse @ V
+            X = decay[:, None] * (X + gain.K @ V)
+        each = block.reshape(CHUNK * m, k, m).transpose(1, 0, 2)
+        total += each.transpose(0, 2, 1) @ each
+    return total
 
 
 @dataclass(frozen=True)
-class Jump:
-    """A jump of the levels of some axes at sample `at`: its evidence in nats over no jump anywhere, the probability
-    [m] that each axis has it, and sizes [m] with their standard deviations."""
+class Act:
+    """What a column of unknown size on unknown axes is worth: `evidence`, nats over none, its search not paid;
+    `probability` [m] that each axis has it; sizes [p, m] of its p parts with their standard deviations [m], nothing and
+    infinite where that is below a half."""
 
-    at: int
     evidence: float
     probability: Array
     size: Array
     sd: Array
 
+    @property
+    def axes(self) -> list[int]:
+        return [int(k) for k in np.flatnonzero(np.isfinite(self.sd))]
 
-def jump(found: Course, at: int, n: int) -> Jump:
-    """What a jump at a sample is worth: a sum over the sets of axes that may have it.
 
-    Its sizes are normal about 0 with one width for all axes of a set, in standard deviations of each axis' own size.
-    The search over n samples is paid for once, whatever the set."""
-    r, N = found.shock[at, 1 : found.known.shape[1]], found.known[at, 1:, 1:]
-    m = r.size
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
-    z, R = r * scale, N * np.outer(scale, scale)
-    ln_weight, sets = [], []
-    for bits in range(1, 1 << m):
-        chosen = [k for k in range(m) if bits >> k & 1]
-        rho, x = R[np.ix_(chosen, chosen)], z[chosen]
-        ln_bf = [
-            0.5 * float(x @ np.linalg.solve(rho + np.eye(len(chosen)) / w**2, x))
-            - 0.5 * float(np.linalg.slogdet(np.eye(len(chosen)) + w**2 * rho)[1])
-            for w in WIDTHS
-        ]
-        ln_prior = len(chosen) * math.log(P_AXIS) + (m - len(chosen)) * math.log1p(-P_AXIS)
-        ln_weight.append(ln_prior + float(np.logaddexp.reduce(ln_bf)) - math.log(len(WIDTHS)))
-        sets.append([bits >> k & 1 for k in range(m)])
-    ln_any = math.log1p(-((1.0 - P_AXIS) ** m))
-    total = float(np.logaddexp.reduce(ln_weight))
-    share = np.exp(np.array(ln_weight) - total)
-    probability = share @ np.array(sets, np.float64)
+def act(score: Array, known: Array) -> Act:
+    """Of scores [p, m] of the p parts of a column that share the information `known` [m, m]: a sum over the sets of
+    axes. Sizes are normal about 0 with one width for all axes of a set, in standard deviations of each axis' own."""
+    p, m = score.shape
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(known), 1e-300))
+    z, R = score * scale, known * np.outer(scale, scale)
+    widths = np.array(WIDTHS)
+    values, members = [], []
+    for count in range(1, m + 1):
+        sets = np.array(list(combinations(range(m), count)))
+        rho = R[sets[:, :, None], sets[:, None, :]][None]
+        firm = rho + np.eye(count) / widths[:, None, None, None] ** 2
+        x = np.moveaxis(z[:, sets], 0, -1)[None]
+        explained = 0.5 * (x * np.linalg.solve(firm, np.broadcast_to(x, (widths.size, *x.shape[1:])))).sum(axis=(2, 3))
+        volume = np.linalg.slogdet(firm)[1] + 2.0 * count * np.log(widths)[:, None]
+        ln_bf = logsumexp(explained - 0.5 * p * volume, axis=0) - math.log(widths.size)
+        values.append(ln_bf + count * math.log(P_AXIS) + (m - count) * math.log1p(-P_AXIS))
+        one = np.zeros((len(sets), m))
+        np.put_along_axis(one, sets, 1.0, axis=1)
+        members.append(one)
+    ln_weight = np.concatenate(values)
+    total = float(logsumexp(ln_weight))
+    probability = np.exp(ln_weight - total) @ np.vstack(members)
     held = np.flatnonzero(probability >= 0.5)
-    size, sd = np.zeros(m), np.full(m, math.inf)
+    size, sd = np.zeros((p, m)), np.full(m, math.inf)
     if held.size:
-        inverse = np.linalg.inv(N[np.ix_(held, held)])
-        size[held], sd[held] = inverse @ r[held], np.sqrt(np.diag(inverse))
-    return Jump(at, total - ln_any - math.log(n), probability, size, sd)
+        inverse = np.linalg.inv(known[np.ix_(held, held)])
+        size[:, held], sd[held] = score[:, held] @ inverse, np.sqrt(np.diag(inverse))
+    return Act(total - math.log1p(-((1.0 - P_AXIS) ** m)), probability, size, sd)

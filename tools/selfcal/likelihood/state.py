@@ -296,6 +296,12 @@ def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
     }
 
 
+def sizes(column: Array, key: str, unit: str, state: State) -> dict[str, Any]:
+    """The posterior of a column's coefficient in the form of the contract."""
+    weight, means, sds = (of[0] for of in state.posterior(column))
+    return {key: mixture(weight, means[:, 0], sds[:, 0], unit)}
+
+
 def mixture(weight: Array, mean: Array, sd: Array | float, unit: str) -> dict[str, Any]:
     """A posterior that is a sum of normals, `weight` of each not normalized, in the form of the contract."""
     found = of_mixture(weight, mean, np.broadcast_to(np.asarray(sd, np.float64), mean.shape))

@@ -179,6 +179,8 @@ def diagnose(
             if shared is not None:
                 tree["hidden_input"] = hidden.stated(shared)
                 for name, law in hidden.own_laws(shared).items():
+                    if name not in found:
+                        continue
                     kept = {key: tree["simulate"]["axes"][name][key] for key in ("bias", "N")}
                     tree["simulate"]["axes"][name] = {**law, **kept}
             document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])

@@ -160,20 +160,30 @@ def _line(state: State, record: Record) -> list[Look]:
         ).x
     )
 
-    def fitted(f: float) -> tuple[float, Array, float, Fit]:
-        pair = np.array([*columns(f, record).values()])
-        return f, pair, *state.with_columns(pair)
-
-    f, pair, gain, chosen = fitted(best)
+    f, pair, gain, chosen = _fitted(state, record, best)
     if f > half - low:  # a line at half the rate also fits beside it, with a column and a frequency more than it needs
-        one = fitted(half)
+        one = _fitted(state, record, half)
         if net(gain - one[2], 2) < NET_LEAST:
             f, pair, gain, chosen = one
     if f < 30.0 * width:
         gain = min(gain, state.rich_gain(pair))
     worth = net(gain, len(pair), ln_lines(n, gain))
-    if worth < 1.0:
-        return []
+    return [_look(state, record, f, pair, gain, worth, chosen)] if worth >= 1.0 else []
+
+
+def at(state: State, record: Record, theta: Sequence[float]) -> Look:
+    """The look at a line of a known frequency."""
+    f, pair, gain, chosen = _fitted(state, record, theta[0])
+    return _look(state, record, f, pair, gain, net(gain, len(pair)), chosen)
+
+
+def _fitted(state: State, record: Record, f: float) -> tuple[float, Array, float, Fit]:
+    pair = np.array([*columns(f, record).values()])
+    return f, pair, *state.with_columns(pair)
+
+
+def _look(state: State, record: Record, f: float, pair: Array, gain: float, worth: float, chosen: Fit) -> Look:
+    n, half = state.y.size, 0.5 * record.rate_hz
     c, sd = chosen.c[-len(pair) :], chosen.sd[-len(pair) :]
     spread = _spread(c, sd, n * state.dt)
     if worth >= NET_LEAST and f < half:
@@ -195,16 +205,14 @@ def _line(state: State, record: Record) -> list[Look]:
     name = f"line_{f:.6g}Hz"
     entry = {"kind": "periodic", "frequency_hz": f}
     added = [Regressor(name + end, "periodic", one, "1", entry) for end, one in columns(f, record).items()]
-    return [
-        Look(
-            "periodic",
-            gain,
-            worth,
-            {"frequency_hz": interval(f, spread, "Hz"), "amplitude": amplitude},
-            {"regressors": (*state.regressors, *added)},
-            measure=measure,
-        )
-    ]
+    return Look(
+        "periodic",
+        gain,
+        worth,
+        {"frequency_hz": interval(f, spread, "Hz"), "amplitude": amplitude},
+        {"regressors": (*state.regressors, *added)},
+        measure=measure,
+    )
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
@@ -302,6 +310,7 @@ CAUSE = Cause(
     "A periodic disturbance of one frequency is in the readings.",
     "Record at another rate: a line that moves is an alias.",
     looks=looks,
+    at=at,
     before_motion=looks,
     alike=_alike,
     settle=_settle,

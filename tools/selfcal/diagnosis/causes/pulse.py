@@ -20,7 +20,7 @@ from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
-from selfcal.likelihood.state import Look, Regressor, State, gain_for, ln_looks, mixture, net
+from selfcal.likelihood.state import Look, Regressor, State, gain_for, interval, ln_looks, mixture, net, sizes
 from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Terms
 
 #: Blocks that the pairs are looked for in, and places of a step among them.
@@ -77,13 +77,34 @@ def looks(state: State, record: Record) -> list[Look]:
     worth = _worth(steps, gain)
     if worth < 1.0:
         return []
+    return [_look(state, record, begin, end, gain, worth, posterior(record.time_s, begin, end, state, brief=True))]
+
+
+def at(state: State, record: Record, theta: Sequence[float]) -> Look:
+    """The look at a pulse of known times."""
+    begin, end = (round(time / state.dt) for time in theta)
+    column = raised(state.y.size, begin, end)
+    gain, fit = state.with_columns(column)
+    edge = state.dt / math.sqrt(12.0)
+    estimate = {
+        "time_s": interval(begin * state.dt - 0.5 * state.dt, edge, "s"),
+        "duration_s": interval((end - begin) * state.dt, math.sqrt(2.0) * edge, "s"),
+        "amplitude": interval(float(fit.c[-1]), float(fit.sd[-1]), state.unit),
+    }
+    found = _look(state, record, begin, end, gain, net(gain), estimate)
+    return replace(found, measure=partial(sizes, column, "amplitude", state.unit))
+
+
+def _look(
+    state: State, record: Record, begin: int, end: int, gain: float, worth: float, estimate: Mapping[str, Any]
+) -> Look:
+    found = raised(state.y.size, begin, end)
     times = [float(record.time_s[place]) for place in (begin, end)]
     entry = {"kind": "pulse", "start_s": times[0], "end_s": times[1]}
     column = Regressor(_name(*times), "pulse", found, "1", entry)
-    estimate = posterior(record.time_s, begin, end, state, brief=True)
     changes = {"regressors": (*state.regressors, column)}
     measure = partial(posterior, record.time_s, begin, end)
-    return [Look("pulse", gain, worth, estimate, changes, when=(times[0], times[1]), measure=measure)]
+    return Look("pulse", gain, worth, estimate, changes, when=(times[0], times[1]), measure=measure)
 
 
 def _worth(steps: Scan, gain: float) -> float:
@@ -295,6 +316,7 @@ CAUSE = Cause(
     "The bias jumps, and after a while it jumps back.",
     "Look for what was switched on and off at these times.",
     looks=looks,
+    at=at,
     most=3,
     slow=True,
     alike=_alike,

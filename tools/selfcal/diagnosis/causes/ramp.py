@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
+from functools import partial
 
 from selfcal.diagnosis.cause import Cause, Key, shown
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import SCREEN, Look, Regressor, State, interval, mixture, net
+from selfcal.likelihood.fit import Fit
+from selfcal.likelihood.state import SCREEN, Look, Regressor, State, interval, net, sizes
 from selfcal.model.regressors import coefficient_unit
 
 
@@ -15,25 +17,35 @@ def looks(state: State, record: Record) -> list[Look]:
     """One look while the model has no ramp."""
     if any(one.name == "time" for one in state.regressors):
         return []
-    t = record.time_s
-    middle = float(0.5 * t[-1])
-    column = Regressor("time", "ramp", t - middle, "s", {"kind": "time", "reference": middle})
+    column = _column(record)
     if state.scores([column.values])[0] < SCREEN:
         return []
     gain, fit = state.with_columns(column.values)
     gain = min(gain, state.rich_gain(column.values))
     worth = net(gain, 1, LN_SLOW)
-    if worth < 1.0:
-        return []
+    return [_look(state, column, gain, worth, fit)] if worth >= 1.0 else []
+
+
+def at(state: State, record: Record, theta: Sequence[float]) -> Look:
+    """The look at a ramp that is known to be there."""
+    column = _column(record)
+    gain, fit = state.with_columns(column.values)
+    return _look(state, column, gain, net(gain), fit)
+
+
+def _column(record: Record) -> Regressor:
+    t = record.time_s
+    middle = float(0.5 * t[-1])
+    return Regressor("time", "ramp", t - middle, "s", {"kind": "time", "reference": middle})
+
+
+def _look(state: State, column: Regressor, gain: float, worth: float, fit: Fit) -> Look:
     unit = coefficient_unit(state.unit, column.unit)
     slope = interval(float(fit.c[-1]), float(fit.sd[-1]), unit)
 
-    def measure(state: State) -> dict[str, Any]:
-        weight, means, sds = (of[0] for of in state.posterior(column.values))
-        return {"slope": mixture(weight, means[:, 0], sds[:, 0], unit)}
-
+    measure = partial(sizes, column.values, "slope", unit)
     changes = {"regressors": (*state.regressors, column)}
-    return [Look("ramp", gain, worth, {"slope": slope}, changes, measure=measure)]
+    return Look("ramp", gain, worth, {"slope": slope}, changes, measure=measure)
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
@@ -46,6 +58,7 @@ CAUSE = Cause(
     "The bias drifts at a constant rate.",
     "Record three times as long, with the temperature beside it.",
     looks=looks,
+    at=at,
     slow=True,
     pictures=shown("means", "evidence"),
     least=_least,

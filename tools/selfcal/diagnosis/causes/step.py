@@ -14,7 +14,7 @@ from selfcal.diagnosis.cause import Cause, Key, shown, sized
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
-from selfcal.likelihood.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net
+from selfcal.likelihood.state import SCREEN, Look, Regressor, State, gain_for, ln_looks, mixture, net, sizes
 from selfcal.likelihood.statemodel import Array, Mask
 
 #: A place is looked at where the level before it leaves this share of a step's information, at least; and until what is
@@ -99,8 +99,20 @@ def looks(state: State, record: Record) -> list[Look]:
     exact, chosen = tried[place]
     exact = min(exact, state.rich_gain(raised(n, place)))
     value = first.worth(exact)
-    if value < 1.0:
-        return []
+    return [_look(state, record, place, exact, value, chosen)] if value >= 1.0 else []
+
+
+def at(state: State, record: Record, theta: Sequence[float]) -> Look:
+    """The look at a step of a known time."""
+    place = min(max(1, round(theta[0] / state.dt)), state.y.size - 1)
+    column = raised(state.y.size, place)
+    gain, chosen = state.with_columns(column)
+    found = _look(state, record, place, gain, net(gain), chosen)
+    return replace(found, measure=partial(sizes, column, "amplitude", state.unit))
+
+
+def _look(state: State, record: Record, place: int, gain: float, worth: float, chosen: Fit) -> Look:
+    n = state.y.size
     time = float(record.time_s[place])
     column = Regressor(f"step_{time:.6g}s", "step", raised(n, place), "1", {"kind": "step", "time_s": time})
     estimate = {
@@ -109,7 +121,7 @@ def looks(state: State, record: Record) -> list[Look]:
     }
     changes = {"regressors": (*state.regressors, column)}
     measure = partial(posterior, record.time_s, place)
-    return [Look("step", exact, value, estimate, changes, when=(time, time), measure=measure)]
+    return Look("step", gain, worth, estimate, changes, when=(time, time), measure=measure)
 
 
 def posterior(time_s: Array, place: int, state: State) -> dict[str, Any]:
@@ -199,6 +211,7 @@ CAUSE = Cause(
     "The bias jumps once.",
     "Record again without touching the mount or the cable.",
     looks=looks,
+    at=at,
     most=3,
     slow=True,
     alike=_alike,

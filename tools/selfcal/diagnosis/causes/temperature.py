@@ -10,6 +10,7 @@ CAUSE = Cause(
     "The bias follows the temperature.",
     "Cycle the temperature up and down, so that it does not only rise with time.",
     looks=lambda state, record: forms.side_looks(state, record, "temperature"),
+    at=lambda state, record, theta: forms.side_at(state, record, "temperature", theta),
     alike=lambda a, b: True,
     pictures=shown("means", "evidence"),
     least=lambda state, record: forms.least(state, record, "temperature"),

@@ -7,7 +7,7 @@ ranked at drifts of several sizes, then the drift is fitted beside the best.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -19,7 +19,7 @@ from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, Series, ln_det, run
-from selfcal.likelihood.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, mixture, net
+from selfcal.likelihood.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, interval, mixture, net, sizes
 from selfcal.likelihood.statemodel import Array, Terms
 
 #: The fastest time constant looked for, samples.
@@ -106,13 +106,30 @@ def looks(state: State, record: Record) -> list[Look]:
     worth = net(gain, 2 * times.size, LN_LOOKS)
     if worth < 1.0:
         return []
+    return [_look(state, record, times, gain, worth, posterior(t, times, record, state, brief=True))]
+
+
+def at(state: State, record: Record, theta: Sequence[float]) -> Look:
+    """The look at a settling of a known time constant, to a factor of the root of 2."""
+    column = _decays(_time(record), np.array(theta))
+    gain, fit = state.with_columns(column)
+    estimate = {
+        "amplitude": interval(float(fit.c[-1]), float(fit.sd[-1]), state.unit),
+        "tau_s": interval(theta[0], theta[0] * math.log(2.0) / math.sqrt(12.0), "s"),
+    }
+    found = _look(state, record, np.array(theta), gain, net(gain), estimate)
+    return replace(found, measure=partial(sizes, column, "amplitude", state.unit))
+
+
+def _look(state: State, record: Record, times: Array, gain: float, worth: float, estimate: Mapping[str, Any]) -> Look:
+    t = _time(record)
+    found = _decays(t, times)
     added = tuple(
         Regressor(f"turn_on_{one:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(one))})
         for one, row in zip(times, found, strict=True)
     )
-    estimate = posterior(t, times, record, state, brief=True)
     changes = {"regressors": (*state.regressors, *added)}
-    return [Look("turn_on", gain, worth, estimate, changes, measure=partial(posterior, t, times, record))]
+    return Look("turn_on", gain, worth, estimate, changes, measure=partial(posterior, t, times, record))
 
 
 def _search(state: State, t: Array, record: Record, least: float) -> tuple[float, Array]:
@@ -297,6 +314,7 @@ CAUSE = Cause(
     "The bias settles after power-on.",
     "Start the record four time constants after power-on, or keep the regressor in the model file.",
     looks=looks,
+    at=at,
     most=1,
     slow=True,
     alike=_alike,

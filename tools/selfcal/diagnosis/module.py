@@ -1,0 +1,431 @@
+"""What acts on several axes at once: events, lines and channels that no single axis shows well enough.
+
+Every candidate is a column x(t; theta), with an unknown size on each axis that has it. Its score and information come
+from the joint filter of all axes (likelihood/joint.py), and its evidence is a sum over the sets of axes. The search
+over theta is paid for once, whatever the set. What acts on one axis alone is left to the axis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from scipy.fft import irfft, next_fast_len, rfft
+from scipy.ndimage import uniform_filter1d
+
+from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
+from selfcal.diagnosis.causes.step import scan
+from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
+from selfcal.diagnosis.forms import LN_FORMS, LN_SLOW, LN_SMOOTHINGS, LONGEST_LAG
+from selfcal.diagnosis.hidden import Hidden, blocks, of_model, weighed
+from selfcal.likelihood.joint import (
+    Act,
+    Course,
+    Joint,
+    act,
+    bins_of,
+    bridged_rows,
+    course,
+    fitted,
+    information,
+    without_lines,
+)
+from selfcal.likelihood.state import NET_LEAST, State
+from selfcal.likelihood.statemodel import Array, Mask
+from selfcal.model.forms import formed, slope
+
+#: Means of this length at least, s: whatever the rate, what is slow is in them.
+MEANS_S = 1.0
+#: Means that the joint model takes at least, and the share of them that an axis may lack.
+LEAST, GAPS = 600, 0.3
+#: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
+CERTAIN = 25.0
+#: Events of a module at most, those of one axis among them.
+MOST = 16
+#: Own drifts are smaller by exp of these beside a slow column: the drift that was fitted without it has swallowed it.
+STIFFER = (0.0, 1.5, 3.0)
+#: Means at most that slow columns are looked for in.
+COARSE = 2000
+#: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
+PLACES = 4
+#: Samples at each end in which no step is looked for, and of a pulse at least.
+EDGE, SHORTEST = 4, 4
+#: Durations of a pulse, a factor apart.
+LONGER = 1.15
+#: Bins about a frequency that tell its noise.
+BESIDE = 50
+#: A line about one that is left to the axes is its own within this share of the frequency: it wanders.
+WANDERS = 0.02
+#: A jump that one size of the quantity explains to this share is the quantity's own.
+PATTERN = 0.7
+#: Causes of those jumps.
+JUMPS = ("step", "pulse")
+#: Smoothing of a channel, s, and windows of its rate.
+SMOOTH_S, RATES_S = 30.0, (60.0, 400.0)
+
+
+#: Cause, its shape, the column [n] and the price of its search.
+Shape = tuple[str, tuple[float, ...], Array, float]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A column of a `cause` with its shape `theta`; what it is worth on the axes, `price` the ln of the number of
+    independent looks of its search. `columns` [p, n]: of means."""
+
+    cause: str
+    theta: tuple[float, ...]
+    act: Act
+    price: float
+    columns: Array
+    more: float = 0.0
+
+    @property
+    def evidence(self) -> float:
+        """Nats over none, net of the search. `more`: what the drift beside it changes."""
+        return self.act.evidence + self.more - self.price
+
+    @property
+    def effect(self) -> Array:
+        """[m, n]: what it adds to each axis."""
+        return np.asarray(self.act.size.T @ self.columns)
+
+    def share_of(self, loading: Array) -> float:
+        """Share of its information that one size of a quantity with these loadings explains."""
+        held = self.act.axes
+        if len(held) < 2 or len(self.columns) > 1:
+            return 0.0
+        a, b, weight = self.act.size[0, held], loading[held], self.act.sd[held] ** -2.0
+        both = (weight * a**2).sum() * (weight * b**2).sum()
+        return float((weight * a * b).sum() ** 2 / max(both, 1e-300))
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The axes together: records `y` [m, n] of means `dt` s long in units of their noise, their joint `model`, and side
+    `channels` [n]. `kept_out` [n // 2 + 1]: frequencies that are left to the axes."""
+
+    y: Array
+    dt: float
+    model: Joint
+    channels: Mapping[str, Array]
+    kept_out: Mask
+    since_s: float = 0.0
+    passed: Mask = field(default_factory=lambda: np.zeros(0, bool))
+
+    @property
+    def n(self) -> int:
+        return int(self.y.shape[1])
+
+    @cached_property
+    def course(self) -> Course:
+        return course(self.model, self.y, smooth=True)
+
+    @cached_property
+    def slow(self) -> list[tuple[Joint, Course, float]]:
+        """Models with smaller drifts, of `coarse` means, their filters, and what they are worth less."""
+        models = [self.model.of_means(self.coarse).stiffer(by) for by in STIFFER]
+        y = np.array([blocks(row, self.coarse) for row in self.y])
+        courses = [course(one, y, smooth=True) for one in models]
+        return [(a, b, b.ln_likelihood - courses[0].ln_likelihood) for a, b in zip(models, courses, strict=True)]
+
+    @property
+    def edge(self) -> int:
+        """Samples at each end in which nothing jumps: there a line that was taken out rings."""
+        return max(EDGE, self.n // 100)
+
+    @property
+    def coarse(self) -> int:
+        """Samples of a mean that slow columns are looked for in."""
+        return max(1, self.n // COARSE)
+
+    @cached_property
+    def cross(self) -> Array:
+        """[n // 2, m, m]: information of two steps so many samples apart, far from the ends."""
+        turn = 2.0 * math.pi * np.maximum(np.arange(self.n // 2 + 1), 1) / self.n
+        found: Array = np.asarray(irfft(self.model.precision(turn), self.n, axis=0))[: self.n // 2]
+        return found
+
+
+def full(score: Array, known: Array) -> Array:
+    """Gain [...] of ln likelihood by scores [..., m] on all axes."""
+    firm = known + 1e-9 * np.trace(known, axis1=-2, axis2=-1)[..., None, None] * np.eye(score.shape[-1])
+    found: Array = 0.5 * (score * np.linalg.solve(firm, score[..., None])[..., 0]).sum(axis=-1)
+    return found
+
+
+def _best(score: Array, known: Array, apart: int) -> list[int]:
+    """The best places of scores [n, m]: of all axes together, and of each alone."""
+    found = []
+    alone = 0.5 * score**2 / np.maximum(np.diagonal(known, axis1=-2, axis2=-1), 1e-300)
+    for gain, count in [(full(score, known), PLACES), *((one, 1) for one in alone.T)]:
+        left = np.array(gain)
+        for _ in range(count):
+            at = int(np.argmax(left))
+            found.append(at)
+            left[max(0, at - apart) : at + apart + 1] = -math.inf
+    return list(dict.fromkeys(found))
+
+
+def steps(seen: Seen) -> Iterator[Candidate]:
+    """A jump of the levels at each sample."""
+    score = np.where(seen.passed[:, None], 0.0, seen.course.shock)
+    score[: seen.edge] = score[-seen.edge :] = 0.0
+    for at in _best(score, seen.course.known, EDGE):
+        column = (np.arange(seen.n) >= at).astype(float)
+        found = act(score[at][None], seen.course.known[at])
+        yield Candidate("step", (at * seen.dt,), found, math.log(seen.n), column[None])
+
+
+def pulses(seen: Seen) -> Iterator[Candidate]:
+    """Two jumps of one size, there and back."""
+    count = max(1, int(math.log(seen.n / 3.0 / SHORTEST) / math.log(LONGER)))
+    lengths = np.unique((SHORTEST * LONGER ** np.arange(count)).astype(int))
+    shock = seen.course.shock
+    price = math.log(seen.n) + math.log(lengths.size)
+    best: list[tuple[float, int, int]] = []
+    for length in map(int, lengths):
+        score = shock[:-length] - shock[length:]
+        cross = seen.cross[length]
+        known = seen.course.known[:-length] + seen.course.known[length:] - cross - cross.T
+        score[: seen.edge] = score[-seen.edge :] = 0.0
+        score[seen.passed[:-length] & seen.passed[length:]] = 0.0
+        gain = full(score, known)
+        at = int(np.argmax(gain))
+        best.append((float(gain[at]), at, at + length))
+    for _, first, last in sorted(best, reverse=True)[:PLACES]:
+        begin, end = _moved(seen, first, last)
+        if end - begin < SHORTEST:
+            continue
+        column = np.zeros(seen.n)
+        column[begin:end] = 1.0
+        known = information(seen.model, seen.course, column[None])[0]
+        found = act((shock[begin] - shock[end])[None], known)
+        yield Candidate("pulse", (begin * seen.dt, end * seen.dt), found, price, column[None])
+
+
+def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int]:
+    """Each place of a pulse in turn at its best within a fifth of its length."""
+    shock = seen.course.shock
+    reach = max(2, (end - begin) // 5)
+    for _ in range(2):
+        for first in (False, True):
+            at = begin if first else end
+            low, high = max(seen.edge, at - reach), min(seen.n - seen.edge, at + reach + 1)
+            places = np.arange(low, high)
+            places = places[places < end - SHORTEST] if first else places[places > begin + SHORTEST]
+            if not places.size:
+                continue
+            other = end if first else begin
+            cross = seen.cross[np.minimum(np.abs(places - other), seen.cross.shape[0] - 1)]
+            known = seen.course.known[places] + seen.course.known[other] - cross - np.swapaxes(cross, 1, 2)
+            at = int(places[np.argmax(full(shock[places] - shock[other], known))])
+            begin, end = (at, end) if first else (begin, at)
+    return begin, end
+
+
+def lines(seen: Seen) -> Iterator[Candidate]:
+    """A sine of each frequency. Its noise is the weights' own about it: no model of drift knows the colour there."""
+    n, weights = seen.n, seen.course.weights
+    U = rfft(weights, axis=0)
+    turn = 2.0 * math.pi * np.maximum(np.arange(U.shape[0]), 1) / n
+    level = seen.model.precision(turn) * (2.0 - 2.0 * np.cos(turn))[:, None, None]
+    ratio = np.abs(U) ** 2 / n / np.maximum(np.diagonal(level, axis1=1, axis2=2), 1e-300)
+    ratio = np.minimum(ratio, 4.0)
+    beside = max(4, min(BESIDE, U.shape[0] // 8))
+    own = np.sqrt(np.maximum(uniform_filter1d(ratio, 2 * beside + 1, axis=0, mode="reflect"), 0.5))
+    known = 0.5 * n * level * own[:, :, None] * own[:, None, :]
+    low = max(1, math.ceil(TURNS_LEAST))
+    hz = np.arange(U.shape[0])
+    usable = np.ones(U.shape[0], bool)
+    for line in np.flatnonzero(seen.kept_out):
+        usable[np.abs(hz - line) <= WANDERS * line] = False
+    usable[:low] = usable[-low:] = False
+    padded = 2 * next_fast_len(n, real=True)
+    V = rfft(weights, padded, axis=0)
+    place = np.minimum(np.rint(np.arange(V.shape[0]) * n / padded).astype(int), U.shape[0] - 1)
+    gain = np.where(usable[place], full(V.real, known[place]) + full(V.imag, known[place]), 0.0)
+    alone = np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place] * usable[place][:, None]
+    t = np.arange(n)
+    places = [int(np.argmax(gain)), *(int(k) for k in np.argmax(alone, axis=0))]
+    for at in dict.fromkeys(places):
+        f = _sharpest(weights, known[place[at]], at / padded, 0.5 / padded)
+        pair = np.array([np.cos(2.0 * math.pi * f * t), np.sin(2.0 * math.pi * f * t)])
+        found = act(pair @ weights, known[place[at]])
+        yield Candidate("periodic", (f / seen.dt,), found, ln_lines(n, max(1.0, found.evidence)), pair)
+
+
+def _sharpest(weights: Array, known: Array, f: float, reach: float) -> float:
+    """The best frequency about f, turns a sample."""
+    t = np.arange(weights.shape[0])
+    for _ in range(3):
+        tried = f + reach * np.linspace(-1.0, 1.0, 7)
+        z = np.exp(2j * math.pi * tried[:, None] * t) @ weights
+        f = float(tried[np.argmax(full(z.real, known) + full(z.imag, known))])
+        reach /= 3.0
+    return f
+
+
+def transients(seen: Seen) -> Iterator[Candidate]:
+    """A constant rate, and a bias that settles."""
+    t = (np.arange(seen.n) + 0.5) * seen.dt
+    octaves = int(math.log2(seen.n / FASTEST))
+    tau = FASTEST * seen.dt * 2.0 ** np.arange(octaves + 1)
+    shapes: list[Shape] = [("ramp", (), t - t.mean(), LN_SLOW)]
+    shapes += [("turn_on", (float(one),), np.exp(-(t + seen.since_s) / one), LN_LOOKS) for one in tau]
+    yield from _weighed(seen, shapes)
+
+
+def channels(seen: Seen) -> Iterator[Candidate]:
+    """Temperature and supply in their forms."""
+    for cause, values in seen.channels.items():
+        about = values - values.mean()
+        smooth = uniform_filter1d(about, max(1, round(SMOOTH_S / seen.dt)), mode="nearest")
+        price = LN_SMOOTHINGS + LN_SLOW
+        shapes: list[Shape] = [(cause, (), smooth, price)]
+        lag = 4.0 * seen.dt * seen.coarse
+        while lag < LONGEST_LAG * seen.n * seen.dt:
+            shapes.append((cause, (lag,), formed(about, "lag", lag, 0.0, seen.dt), price + LN_FORMS["lag"]))
+            lag *= 2.0
+        shapes += [
+            (cause, (), slope(about, window, seen.dt) * window, price + LN_FORMS["rate"])
+            for window in RATES_S
+            if window < seen.n * seen.dt / 6.0
+        ]
+        shapes.append((cause, (), smooth**2 - np.mean(smooth**2), price + LN_FORMS["square"]))
+        yield from _weighed(seen, [one for one in shapes if np.ptp(one[2]) > 0.0])
+
+
+def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
+    """Slow columns, each at the drift that suits it best."""
+    columns = np.array([one[2] / max(float(np.std(one[2])), 1e-300) for one in shapes])
+    means = np.array([blocks(one, seen.coarse) for one in columns])
+    best: dict[int, Candidate] = {}
+    for model, found, less in seen.slow:
+        known = information(model, found, means)
+        score = means @ found.weights
+        for k, (cause, theta, _, price) in enumerate(shapes):
+            if full(score[k], known[k]) + less < NET_LEAST:
+                continue
+            one = Candidate(cause, theta, act(score[k][None], known[k]), price, columns[k][None], less)
+            if k not in best or best[k].evidence < one.evidence:
+                best[k] = one
+    yield from best.values()
+
+
+#: The searches, each with the columns that it looks for.
+FAMILIES: tuple[Callable[[Seen], Iterator[Candidate]], ...] = (steps, pulses, lines, transients, channels)
+
+
+@dataclass
+class Search:
+    """What was found so far in records `y` [m, n]: candidates of `several` axes, and those of one, which are left to
+    it; `rest` [m, n] less all of them, and the `model` of that."""
+
+    y: Array
+    dt: float
+    channels: Mapping[str, Array]
+    kept_out: Mask
+    since_s: float
+    model: Joint
+    rest: Array
+    several: list[Candidate] = field(default_factory=list)
+    single: list[Candidate] = field(default_factory=list)
+
+    def go(self, least: float) -> None:
+        """Look until nothing is worth `least`, nats. A candidate with the pattern of the quantity in the model is that
+        one's own."""
+        passed = np.zeros(self.y.shape[1], bool)
+        for _ in range(MOST - len(self.several) - len(self.single)):
+            seen = Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s, passed)
+            found = max(
+                (one for family in FAMILIES for one in family(seen)), key=lambda one: one.evidence, default=None
+            )
+            if found is None or found.evidence < least:
+                return
+            if self._is_own(found):
+                for time in found.theta:
+                    at = round(time / self.dt)
+                    passed[max(0, at - 3) : at + 4] = True
+                continue
+            (self.several if len(found.act.axes) > 1 else self.single).append(found)
+            self.rest = self.rest - found.effect
+            self.refit()
+
+    def _is_own(self, one: Candidate) -> bool:
+        """Whether an event has the pattern of the quantity in the model."""
+        return one.cause in JUMPS and one.share_of(self.model.loading) > PATTERN
+
+    def weigh(self, model: Joint) -> None:
+        """Take a model with the quantity. Events with its pattern are its own."""
+        self.model = model
+        for one in filter(self._is_own, self.several):
+            self.rest = self.rest + one.effect
+        self.several = [one for one in self.several if not self._is_own(one)]
+
+    def refit(self, f: bool | None = None) -> None:
+        """The model of what is left."""
+        f = bool(self.model.loading.any()) if f is None else f
+        self.model = fitted(bins_of(bridged_rows(self.rest)), self.dt, f, self.model)
+
+
+def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s: float = 0.0) -> Module | None:
+    """What acts on several axes of one grid; None: there are too few axes or means to tell.
+
+    `channels` [n]: temperature and supply. Before the quantity is weighed its wandering looks like events: those need
+    be beyond doubt. With it in the model, or where it is not there, the usual limit holds."""
+    dt = max((state.dt for state in states.values()), default=1.0)
+    block = max(1, round(MEANS_S / dt))
+    found = {name: _means(state, block) for name, state in states.items() if not state.below_lattice}
+    found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}
+    if len(found) < 2 or min(y.size for y in found.values()) < LEAST:
+        return None
+    y = np.array(list(found.values()))
+    scale = np.array([np.nanstd(np.diff(row)) for row in y]) / math.sqrt(2.0)
+    y = (y - np.nanmean(y, axis=1)[:, None]) / scale[:, None]
+    span = block * dt
+    whole, kept_out = without_lines(bridged_rows(y))
+    y = np.where(np.isfinite(y), whole, np.nan)
+    side = {cause: blocks(values, block) for cause, values in channels.items()}
+    null = fitted(bins_of(bridged_rows(y)), span, False)
+    search = Search(y, span, side, kept_out, since_s, null, y)
+    search.go(CERTAIN)
+    model = weighed(search.model, search.rest, span)
+    if model is not None:
+        search.weigh(model)
+    search.go(NET_LEAST)
+    of = None if model is None else of_model(tuple(found), search.model, search.rest, scale, span)
+    return Module(tuple(found), span, tuple(search.several), of)
+
+
+@dataclass(frozen=True)
+class Module:
+    """What acts on several of the axes `names`: `events`, of means `dt` s long, and one quantity that nobody recorded
+    or None."""
+
+    names: tuple[str, ...]
+    dt: float
+    events: tuple[Candidate, ...]
+    hidden: Hidden | None
+
+
+def sharpened(event: Candidate, states: Sequence[State], span: float) -> tuple[float, ...]:
+    """The shape of an event on the axes' own grid: its times are known to a mean alone."""
+    dt = states[0].dt
+    if event.cause not in JUMPS or dt > 0.5 * span:
+        return event.theta
+    gain = np.sum([scan(state.series, state.best).gain for state in states], axis=0)
+    reach = round(1.5 * span / dt)
+    found = []
+    for time in event.theta:
+        low = max(0, round(time / dt) - reach)
+        found.append((low + int(np.argmax(gain[low : low + 2 * reach + 1]))) * dt)
+    return tuple(found)
+
+
+def _means(state: State, block: int) -> Array:
+    """Means [k] of the readings less the columns of the model; NaN where half are missing."""
+    return blocks(state.y - state.best.c @ state.series.columns, block)
