@@ -17,7 +17,7 @@ ROUNDS = 12
 @dataclass(frozen=True)
 class Finding:
     """One named cause on one axis. `partner`: the other axis, of a cause that two share. `held_out`: its gain, where
-    the loop has asked for it."""
+    the loop has asked for it. `event`: above 0, the one of several axes that it is a part of."""
 
     look: Look
     round: int
@@ -27,6 +27,7 @@ class Finding:
     shared_with: tuple[str, ...] = ()
     partner: State | None = None
     held_out: HeldOut | None = None
+    event: int = 0
 
     @property
     def columns(self) -> tuple[Regressor, ...]:

@@ -84,12 +84,12 @@ def diagnose_record(
             one.unfinished = spent
 
     work.each(walk, found)
-    settled = [cause.settle(record, found) for cause in CAUSES.values() if cause.settle is not None]
+    if any(one.unfinished == INTERRUPTED for one in found.values()):
+        raise Stopped
+    settled = [_weed(found), *(cause.settle(record, found) for cause in CAUSES.values() if cause.settle is not None)]
     changed = list(dict.fromkeys(name for names in settled for name in names))
     _share(found)
     work.each(lambda name: _end(found[name], advance), changed)
-    if any(one.unfinished == INTERRUPTED for one in found.values()):
-        raise Stopped
     return found
 
 
@@ -104,6 +104,29 @@ def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
     one.findings = [_measured(finding, one.state) for finding in one.findings if finding.round <= ROUNDS]
     _unexplained(one)
     one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
+
+
+def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
+    """Drop events of several axes that what was found after them explains as well: noise with a memory, or a law that
+    the first model had not, looks like events to it. Returns the axes whose model changed."""
+    changed: list[str] = []
+    events: dict[int, list[tuple[Diagnosed, Finding]]] = {}
+    for one in found.values():
+        for finding in one.findings:
+            if finding.event:
+                events.setdefault(finding.event, []).append((one, finding))
+    for parts in sorted(events.values(), key=lambda parts: sum(finding.look.gain for _, finding in parts)):
+        price = sum(finding.look.gain for _, finding in parts) - max(finding.look.net for _, finding in parts)
+        less = [one.state.without({column.name for column in finding.columns}).refit() for one, finding in parts]
+        gain = sum(
+            one.state.best.ln_likelihood - state.best.ln_likelihood for (one, _), state in zip(parts, less, strict=True)
+        )
+        if gain - price < NET_LEAST:
+            for (one, finding), state in zip(parts, less, strict=True):
+                one.findings = [each for each in one.findings if each.event != finding.event]
+                one.state = state
+                changed.append(state.axis)
+    return changed
 
 
 def _measured(finding: Finding, final: State) -> Finding:
@@ -215,7 +238,7 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
                 found[name].hidden = seen.hidden
             if on.probability >= 0.5:
                 states[name] = states[name].refit(regressors=(*states[name].regressors, on.column))
-    for event in seen.events:
+    for number, event in enumerate(seen.events, 1):
         names = [seen.names[k] for k in event.act.axes]
         theta = module.sharpened(event, [states[name] for name in names], seen.dt)
         findings = {}
@@ -225,7 +248,7 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
             look = replace(look, net=max(look.net, event.evidence))
             others = tuple(other for other in names if other != name)
             held_out = score.gain(look, states[name], after, record)
-            findings[name] = Finding(look, 0, states[name], after, shared_with=others, held_out=held_out)
+            findings[name] = Finding(look, 0, states[name], after, shared_with=others, held_out=held_out, event=number)
         if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
             continue
         for name, finding in findings.items():

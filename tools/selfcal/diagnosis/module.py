@@ -152,7 +152,8 @@ class Seen:
 
 def full(score: Array, known: Array) -> Array:
     """Gain [...] of ln likelihood by scores [..., m] on all axes."""
-    firm = known + 1e-9 * np.trace(known, axis1=-2, axis2=-1)[..., None, None] * np.eye(score.shape[-1])
+    least = 1e-9 * np.trace(known, axis1=-2, axis2=-1) + 1e-300  # of nothing known, nothing
+    firm = known + least[..., None, None] * np.eye(score.shape[-1])
     found: Array = 0.5 * (score * np.linalg.solve(firm, score[..., None])[..., 0]).sum(axis=-1)
     return found
 
