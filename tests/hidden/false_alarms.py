@@ -95,7 +95,7 @@ def judged(seed: int, rate: float) -> tuple[str, dict[str, str]]:
     for name, entry in found.items():
         if "error" in entry:
             wrong[name] = str(entry["error"])
-        elif entry["verdict"] != "adequate":
+        elif entry["findings"]:
             wrong[name] = " ".join(_words(finding) for finding in entry["findings"])
     return form, wrong
 

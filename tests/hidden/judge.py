@@ -127,7 +127,7 @@ def judge(entry: dict[str, Any], record: Record) -> Answer:
         return {"first": REFUSED, "named": [], "adequate": False, "error": entry["error"]}
     findings = sorted(entry["findings"], key=lambda finding: -float(finding["evidence_gain_nats"] or 0.0))
     named = [finding["cause"] for finding in findings]
-    adequate = entry["verdict"] == ADEQUATE
+    adequate = not entry["findings"]  # a small finding is one, too
     own = [effect for effect in record.effects if effect.axis == record.axis]
     result: Answer = {"first": named[0] if named else ADEQUATE if adequate else UNEXPLAINED}
     result |= {"named": named, "adequate": adequate, "sizes": {}, "gain": {}, "cleared": None}

@@ -141,7 +141,7 @@ def answer(task: Task, out: Path) -> Answer:
     named = {
         name: entry.get("error") or " ".join(map(_words, told(entry, lattice[name] is not None)))
         for name, entry in made["entries"].items()
-        if "error" in entry or entry["verdict"] != "adequate"
+        if "error" in entry or entry["findings"]
     }
     return made | {"inadequate": {name: words or "nothing named" for name, words in named.items()}}
 
@@ -209,7 +209,7 @@ def goals(answers: Sequence[Answer]) -> list[Line]:
             known = [share for share in shares if share is not None]
             lines.append(Line("plain: kinds named in at least half", sum(s >= 0.5 for s in known), len(known), 1.0))
         missed = [each for each in own if each.get("identify_adequate") is False]
-        found = sum(each["entries"][each["truth"]["axis"]].get("verdict") != "adequate" for each in missed)
+        found = sum(bool(each["entries"][each["truth"]["axis"]].get("findings")) for each in missed)
         lines.append(Line(f"{size}: not adequate for identify, then for diagnose", found, len(missed), 1.0))
     lines += _carried([each for each in answers if each["task"]["size"] == "plain"])
     clean = [each for each in answers if each["task"]["kind"] == CLEAN]

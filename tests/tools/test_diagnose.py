@@ -222,7 +222,9 @@ def test_a_plain_cause_is_named_first(cause: str, tmp_path: Path) -> None:
     path = written(record, tmp_path / "log.npz")
     document = diagnose(path, axes=[record.axis])
     axis = document["axes"][record.axis]
-    assert axis["verdict"] == "inadequate"
+    ids = {one["id"] for one in document["findings"]}
+    assert cause in axis["causes"] and {one["of"] for one in axis["findings"]} == ids
+    assert (axis["verdict"] == "inadequate") == bool(axis["material"] or cause == "unexplained")
     assert axis["findings"][0]["cause"] == cause
     json.dumps(document)
     for finding in axis["findings"]:

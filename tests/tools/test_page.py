@@ -27,6 +27,7 @@ from selfcal.diagnosis import integrity
 from selfcal.diagnosis.causes import colored_noise, periodic, ramp, step, variance_change
 from selfcal.diagnosis.causes import outliers as outliers_cause
 from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.events import add_findings
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.loop import diagnose_record
@@ -266,19 +267,29 @@ def case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     record = of_recording(recording, Model.load(None))
     found = diagnose_record(record, ("gx", "gy"))
     document = to_document(recording, found, {}, {"name": "extended"})
+    add_findings(document, recording, found, {}, None)
     return Case(document, record, found, page(document, record, found))
 
 
 def test_the_findings_stand_at_the_top(case: Case) -> None:
-    """What is said first: the verdict on each axis, each finding in words with its size, linked to its pictures."""
-    assert {one["cause"] for one in case.document["axes"]["gx"]["findings"]} >= {"temperature", "step"}
+    """What is said first: the verdict on each axis, and a row an event or source, linked to its box. Evidence stands in
+    the boxes alone."""
+    assert {one["cause"] for one in case.document["findings"] if one["material"]} == {"temperature", "step"}
     parsed = Page(case.text)
     top = parsed.text[: parsed.text.index("Whole record")]
+    top = top[: top.index("GainNot found") if "GainNot found" in top else len(top)]
     assert "Not adequate: gx." in top and "Adequate: gy." in top
-    for finding in case.document["axes"]["gx"]["findings"]:
-        assert finding["words"] in top
+    first = top[: top.index("Readings of each axis")]
+    assert "nats" not in first and "round" not in first
+    heads, *rows = cells_of(case.text, "What matters")
+    assert heads == ["row", "from", "what", "size", "changes", "do"] and [row[0] for row in rows] == ["1", "2"]
+    for row, finding in zip(rows, case.document["findings"], strict=False):
+        assert row[2].startswith(f"{finding['cause']} on gx") and row[5]
     pictures_of = [one["aria-label"] or "" for one in parsed.named("svg") if one.get("role") == "img"]
     assert any(label.startswith("Before: standard deviations") and "outside" in label for label in pictures_of)
+    step = next(place for place, one in enumerate(case.document["findings"], 1) if one["cause"] == "step")
+    strip = next(label for label in pictures_of if label.startswith("Readings and events: gx, gy; marks at"))
+    assert re.search(rf"125\d s \({step}\)", strip)  # the step is at sample 2500 of 2 Hz
 
 
 def cells_of(text: str, name: str) -> list[list[str]]:
@@ -294,7 +305,7 @@ def an_estimate(median: float, unit: str) -> dict[str, Any]:
 
 
 def test_causes_by_axis_and_the_noise_stand_at_the_top(case: Case) -> None:
-    """The matrix has the document's evidence, the table its posterior; without one, the fit that the record is made of:
+    """The matrix has the document's causes, the table its posterior; without one, the fit that the record is made of:
     white noise of 0.05 deg/s at 2 Hz."""
     known = {
         "hypotheses": {"constant": 0.2, "random_walk": 0.8},
@@ -308,30 +319,35 @@ def test_causes_by_axis_and_the_noise_stand_at_the_top(case: Case) -> None:
     heads, *rows = cells_of(text, "Causes by axis")
     assert heads == ["cause", "gx", "gy"]
     shown = {row[0].replace(" ", "_"): row[1:] for row in rows}
-    for finding in axes["gx"]["findings"]:
-        if finding["evidence_gain_nats"] > 20.0:
-            assert float(shown[finding["cause"]][0]) == pytest.approx(finding["evidence_gain_nats"], abs=0.5)
-    assert {row[1] for row in shown.values()} == {"–"}
+    assert shown.keys() == {one["cause"] for one in axes["gx"]["findings"]}
+    for cause, (sign, other) in shown.items():
+        assert sign == ("●" if cause in axes["gx"]["material"] else "○") and other == "–"
+    gx, gy = cells_of(text, "N, K and B before and after")[1:]
+    before, after = (axes["gx"]["numbers"]["N"][key] for key in ("before", "after"))
+    assert gx[1].startswith(f"{before:.3g} → {after['median']:.3g}") and gy[0] == "gy"
     gx, gy = cells_of(text, "Noise of each axis")[1:]
     assert gx[:3] == ["gx", "random walk", "0.8"] and gx[3].startswith("0.035 (0.0315 to 0.0385) °/s/√Hz")
     assert gx[4].startswith("0.002 (0.0018 to 0.0022)") and gx[5] == "–" and gx[6].endswith("points outside")
     assert gy[2] == "fit" and float(gy[3].split()[0]) == pytest.approx(0.05 / math.sqrt(2.0), rel=0.05)
 
 
-def test_weak_findings_are_folded(case: Case) -> None:
-    """Below a hundredth of the largest evidence, in the list and in the axis' section. Their action stays with them."""
-    entry = case.document["axes"]["gx"]
-    first = {**entry["findings"][0], "shared_with": []}
-    sizes = {"strong": 5000.0, "near": 51.0, "weak": 49.0}
-    findings = [{**first, "cause": name, "words": f"A {name} one.", "record_next": f"Mend the {name} one.",
-                 "evidence_gain_nats": nats, "net_nats": nats} for name, nats in sizes.items()]  # fmt: skip
-    text = page({**case.document, "axes": {"gx": {**entry, "findings": findings}}}, case.record, case.found)
+def test_small_findings_are_folded_whatever_their_evidence(case: Case) -> None:
+    """In the list and in the axis' section; what matters is not, however little evidence it has beside another."""
+    entry, (event, *_) = case.document["axes"]["gx"], case.document["findings"]
+    nats = {"strong": 5000.0, "near": 51.0, "weak": 9.0}
+    findings, events = [], []
+    for name, gain in nats.items():
+        own = {"cause": name, "record_next": f"Mend the {name} one.", "evidence_nats": gain}
+        events.append({**event, **own, "id": name, "material": name != "strong"})
+        box = {"of": name, "words": f"A {name} one.", "evidence_gain_nats": gain, "net_nats": gain}
+        findings.append({**entry["findings"][0], **own, **box})
+    axis = {**entry, "findings": findings, "material": ["near", "weak"]}
+    text = page({**case.document, "findings": events, "axes": {"gx": axis}}, case.record, case.found)
     folded = "".join(re.findall(r"<details.*?</details>", text[: text.index("Whole record")], re.DOTALL))
-    for name in sizes:
-        assert (f"A {name} one." in folded) == (name == "weak")
-        assert f"<strong>Do:</strong> Mend the {name} one." in text
-    assert "1 weaker findings, each below 49" in text and "1% of the largest" in text
-    assert [row[0] for row in cells_of(text, "Causes by axis")] == ["cause", "strong", "near"]
+    for name in nats:
+        assert (f"A {name} one." in folded) == (f"Mend the {name} one.</td>" in folded) == (name == "strong")
+        assert f"Mend the {name} one.</td>" in text
+    assert [row[2].split()[0] for row in cells_of(text, "What matters")[1:]] == ["near", "weak"]
 
 
 def test_an_allan_curve_that_still_leaves_its_band_is_told(case: Case, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -533,29 +549,28 @@ def test_a_browser_shows_it(browser: Any, address: str, width: int) -> None:
     assert told == [] and asked == [address]
     assert view.evaluate("document.documentElement.scrollWidth") <= width
     size = (
-        "[...document.querySelectorAll('figure svg[role=img]')].map(s => 12.5 * s.getBoundingClientRect().width / 340)"
+        "[...document.querySelectorAll('figure svg[role=img]')]"
+        ".map(s => 12.5 * s.getBoundingClientRect().width / s.viewBox.baseVal.width)"
     )
     assert min(view.evaluate(size)) >= 9.0
-    assert view.locator(".findings li").count() >= 2
+    assert view.locator(".events tbody tr").count() >= 2
     view.close()
 
 
 @pytest.mark.parametrize(("width", "height"), [(1400, 900), (390, 844)])
 def test_the_answer_is_on_the_first_screen(browser: Any, case: Case, tmp_path: Path, width: int, height: int) -> None:
-    """Six axes with six causes each: verdict, matrix and the table of the noise."""
-    axes = {}
-    for name in ("gx", "gy", "gz", "ax", "ay", "az"):
-        entry = case.document["axes"]["gx"]
-        kinds = ("periodic", "motion", "flicker", "step", "unexplained", "variance_change")
-        axes[name] = {**entry, "findings": [{**entry["findings"][0], "cause": kind} for kind in kinds]}
-    text = page({**case.document, "axes": axes}, case.record, dict.fromkeys(axes, case.found["gx"]))
+    """Six axes with three events: verdict and list; on a desk N, K and B of all axes as well."""
+    names = ("gx", "gy", "gz", "ax", "ay", "az")
+    event = case.document["findings"][0]
+    events = [{**event, "id": kind, "axes": dict.fromkeys(names, event["axes"]["gx"])} for kind in ("a", "b", "c")]
+    document = {**case.document, "findings": events, "axes": dict.fromkeys(names, case.document["axes"]["gx"])}
+    text = page(document, case.record, dict.fromkeys(names, case.found["gx"]))
     (tmp_path / "report.html").write_text(text, encoding="utf-8")
     view = browser.new_page(viewport={"width": width, "height": height})
     view.goto((tmp_path / "report.html").as_uri())
-    for place in (".bad", ".matrix", ".glance:not(.matrix)"):
+    for place in (".bad", ".events", *([".numbers"] if width > 1000 else [])):
         box = view.locator(place).first.bounding_box()
         assert box["y"] + box["height"] <= height, (place, box)
-    assert view.locator(".matrix").evaluate("m => m.scrollWidth <= m.clientWidth")
     assert view.evaluate("document.documentElement.scrollWidth") <= width
     view.close()
 

@@ -152,6 +152,39 @@ class Identification(Object):
     axes: dict[str, IdentifiedAxis]
 
 
+class Change(Object):
+    """What an event changes on an axis: N, K and B without it over with it (None: with it, the record shows none), how
+    far it moves the bias, in `unit`, and the error of the bias ahead by horizon, s. `material`: those that matter."""
+
+    N: float | None
+    K: float | None
+    B: float | None
+    bias: float
+    unit: str
+    bias_error: dict[str, dict[str, float]] | None
+    material: list[str]
+
+
+class Event(Object):
+    """An event or source of all axes that it acts on: what these have in common (`estimate`), its sizes and probability
+    by axis, what it changes, and where it comes from. `confirmed`: held-out time shows it; None: none can."""
+
+    id: str
+    cause: str
+    words: str
+    source: str
+    estimate: dict[str, Any]
+    axes: dict[str, dict[str, Any]]
+    evidence_nats: float
+    net_nats: float
+    material: bool
+    confirmed: bool | None
+    changes: dict[str, Change]
+    also_possible: list[str]
+    record_next: str
+    gain_on: dict[str, Any] | None
+
+
 class Finding(Object):
     """A cause that explains something of the record: its evidence gain in nats, its size with interval and unit, the
     time [begin, end] in s where it has one, what it gains on held-out data, and the causes that would explain as
@@ -165,6 +198,7 @@ class Finding(Object):
     when: list[float] | None
     found_in_round: int
     also_possible: list[str]
+    of: str
     shared_with: list[str]
     record_next: str | None
     gain: dict[str, Any] | None
@@ -177,13 +211,18 @@ class Finding(Object):
 
 
 class DiagnosedAxis(Object):
-    """One axis of `diagnose`, or `error` alone. `verdict`: "adequate" or "inadequate", of the extended model. `stated`:
-    causes that it shows and the model file has already."""
+    """One axis of `diagnose`, or `error` alone. `verdict`: "inadequate" with a finding that matters, or without a name.
+    `causes`: all of its own, `material`: those that matter. `numbers`: N, K and B before and after. `stated`: causes
+    that it shows and the model file has already."""
 
     error: str | None
     unit: str
     judged_at_hz: float
     verdict: str
+    causes: list[str]
+    material: list[str]
+    small_findings: int
+    numbers: dict[str, Any]
     stated: list[str] | None
     findings: list[Finding]
     only_in_means: list[Finding] | None
@@ -201,6 +240,7 @@ class Diagnosis(Object):
 
     schema: str
     recording: Recording
+    findings: list[Event]
     axes: dict[str, DiagnosedAxis]
     model: dict[str, Any]
 

@@ -58,8 +58,8 @@ def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict
     error = diagnosed.get("error", identified.get("error"))
     if error is not None:
         return {"error": error}
-    kept = {key: diagnosed[key] for key in ("unit", "verdict", "not_judged", "unfinished") if key in diagnosed}
-    return {**kept, "causes": sorted({finding["cause"] for finding in diagnosed["findings"]})}
+    kept = ("unit", "verdict", "causes", "material", "not_judged", "unfinished")
+    return {key: diagnosed[key] for key in kept if key in diagnosed}
 
 
 def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:

@@ -10,8 +10,8 @@ from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, note
 from selfcal.batch.verdicts import PASS, Verdict, code_of
 
-#: Anything that the model does not explain; and, of two recordings, any change.
-INADEQUATE, CHANGED = "inadequate", "changed"
+#: What is not explained, or moves a number as much as matters; the latter alone; and, of two recordings, any change.
+INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ def check(wanted: str | None, more: Collection[str] = ()) -> None:
         return
     from selfcal.diagnosis.causes import CAUSES  # a second of imports
 
-    known = (INADEQUATE, *more, *CAUSES)
+    known = (INADEQUATE, MATERIAL, *more, *CAUSES, "hidden_input")
     if wanted not in known:
         raise UserError(f"--fail-on: there is no cause '{wanted}' ({', '.join(known)})")
 
@@ -64,7 +64,8 @@ def _axis(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
         return False, f"{wanted} cannot be judged: {axis['error']}"
     if "verdict" not in axis:
         return _of_identify(axis, wanted)
-    if axis["verdict"] != "adequate" if wanted == INADEQUATE else wanted in _causes(axis):
+    shown = {INADEQUATE: axis["verdict"] != "adequate", MATERIAL: bool(axis["material"])}
+    if shown[wanted] if wanted in shown else wanted in axis["causes"]:
         return True, ""
     for one in axis["not_judged"]:
         if one["cause"] == wanted:
@@ -72,10 +73,6 @@ def _axis(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
     if axis.get("unfinished"):
         return False, f"{wanted} cannot be judged: {axis['unfinished']}"
     return False, ""
-
-
-def _causes(axis: Mapping[str, Any]) -> list[str]:
-    return axis["causes"] if "causes" in axis else [finding["cause"] for finding in axis["findings"]]
 
 
 def _of_identify(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:

@@ -238,7 +238,8 @@ def _matrix(batch: Batch) -> Iterator[str]:
             for axis, entry in unit.axes.items():
                 for cause in dict.fromkeys([*unit.causes(axis), *entry.get("marks", [])]):
                     axes = found.setdefault(name, {}).setdefault(cause, [])
-                    axes += [] if axis in axes else [axis]
+                    told = f"({axis})" if cause in unit.small(axis) else axis
+                    axes += [] if told in axes else [told]
     causes = sorted({cause for row in found.values() for cause in row})
     if not causes:
         return
@@ -251,6 +252,7 @@ def _matrix(batch: Batch) -> Iterator[str]:
         for name, row in list(found.items())[:MOST_ROWS]
     )
     caption = f"{len(found)} of {len(batch.devices)} devices show a cause; the axes that do."
+    caption += " In brackets: it changes no number by as much as matters."
     caption += f" The first {MOST_ROWS} are here, the table has all." if len(found) > MOST_ROWS else ""
     yield scrolled("Causes", caption, f"<thead><tr><th scope=col>device</th>{head}</tr></thead><tbody>{rows}</tbody>")
     yield "</section>"

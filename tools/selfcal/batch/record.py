@@ -21,7 +21,7 @@ from selfcal.batch.table import Unit
 
 #: What is kept of an axis of `identify`, and of one of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
-DIAGNOSED = ("verdict", "not_judged", "unfinished", "error")
+DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
 #: Checks of the readings themselves, and of the innovations; a mark is one so many standard deviations off.
 READINGS = ("saturation", "outliers", "held_samples", "motion", "stuck")
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
@@ -89,10 +89,7 @@ def _diagnosis(verbs: Verbs, path: str, names: Sequence[str], given: Mapping[str
         axes = verbs.diagnose(path, **given)["axes"]
     except UserError as error:
         return {name: {"error": str(error).removeprefix(f"{path}: ")} for name in names}
-    return {
-        name: _of(axis, DIAGNOSED) | {"causes": sorted({one["cause"] for one in axis.get("findings", [])})}
-        for name, axis in axes.items()
-    }
+    return {name: _of(axis, DIAGNOSED) for name, axis in axes.items()}
 
 
 def own_pages(

@@ -54,6 +54,13 @@ class Unit:
         found: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get("causes", [])
         return found
 
+    def small(self, axis: str) -> set[str]:
+        """Those of them that change no number by as much as matters."""
+        return set(self.causes(axis)) - {
+            "unexplained",
+            *self.record.get("diagnosis", {}).get(axis, {}).get("material", []),
+        }
+
 
 def best(axis: Mapping[str, Any]) -> str:
     """The most probable law of an axis."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -115,7 +115,10 @@ class Cause:
     most         times at most that the loop names it on an axis; 0: as often as it is found.
     before_motion  looks that motion must not be taken for: they come before motion.
     slow         a drift of another law may show it: `identify` weighs more laws.
-    alike        whether two looks on two axes are one cause with its size on each.
+    source       where it comes from: surroundings, handling, sensor, read-out or model.
+    alike        whether two looks of it are one event or source: the same time, line, channel or law.
+    pairs        its looks name the other axis of a pair (`other`): pairs that meet are one group of axes.
+    piece        whether a look is a piece of a hidden quantity, of which it gets the axes and the times of jumps, s.
     settle       after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
     pictures     names of pictures.py for a look.
     no_gain      why a gain on held-out time is not defined.
@@ -151,7 +154,10 @@ class Cause:
     most: int = 0
     before_motion: Looks | None = None
     slow: bool = False
+    source: str = "model"
     alike: Callable[[Look, Look], bool] = _never
+    pairs: bool = False
+    piece: Callable[[Look, Collection[str], Sequence[float]], bool] = field(default=lambda look, axes, jumps: False)
     settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None
     pictures: Callable[[Look], Sequence[str]] = field(default=lambda look: ("unexplained",))
     no_gain: str = ""

@@ -10,14 +10,12 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from rich.console import Console
-
-from selfcal.adequacy.document import parameters_entry, recording_entry, regressors_entry, since
+from selfcal.adequacy.document import Identified, parameters_entry, recording_entry, regressors_entry
 from selfcal.adequacy.identify import identify_axis, moved_beside
 from selfcal.base.ending import Held, Stopped, abandon
-from selfcal.base.errors import UserError, note, printable
+from selfcal.base.errors import UserError, note
 from selfcal.base.progress import Doing
-from selfcal.diagnosis import hidden, words
+from selfcal.diagnosis import hidden
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
@@ -147,9 +145,11 @@ def below_lattice(record: Record, name: str) -> bool:
     return name in record.axes and record.axes[name].below_lattice
 
 
-def add_posteriors(document: dict[str, Any], recording: Recording, model: Model, ending: Held) -> None:
-    """What the extended model knows of each axis at rest, as `identify` tells it; null where the record bears no
-    report, and after a signal."""
+def add_posteriors(
+    document: dict[str, Any], recording: Recording, model: Model, ending: Held
+) -> dict[str, Identified | None]:
+    """What the extended model knows of each axis at rest, as `identify` tells it; None where the record bears no
+    report, and after a signal. The document has its posterior."""
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     findings = [finding for axis in axes.values() for finding in axis["findings"]]
     moved = [one for finding in findings if finding["cause"] == "motion" for one in finding["estimate"]["intervals"]]
@@ -157,14 +157,17 @@ def add_posteriors(document: dict[str, Any], recording: Recording, model: Model,
         own = recording.along(name)
         moved += moved_beside(own, model, name, look(own, name, model.group_of(name)))
     rest = recording.without(moved)
+    known: dict[str, Identified | None] = {}
     for name, axis in axes.items():
-        axis["posterior"] = None if ending.asked else _posterior(rest, name, model)
+        known[name] = None
+        with suppress(UserError):
+            known[name] = None if ending.asked else identify_axis(rest, name, model, "library", None)
+        axis["posterior"] = _posterior(known[name])
+    return known
 
 
-def _posterior(recording: Recording, name: str, model: Model) -> dict[str, Any] | None:
-    try:
-        known = identify_axis(recording, name, model, "library", None)
-    except UserError:
+def _posterior(known: Identified | None) -> dict[str, Any] | None:
+    if known is None:
         return None
     return {
         "hypotheses": dict(known.result.probability),
@@ -182,77 +185,3 @@ def options_given(
     given += [] if decimate is None else [("--decimate", f"{decimate:.15g}")]
     given += [("--since-power-on", f"{recording.since_power_on_s:.15g}")] if recording.since_power_on_s else []
     return [*given, *recording.options]
-
-
-def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
-    recording = document["recording"]
-    console = Console(stderr=to_stderr)
-    console.print(
-        f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s{since(recording)}\n",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
-    for shared in document.get("findings", []):
-        colour = "bold red" if shared["confirmed"] else "yellow"
-        console.print(
-            f"{', '.join(shared['axes'])}: {shared['cause']}",
-            style=colour,
-            highlight=False,
-            markup=False,
-            soft_wrap=True,
-        )
-        held = "" if shared["confirmed"] else "; not confirmed on held-out time"
-        for line in (
-            shared["words"],
-            f"evidence {shared['evidence_nats']:.1f} nats{held}",
-            f"next: {shared['record_next']}",
-        ):
-            console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
-    for name, axis in document["axes"].items():
-        if "error" in axis:
-            console.print(f"{name}: no result: {axis['error']}", highlight=False, markup=False, soft_wrap=True)
-            continue
-        reason = f": {axis['unfinished']}" if axis.get("unfinished") else ""
-        colour = "bold red" if axis["verdict"] != "adequate" else "yellow" if reason else "green"
-        heading = f"{name} [{axis['unit']}]: {words.verdict(axis)}{reason}"
-        heading += f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else ""
-        console.print(heading, style=colour, highlight=False, markup=False, soft_wrap=True)
-        for finding in axis["findings"]:
-            for line in _lines(finding):
-                console.print(f"  {line}", highlight=False, markup=False, soft_wrap=True)
-        if len(axis["findings"]) > 1:
-            for line in words.carried(axis):
-                console.print(f"  all causes together: {line}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _lines(finding: Mapping[str, Any]) -> list[str]:
-    """One finding in a few lines."""
-    gain = finding["gain"]
-    lines = [f"{finding['cause']}: {finding['words']}"]
-    evidence = f"  evidence {words.evidence(finding)}"
-    if finding["when"]:
-        evidence += f"; at {finding['when'][0]:.6g} s"
-        evidence += "" if finding["when"][0] == finding["when"][1] else f" to {finding['when'][1]:.6g} s"
-    lines.append(evidence)
-    if gain is not None:
-        score = gain["log_score_per_sample"]
-        errors = ", ".join(
-            f"{horizon} s {row['before']:.3g} -> {row['after']:.3g}"
-            for horizon, row in gain["bias_rmse"]["horizon_s"].items()
-        )
-        lines.append(f"  held-out gain {score['after'] - score['before']:+.4f} ± {score['sd']:.2g} nats a sample")
-        lines[-1] += f"; bias error ahead, {gain['bias_rmse']['unit']}: {errors}" if errors else ""
-    elif finding.get("gain_reason"):
-        lines.append(f"  no held-out gain: {finding['gain_reason']}")
-    lines += [f"  {line}" for line in words.carried(finding)]
-    if finding["inflation_words"]:
-        lines.append(f"  {finding['inflation_words']}")
-    if finding["shared_with"]:
-        lines.append(f"  also on {', '.join(finding['shared_with'])}")
-    if finding["also_possible"]:
-        lines.append(f"  this record cannot tell it from: {', '.join(finding['also_possible'])}")
-    lines.append(f"  next: {finding['record_next']}")
-    return lines

@@ -119,7 +119,6 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
         "found_in_round": finding.round,
         "also_possible": list(finding.also_possible),
         "record_next": CAUSES[look.cause].record_next,
-        "shared_with": list(finding.shared_with),
         "gain": held_out,
         **({} if reason is None else {"gain_reason": reason}),
         "inflation": dict(factors),

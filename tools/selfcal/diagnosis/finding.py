@@ -24,7 +24,6 @@ class Finding:
     before: State
     after: State
     also_possible: tuple[str, ...] = ()
-    shared_with: tuple[str, ...] = ()
     partner: State | None = None
     held_out: HeldOut | None = None
     event: int = 0

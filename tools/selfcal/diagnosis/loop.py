@@ -88,7 +88,6 @@ def diagnose_record(
         raise Stopped
     settled = [_weed(found), *(cause.settle(record, found) for cause in CAUSES.values() if cause.settle is not None)]
     changed = list(dict.fromkeys(name for names in settled for name in names))
-    _share(found)
     work.each(lambda name: _end(found[name], advance), changed)
     return found
 
@@ -186,8 +185,7 @@ def _integrity(
         states[name] = integrity.masked(states[name], mask).refit()
     changed = integrity.rate_changes(record)
     for name, one in found.items():
-        others = tuple(other for other in found if other != name)
-        one.findings.extend(Finding(look, 0, one.state, one.state, shared_with=others) for look in changed)
+        one.findings.extend(Finding(look, 0, one.state, one.state) for look in changed)
         for found_at in (look(record, name) for look in (integrity.held_samples, integrity.stuck, integrity.recurring)):
             if found_at is not None:
                 one.findings.append(Finding(found_at, 0, one.state, one.state))
@@ -197,8 +195,7 @@ def _integrity(
             # Motion that is left out already spoilt the first state.
             known = None if name in handled else score.gain(look, one.state, states[name], record)
             if known is None or not known.harms:
-                shared = tuple(other for other in {**handled, **moved} if other != name)
-                one.findings.append(Finding(look, 0, one.first, states[name], shared_with=shared, held_out=known))
+                one.findings.append(Finding(look, 0, one.first, states[name], held_out=known))
         if name in gone:
             one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
@@ -340,22 +337,6 @@ def _looked(
 def _by_worth(looks: Sequence[Look]) -> list[Look]:
     """The most worth first; what has no name comes after every cause that has one."""
     return sorted(looks, key=lambda look: (look.cause == "unexplained" or look.net < NET_LEAST, -look.net))
-
-
-def _share(found: Mapping[str, Diagnosed]) -> None:
-    """The same cause on several axes is one finding with its size on each."""
-    for name, one in found.items():
-        for k, finding in enumerate(one.findings):
-            others = tuple(
-                other
-                for other, two in found.items()
-                if other != name and any(_same(finding.look, more.look) for more in two.findings)
-            )
-            one.findings[k] = replace(finding, shared_with=tuple(dict.fromkeys((*finding.shared_with, *others))))
-
-
-def _same(a: Look, b: Look) -> bool:
-    return a.cause == b.cause and CAUSES[a.cause].alike(a, b)
 
 
 def _unexplained(one: Diagnosed) -> None:

@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import gammaln, logsumexp, softmax
 
+from selfcal.base.units import FLICKER_FLOOR
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
 from selfcal.diagnosis.record import Record
@@ -28,6 +29,10 @@ from selfcal.readings.readings import Rows
 PREDICTIONS = 300
 #: Samples to score, and between the first and the last prediction, at least.
 LEAST = 30
+#: A walk that moves less over the record than so many times what its white noise leaves of the mean is none.
+WALK_LEAST = 3.0
+#: The bias is a mean over so long, s.
+BIAS_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -251,14 +256,37 @@ def _mean(values: Array) -> float:
     return float(good.mean()) if good.size else math.nan
 
 
+def numbers(state: State) -> dict[str, float]:
+    """N, K and B of plain white noise and random walk fitted beside the model of a state, in the axis' unit; 0 where
+    the record shows none. B is that of the model's flicker noise, else by the minimum of the Allan deviation."""
+    plain, best = next(one for one in state.fits if one.terms.walk), state.best
+    N, K = plain.N * _low_gain(plain), plain.K
+    if not K * plain.duration_s > WALK_LEAST * N:
+        K = 0.0
+    if best.terms.flicker:
+        return {"N": N, "K": K, "B": best.sigma * math.exp(best.value("ln_flicker"))}
+    return {"N": N, "K": K, "B": math.sqrt(2.0 * N * K / math.sqrt(3.0)) / FLICKER_FLOOR}
+
+
+def bias_ahead(state: State) -> float:
+    """Mean of the predicted bias over the next BIAS_S, without the level and the columns, in the axis' unit: lines and
+    bands have averaged out, the drift has not."""
+    fit = state.best
+    m = matrices(fit.terms, fit.theta, state.dt, state.series.duration_s, state.block)
+    x = run(state.series, fit.terms, fit.theta)[0][-1].x
+    total, step, count = np.eye(len(m.F)), m.F, 1
+    while count * state.dt < BIAS_S:
+        total, step, count = total + step @ total, step @ step, 2 * count
+    return float(fit.c[0] + (x[0] - fit.c @ x[1:]) @ (m.h @ total) / count)
+
+
 def inflation(before: State, after: State) -> Mapping[str, float]:
-    """Factors by which plain white noise and random walk are off for want of a cause: fitted without it over with."""
+    """Factors by which `numbers` are off for want of a cause: fitted without it over with. Infinite: with it the record
+    shows none."""
     if before is after:
-        return {"N": 1.0, "K": 1.0}
-    plain = [next(one for one in state.fits if one.terms.walk) for state in (before, after)]
-    N = [one.sigma * _low_gain(one) for one in plain]
-    K = [one.K * math.sqrt(one.dt) for one in plain]
-    return {"N": N[0] / N[1], "K": K[0] / K[1] if K[1] > 1e-4 * N[1] else math.inf}
+        return dict.fromkeys(("N", "K", "B"), 1.0)
+    old, new = numbers(before), numbers(after)
+    return {name: old[name] / new[name] if new[name] else math.inf if old[name] else 1.0 for name in new}
 
 
 def _low_gain(one: Fit) -> float:

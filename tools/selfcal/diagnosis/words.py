@@ -46,12 +46,43 @@ FORMS = {
     "cube": "by its cube as well",
     "play": "through a play (hysteresis)",
 }
+#: Forms, as an alternative.
+FORM_NAMES = {"rate": "its rate", "square": "its square", "cube": "its cube", "lag": "a lag", "play": "a play"}
+#: What stands out, by the beginning of a statistic's name.
+STATISTICS = (
+    ("jumps_of_the_bias", "the bias jumps more than its drift does"),
+    ("coherence_with_", "the readings go together with a recorded channel"),
+    ("innovation_largest_correlation", "the noise repeats itself after a while"),
+    ("innovation_largest", "single readings are far off"),
+    ("innovation_excess_kurtosis", "large and small readings are commoner than in normal noise"),
+    ("innovation_skewness", "the noise is not symmetric"),
+    ("innovation_ln_variance", "the noise level differs between the halves of the record"),
+    ("innovation_spread", "the readings scatter as no model does"),
+    ("innovation_mean", "the level differs from what the model predicts"),
+    ("innovation_lag", "neighbouring readings are correlated as no model has them"),
+    ("innovation_correlation", "neighbouring readings are correlated as no model has them"),
+    ("allan_", "the Allan deviation leaves the model's"),
+    ("spectrogram_of_", "the power comes and goes"),
+    ("spectrum_worst", "a third of an octave has more or less power than the model"),
+    ("repeated_readings", "readings repeat the one before too often"),
+    ("commonest_reading", "one reading is too common"),
+    ("longest_repeat", "one reading stays too long"),
+    ("equal_readings", "some codes never come"),
+    ("odd_even_codes", "odd and even codes are not alike"),
+)
+#: Keys that stand with the details.
+LATER = (
+    *("harmonics", "width_hz", "form", "form_also_possible", "lag_s", "width", "time_constant_s", "tau_2_s"),
+    *("band_hz", "clipped"),
+)
+#: Half of a coefficient's 90 % interval over it, below which it is applied and not recorded again.
+APPLIED = 0.05
 #: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g). A
 #: coefficient so many times larger is no leak of that kind.
 G_SENSITIVITY, IMPLAUSIBLE = 0.02, 50.0
 
 
-def _rounded(value: float, half: float) -> str:
+def rounded(value: float, half: float) -> str:
     """A value to the second digit of its uncertainty; 6 digits without one."""
     if not (half > 0.0 and math.isfinite(half) and value != 0.0):
         return f"{value:.6g}"
@@ -60,38 +91,154 @@ def _rounded(value: float, half: float) -> str:
     return f"{value:#.{digits}g}".removesuffix(".")
 
 
-def _intervals(stretches: Sequence[Sequence[float]]) -> str:
+def intervals(stretches: Sequence[Sequence[float]]) -> str:
     """The first few stretches of time, and how many more there are."""
     shown = ", ".join(f"{start:.6g} s to {end:.6g} s" for start, end in stretches[:INTERVALS_SHOWN])
     more = len(stretches) - INTERVALS_SHOWN
     return f"from {shown}" + (f" and {more} more" if more > 0 else "")
 
 
+def sizes(estimate: Mapping[str, Any]) -> str:
+    """An estimate read out: each size to the second digit of its uncertainty."""
+    return ", ".join(filter(None, (_size(str(key), value) for key, value in estimate.items())))
+
+
+def _size(key: str, value: Any) -> str:
+    label = LABELS.get(key, key.replace("_", " "))
+    if isinstance(value, Mapping) and "median" in value:
+        low, high = value.get("q05"), value.get("q95")
+        half = math.nan if low is None or high is None else 0.5 * (high - low)
+        unit = "" if value.get("unit") in (None, "1") else f" {value['unit']}"
+        spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
+        return f"{label} {rounded(value['median'], half)}{spread}{unit}"
+    match key:
+        case "intervals":
+            return intervals(value)
+        case "band_hz":
+            return f"between {value[0]:.3g} Hz and {value[1]:.3g} Hz"
+        case "form":
+            return FORMS.get(value, "")
+        case "form_also_possible":
+            return f"not to be told from {', '.join(FORM_NAMES.get(one, str(one)) for one in value)}"
+        case "jumps":
+            times = ", ".join(f"{one['time_s']:.0f}" for one in value)
+            return f"jumps at {times} s" if times else ""
+        case "statistic":
+            return statistic(str(value))
+        case "input" | "source" | "measured" | "law":
+            return ""
+    if isinstance(value, list | tuple):
+        return f"{label} {', '.join(str(one) for one in value)}"
+    return f"{label} {value:.3g}" if isinstance(value, float) else f"{label} {value}"
+
+
+def statistic(name: str) -> str:
+    """What stands out, by the name of a statistic or of a check."""
+    return next((told for begin, told in STATISTICS if name.startswith(begin)), name.replace("_", " "))
+
+
 def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
     """The cause with its size."""
-    parts = []
-    for key, value in estimate.items():
-        label = LABELS.get(key, key)
-        if isinstance(value, Mapping):
-            half = 0.5 * (value["q95"] - value["q05"])
-            unit = "" if value["unit"] == "1" else f" {value['unit']}"
-            spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
-            parts.append(f"{label} {_rounded(value['median'], half)}{spread}{unit}")
-        elif key == "intervals":
-            parts.append(_intervals(value))
-        elif key == "band_hz":
-            parts.append(f"between {value[0]:.3g} Hz and {value[1]:.3g} Hz")
-        elif key == "form":
-            parts += [FORMS[value]] if value in FORMS else []
-        elif key == "form_also_possible":
-            parts.append(f"not to be told from {', '.join(value)}")
-        elif key in ("input", "source"):
-            continue
-        else:
-            parts.append(f"{label} {value:.4g}" if isinstance(value, float) else f"{label} {value}")
-    text = ", ".join(parts)
+    text = sizes(estimate)
     begin = CAUSES[cause].unsure if "source" in estimate else CAUSES[cause].words
     return f"{begin} {text[:1].upper()}{text[1:]}."
+
+
+def event(finding: Mapping[str, Any]) -> str:
+    """A finding of all axes in a sentence: the cause, what the axes have in common, and its size on each."""
+    each = "; ".join(f"{axis}: {sizes(one['estimate'])}" for axis, one in finding["axes"].items() if one["estimate"])
+    told = ". ".join(part[:1].upper() + part[1:] for part in (sizes(finding["estimate"]), each) if part)
+    return f"{CAUSES[finding['cause']].words} {told or 'On ' + ', '.join(finding['axes'])}."
+
+
+def what(finding: Mapping[str, Any]) -> str:
+    """The first words of the list: what acts, on which axes, and when or at which frequency."""
+    shape = {key: value for key, value in finding["estimate"].items() if key not in LATER}
+    told = f"{finding['cause'].replace('_', ' ')} on {' '.join(finding['axes'])}"
+    return f"{told}: {told_of}" if (told_of := sizes(shape)) else told
+
+
+def how_much(finding: Mapping[str, Any]) -> str:
+    """Its leading size on each axis."""
+    found = []
+    for axis, one in finding["axes"].items():
+        value = next((value for value in one["estimate"].values() if isinstance(value, Mapping)), None)
+        if "share" in one["estimate"] and not isinstance(one["estimate"]["share"], Mapping):
+            found.append((axis, one["estimate"]["share"], "of the drift"))
+        elif value is not None and value["median"] is not None:
+            found.append((axis, value["median"], value["unit"]))
+    return _by_unit(found)
+
+
+def _by_unit(values: Sequence[tuple[str, float, str]]) -> str:
+    """Sizes of axes; of more than two in one unit the least and the largest."""
+    told = []
+    for unit in dict.fromkeys(unit for _, _, unit in values):
+        own = [(axis, value) for axis, value, of in values if of == unit]
+        if len(own) > 2:
+            ends = [ratio(end(abs(value) for _, value in own)) for end in (min, max)]
+            text = " to ".join(dict.fromkeys(ends))
+        else:
+            text = ", ".join(f"{axis} {ratio(value)}" for axis, value in own)
+        told.append(text if unit == "1" else f"{text} {unit}")
+    return "; ".join(told)
+
+
+def effects(finding: Mapping[str, Any]) -> str:
+    """What it changes by as much as matters."""
+    told = []
+    changes = finding["changes"]
+    for name in ("N", "K", "B"):
+        # B follows from N and K: where these move it says no more.
+        own = [one for one in changes.values() if name in one["material"]]
+        own = [one for one in own if name != "B" or "K" not in one["material"]]
+        factors = [math.inf if one[name] is None else one[name] for one in own]
+        known = sorted(float(ratio(one)) for one in factors if 0.0 < one < math.inf)
+        parts = [f"× {' to '.join(dict.fromkeys(f'{end:g}' for end in (known[0], known[-1])))}"] if known else []
+        parts += ["not identified without it"] if math.inf in factors else []
+        parts += ["hidden without it"] if 0.0 in factors else []
+        told += [f"{name} {' or '.join(parts)}"] if parts else []
+    moved = [(axis, abs(one["bias"]), one["unit"]) for axis, one in changes.items() if "bias" in one["material"]]
+    if moved:
+        told.append(f"bias by {_by_unit(moved)}")
+    rows = [one["bias_error"] for one in changes.values() if "bias_error" in one["material"]]
+    less = [(1.0 - row["after"] / row["before"], horizon) for one in rows for horizon, row in one.items()]
+    if less:
+        most, horizon = max(less)
+        told.append(f"bias {horizon} s ahead known {100.0 * most:.0f} % better")
+    return ", ".join(told)
+
+
+def action(finding: Mapping[str, Any]) -> str:
+    """What to do. A coefficient that is known well enough is applied, and not measured again."""
+    cause = CAUSES.get(finding["cause"])
+    known = [one["estimate"].get("coefficient") for one in finding["axes"].values()]
+    if cause is not None and cause.entry is not None and known and all(map(_sure, known)):
+        return f"Apply it: it is known to {100.0 * APPLIED:.0f} %. --write-model states it."
+    return str(finding["record_next"])
+
+
+def _sure(coefficient: Mapping[str, Any] | None) -> bool:
+    return coefficient is not None and coefficient["q95"] - coefficient["q05"] < 2.0 * APPLIED * abs(
+        coefficient["median"]
+    )
+
+
+def small(findings: Sequence[Mapping[str, Any]]) -> str:
+    """One line on the findings that matter little: by how much they move a number at most."""
+    told = []
+    for name in ("N", "K", "B"):
+        factors = [one[name] for finding in findings for one in finding["changes"].values()]
+        most = max((abs(one - 1.0) for one in factors if one is not None and math.isfinite(one)), default=0.0)
+        told.append(f"{name} by more than {100.0 * most:.0f} %")
+    count = f"{len(findings)} small finding{'s' if len(findings) != 1 else ''}"
+    none = "none changes" if len(findings) != 1 else "it does not change"
+    return f"{count}: {none} {', '.join(told)}, or any of these and the bias by more than half of its interval"
+
+
+def ratio(value: float) -> str:
+    """Two digits."""
+    return f"{float(f'{value:.2g}'):g}"
 
 
 def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f}".format) -> str:
@@ -118,7 +265,9 @@ def carried(finding: Mapping[str, Any]) -> list[str]:
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
     told = [
-        f"{name} {f'{factor:.2f} times' if math.isfinite(factor) else 'many times'} the value with it"
+        f"{name} {ratio(factor)} times the value with it"
+        if math.isfinite(factor)
+        else f"{name} not identified without it"
         for name, factor in inflation.items()
         if not 0.95 < factor < 1.05
     ]

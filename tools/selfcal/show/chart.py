@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import Literal
 
@@ -16,6 +16,10 @@ from selfcal.likelihood.statemodel import Array
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
 WIDTH, HEIGHT = 340, 220
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
+#: Size of a picture of strips, room for their names, and the height of each.
+STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
+#: Share of the points of a strip that may lie beyond its lower edge, and beyond its upper one.
+USUAL = 0.02
 #: Rows of a table behind a picture at most.
 ROWS = 25
 #: Ticks on an axis, about.
@@ -182,6 +186,58 @@ def draw(figure: Figure) -> str:
         f"<figure><div class=panels>{pictures}</div>"
         f"<figcaption>{escape(figure.caption)} {_key(figure)}</figcaption>{_tables(figure)}</figure>"
     )
+
+
+def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> str:
+    """The figure in HTML with its panels one below the other over one x, each on its own scale; `marks`: places with
+    the text that stands above them."""
+    x = _Scale(*_x_limits(figure), False, STRIP_LEFT, STRIP_WIDTH - STRIP_LEFT - RIGHT)
+    right, bottom = STRIP_WIDTH - RIGHT, TOP + STRIP * len(figure.panels)
+    told = f"{figure.name}: {', '.join(panel.title for panel in figure.panels)}; marks at " + (
+        ", ".join(f"{number(at)} s ({text})" for at, text in marks) or "no time"
+    )
+    out = [f'<svg viewBox="0 0 {STRIP_WIDTH} {bottom + 34}" role=img aria-label="{escape(told)}">']
+    for row, given in enumerate(figure.panels):
+        top = TOP + STRIP * row
+        y = _Scale(*_usual(given), False, top + STRIP - 4, -(STRIP - 8))
+        panel = replace(
+            given,
+            curves=[replace(one, y=np.clip(one.y, y.low, y.high)) for one in given.curves],
+            bands=[
+                replace(one, low=np.clip(one.low, y.low, y.high), high=np.clip(one.high, y.low, y.high))
+                for one in given.bands
+            ],
+        )
+        out.append(f"<path class=grid d='M{STRIP_LEFT} {top + STRIP}H{right}'/>")
+        out.append(f"<text class=name x=4 y={top + STRIP // 2}>{escape(panel.title)}</text>")
+        span = number(y.high - y.low, 2)
+        out.append(f"<text class=tick x=4 y={top + STRIP // 2 + 15}>{span} {escape(panel.y_label)}</text>")
+        out += [_band(band, x, y, False) for band in panel.bands]
+        out += [_curve(curve, x, y, False) for curve in panel.curves]
+    above: dict[float, list[str]] = {}
+    for at, text in sorted(marks):
+        place = float(x.at(np.array([at]))[0])
+        out.append(f"<path class=mark d='M{place:.1f} {TOP}V{bottom}'/>")
+        near = next((one for one in above if place - one < 14.0), place)
+        above.setdefault(near, []).append(text)
+    for place, texts in above.items():
+        text = escape(" ".join(dict.fromkeys(texts)))
+        out.append(f"<text class=name x={place:.1f} y={TOP - 6} text-anchor=middle>{text}</text>")
+    for value in x.ticks():
+        at = float(x.at(np.array([value]))[0])
+        out.append(f"<text class=tick x={at:.1f} y={bottom + 15} text-anchor=middle>{number(value)}</text>")
+    out.append(f"<text class=tick x={right} y={bottom + 30} text-anchor=end>{escape(figure.panels[0].x_label)}</text>")
+    return (
+        f"<figure><div class='scroll strips' tabindex=0 role=group aria-label='{escape(figure.name)}'>{''.join(out)}"
+        f"</svg></div><figcaption>{escape(figure.caption)} {_key(figure)}</figcaption>{_tables(figure)}</figure>"
+    )
+
+
+def _usual(panel: Panel) -> tuple[float, float]:
+    """Limits that all but a few points of a panel keep: a shock must not hide a step."""
+    values = [one.y for one in panel.curves] + [edge for one in panel.bands for edge in (one.low, one.high)]
+    usual = [np.nanquantile(one, (USUAL, 1.0 - USUAL)) for one in values if np.isfinite(one).any()]
+    return _limits(usual, False, 0.06)
 
 
 def _panel(panel: Panel, x: _Scale, y: _Scale) -> str:

@@ -107,7 +107,9 @@ def _verdicts(document: Mapping[str, Any], names: Mapping[str, str]) -> Iterator
             elif "error" in one:
                 cells += f"<td>{escape(str(one['error']))}</td>"
             else:
-                causes = ", ".join(cause_name(cause) for cause in one["causes"])
+                told = [cause for cause in one["causes"] if cause in (*one["material"], "unexplained")]
+                less = len(one["causes"]) - len(told)
+                causes = ", ".join([*map(cause_name, told), *([f"{less} small"] if less else [])])
                 cells += f"<td>{verdict_of(one)}{f': {causes}' if causes else ''}</td>"
         rows += f"<tr><th scope=row>{escape(name)}</th>{cells}</tr>"
     heads = "".join(f"<th scope=col>{escape(head)}</th>" for head in ("recording", *axes))

@@ -19,20 +19,17 @@ from selfcal.base.ending import Stopped
 from selfcal.base.output import write_text
 from selfcal.base.units import parameter_unit
 from selfcal.diagnosis import words
-from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.events import UNEXPLAINED, small, times_of
 from selfcal.diagnosis.extend import fitted_law
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.show import pictures
-from selfcal.show.chart import Figure, draw, number, outside_of, scrolled
+from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, number, outside_of, scrolled, strips
+from selfcal.show.findings import before_after
 
 #: Bytes of the page without its style, at most.
 SIZE_MOST = 990_000
 LEFT_OUT = "<p>This picture is left out to keep the page small: ask for this axis alone with <code>--axis</code>.</p>"
-#: Findings with less than this share of the largest evidence of the page, or of their axis, are folded.
-FOLDED = 0.01
-#: Findings listed at the top of the page at most; the rest stand with their axes.
-TOP = 40
 #: Name of the figure that decides whether the Allan curve leaves its band, and the share of its points from which on it
 #: does. Each point of a fitting record lies outside the range of 20 with a probability of 2/21, and neighbours do so
 #: together: of 400 fitting records one had more than this share outside, nine more than a quarter.
@@ -65,6 +62,8 @@ dl{display:grid;grid-template-columns:minmax(8rem,max-content) 1fr;gap:.2rem 1re
 dt{color:var(--soft)}dd{margin:0;overflow-wrap:anywhere}
 figure{margin:.8rem 0;min-width:0}
 .panels{display:grid;grid-template-columns:repeat(auto-fit,minmax(min(100%,290px),1fr));gap:.5rem 1rem;max-width:860px}
+.strips svg{width:100%;min-width:680px;max-width:1000px;height:auto;display:block}
+.events td:nth-child(n+3){min-width:11rem}
 .panels svg{width:100%;max-width:420px;height:auto;display:block}
 @media(min-width:1150px){figure{display:grid;grid-template-columns:minmax(0,3fr) minmax(0,1fr);gap:0 1.2rem}
 figure details{grid-column:1/-1}.key{display:block;white-space:normal;margin:.4rem 0 0}figcaption{padding-top:1.6rem}}
@@ -162,7 +161,7 @@ def _body(document: Mapping[str, Any], record: Record, found: Mapping[str, Diagn
         allan[axis] = _allan_after(overview)
         sections.append(list(_axis(k, axis, entry, one, overview, own, allan[axis])))
     rest = [*_gains(axes), *_not_found(axes), *_reproduce(document, options), *_reading()]
-    parts = [_Part(text) for text in (*_summary(axes, failed, found, allan), *_contents(axes))]
+    parts = [_Part(text) for text in (*_summary(document, axes, failed, found, allan), *_contents(axes))]
     parts += [part for section in sections for part in section]
     parts += [_Part(text) for text in rest]
     return _within(parts, SIZE_MOST)
@@ -229,6 +228,7 @@ def _leaves(allan: tuple[int, int]) -> bool:
 
 
 def _summary(
+    document: Mapping[str, Any],
     axes: Mapping[str, Mapping[str, Any]],
     failed: Mapping[str, str],
     found: Mapping[str, Diagnosed],
@@ -241,69 +241,135 @@ def _summary(
     if bad:
         yield (
             f"<p><span class=bad>✗ Not adequate: {escape(', '.join(bad))}.</span> "
-            "The recording differs from what the model simulates.</p>"
+            "What was found changes N, K, B or the bias, or has no name.</p>"
         )
     if good:
         yield (
             f"<p><span class=good>✓ Adequate: {escape(', '.join(good))}.</span> "
-            "Nothing in the recording speaks against the model.</p>"
+            "Nothing found there changes N, K, B or the bias by as much as matters.</p>"
         )
     if begun:
         yield f"<p><strong>Not finished: {escape(', '.join(begun))}.</strong> Nothing was found so far.</p>"
     for axis, error in failed.items():
         yield f"<p><strong>Not diagnosed: {escape(axis)}.</strong> {escape(error)}</p>"
-    groups = _grouped(axes)
-    least = FOLDED * max((_strength(members) for members in groups), default=0.0)
-    strong = [members for members in groups if not _strength(members) < least]
+    findings = document.get("findings") or []
+    less = list(small(findings))
+    shown = [one for one in findings if not any(one is each for each in less)]
+    if shown:
+        yield _events("What matters", "One row an event or source, the largest change first.", shown, axes)
+    if less:
+        yield f"<details><summary>{escape(words.small(less))}</summary>"
+        yield f"{_events('Small findings', 'One row an event or source.', less, axes)}</details>"
     if axes:
-        yield _matrix(axes, strong)
+        yield _numbers(axes)
+        yield _readings(shown, axes, found)
+        yield _matrix(axes)
         yield _noise(axes, found, allan)
-    if groups:
-        yield "<ol class=findings>"
-        for members in strong[:TOP]:
-            yield f"<li>{_told(members)}</li>"
-        yield "</ol>"
-    weak = [*strong[TOP:], *groups[len(strong) :]]
-    if weak:
-        yield f"<details><summary>{len(weak)} weaker findings, each below {_whole(_strength(weak[0]) * 1.0001)} nats"
-        yield f" (folded from {FOLDED:.0%} of the largest on)</summary><ol class=findings>"
-        for members in weak:
-            yield f"<li>{_told(members)}</li>"
-        yield "</ol></details>"
+    yield from (_box(one) for one in findings if not any(one["id"] == each.get("of") for each in _boxes(axes)))
     yield "</section>"
 
 
-def _strength(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> float:
-    return max(_nats(member[2]) for member in members)
+def _boxes(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    """The findings that stand with their axes."""
+    return (finding for axis in axes.values() for finding in axis["findings"])
 
 
-def _matrix(
-    axes: Mapping[str, Mapping[str, Any]], groups: Sequence[Sequence[tuple[str, int, Mapping[str, Any]]]]
+def _box(finding: Mapping[str, Any]) -> str:
+    """A finding of several axes that stands with none."""
+    facts = "".join(
+        f"<dt>{escape(axis)}</dt><dd>{escape(words.sizes(one['estimate']))}</dd>"
+        for axis, one in finding["axes"].items()
+    )
+    nats = f"{_whole(finding['evidence_nats'])} nats, {_whole(finding['net_nats'])} net of the search"
+    return (
+        f"<div class=finding><h3 id='{_id(finding['id'], 0)}'>{cause_name(finding['cause'])}</h3>"
+        f"<p>{escape(finding['words'])}</p><dl>{facts}<dt>Evidence</dt><dd>{nats}</dd></dl></div>"
+    )
+
+
+def _events(
+    name: str, caption: str, findings: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[str, Any]]
 ) -> str:
-    """Causes by axes: evidence, linked to the finding."""
-    if not groups:
-        return ""
-    cells: dict[str, dict[str, tuple[int, Mapping[str, Any]]]] = {}
-    for members in groups:
-        for axis, k, finding in members:
-            row = cells.setdefault(str(finding["cause"]), {})
-            if axis not in row or _nats(finding) > _nats(row[axis][1]):
-                row[axis] = (k, finding)
+    """Findings of all axes: what, where from, the size, what it changes and what to do; linked to their boxes."""
+    rows = ""
+    for place, finding in enumerate(findings, 1):
+        links = [
+            f"<a href='#{_id(axis, k)}'>{escape(axis)}</a>"
+            for axis, entry in axes.items()
+            for k, each in enumerate(entry["findings"])
+            if each.get("of") == finding["id"]
+        ] or [f"<a href='#{_id(finding['id'], 0)}'>more</a>"]
+        doubt = "; not confirmed on held-out time" if finding["confirmed"] is False else ""
+        cells = (
+            escape(finding["source"]),
+            f"{escape(unit_module.typeset(words.what(finding)))} <span class=soft>({' '.join(links)})</span>",
+            escape(unit_module.typeset(words.how_much(finding))),
+            escape(unit_module.typeset(words.effects(finding)) + doubt),
+            escape(words.action(finding)),
+        )
+        rows += f"<tr><th scope=row>{place}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
+    heads = "".join(f"<th scope=col>{head}</th>" for head in ("row", "from", "what", "size", "changes", "do"))
+    return scrolled(name, caption, f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody>", "events")
 
-    def cell(row: Mapping[str, tuple[int, Mapping[str, Any]]], axis: str) -> str:
-        if axis not in row:
+
+def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> str:
+    """N, K and B of each axis without its findings and with them."""
+    rows = "".join(
+        f"<tr><th scope=row>{escape(axis)}</th>"
+        + "".join(f"<td>{escape(before_after(entry['numbers'][name]))}</td>" for name in ("N", "K", "B"))
+        + "</tr>"
+        for axis, entry in axes.items()
+        if "numbers" in entry
+    )
+    heads = "".join(f"<th scope=col>{head}</th>" for head in ("axis", "N", "K", "B"))
+    caption = "Before → with the findings in the model: medians, 5 to 95 %. –: looked for, not identified."
+    table = f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody>"
+    return scrolled("N, K and B before and after", caption, table.replace("-&gt;", "→"), "glance numbers")
+
+
+def _readings(
+    findings: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[str, Any]], found: Mapping[str, Diagnosed]
+) -> str:
+    """The readings of all axes over one time, the events marked by their numbers in the list."""
+    marks = [(time, str(place)) for place, one in enumerate(findings, 1) for time in times_of(one)]
+    panels = []
+    for axis, entry in axes.items():
+        one = found[axis]
+        factor = unit_module.factor(one.state.unit, str(entry["unit"]))
+        x, mean, low, high = envelope(one.record.time_s + one.record.start_s, one.first.y, pictures.POINTS)
+        band = Band("lowest to highest reading", x, factor * low, factor * high, "spread")
+        unit = unit_module.typeset(str(entry["unit"]))
+        panels.append(
+            Panel(axis, "time, s", unit, [Curve("mean", x, factor * mean)], [band], marks=[m for m, _ in marks])
+        )
+    caption = "Readings of each axis about its level, each on its own scale. Numbers: the rows of the list."
+    return strips(Figure("Readings and events", caption, panels), marks)
+
+
+def _matrix(axes: Mapping[str, Mapping[str, Any]]) -> str:
+    """Causes by axes: which matter, and which were looked for and not found; linked to the boxes."""
+    places: dict[str, dict[str, int]] = {}
+    for axis, entry in axes.items():
+        for k, finding in enumerate(entry["findings"]):
+            places.setdefault(str(finding["cause"]), {}).setdefault(axis, k)
+    if not places:
+        return ""
+
+    def cell(cause: str, axis: str) -> str:
+        if axis not in places[cause]:
             return "<td class=soft>–</td>"
-        k, finding = row[axis]
-        nats = _nats(finding)
-        return f"<td><a href='#{_id(axis, k)}'>{f'{nats:.0f}' if 10.0 <= nats < 1e7 else number(nats, 2)}</a></td>"
+        known = (*axes[axis].get("material", ()), UNEXPLAINED)
+        sign = "●" if cause in known else "○"
+        return f"<td><a href='#{_id(axis, places[cause][axis])}'>{sign}</a></td>"
 
     heads = "".join(f"<th scope=col>{escape(axis)}</th>" for axis in axes)
     body = "".join(
-        f"<tr><th scope=row>{cause_name(cause)}</th>{''.join(cell(row, axis) for axis in axes)}</tr>"
-        for cause, row in cells.items()
+        f"<tr><th scope=row>{cause_name(cause)}</th>{''.join(cell(cause, axis) for axis in axes)}</tr>"
+        for cause in places
     )
     table = f"<thead><tr><th scope=col>cause</th>{heads}</tr></thead><tbody>{body}</tbody>"
-    return scrolled("Causes by axis", "Evidence of each cause, nats.", table, "glance matrix")
+    caption = "●: it matters, or has no name. ○: small. –: looked for, not found."
+    return scrolled("Causes by axis", caption, table, "glance matrix")
 
 
 def _noise(
@@ -357,44 +423,9 @@ def interval(one: Mapping[str, Any] | None) -> str:
     return f"{sign}{number(one['median'], 3)}{limits} {escape(unit_module.typeset(str(one['unit'])))}"
 
 
-def _grouped(axes: Mapping[str, Mapping[str, Any]]) -> list[list[tuple[str, int, Mapping[str, Any]]]]:
-    """Findings as (axis, number, finding), those that several axes share together; the strongest first."""
-    groups: dict[tuple[Any, ...], list[tuple[str, int, Mapping[str, Any]]]] = {}
-    for axis, entry in axes.items():
-        for k, finding in enumerate(entry["findings"]):
-            shared = tuple(sorted({axis, *(finding.get("shared_with") or ())}))
-            key: tuple[Any, ...] = (finding["cause"], shared)
-            while any(member[0] == axis for member in groups.get(key, ())):
-                key = (*key, k)  # two of one kind on one axis
-            groups.setdefault(key, []).append((axis, k, finding))
-    return sorted(groups.values(), key=lambda members: -max(_nats(member[2]) for member in members))
-
-
 def _nats(finding: Mapping[str, Any]) -> float:
     value = finding["evidence_gain_nats"]
     return float(value) if value is not None else math.inf
-
-
-def _told(members: Sequence[tuple[str, int, Mapping[str, Any]]]) -> str:
-    """One finding of the summary, with its size on each axis."""
-    findings = [finding for _, _, finding in members]
-    first = findings[0]
-    links = ", ".join(f"<a href='#{_id(axis, k)}'>{escape(axis)}</a>" for axis, k, _ in members)
-    sizes = [_sizes(finding) for finding in findings]
-    if len(set(sizes)) == 1:
-        told = escape(str(first.get("words") or sizes[0]))
-    else:
-        told = f"{escape(CAUSES[first['cause']].words)} "
-        told += "; ".join(f"{escape(axis)}: {escape(size)}" for (axis, _, _), size in zip(members, sizes, strict=True))
-        told += "."
-    nats = sorted(_nats(finding) for finding in findings)
-    evidence = words.evidence(first, _whole) if nats[0] == nats[-1] else f"{_whole(nats[0])} to {_whole(nats[-1])} nats"
-    text = f"<strong>{cause_name(first['cause'])}</strong> on {links}: {told} <span class=soft>({evidence})</span>"
-    if len(members) == 1 and first.get("inflation_words"):
-        text += f" {escape(str(first['inflation_words']))}"
-    if first.get("record_next"):
-        text += f" <strong>Do:</strong> {escape(str(first['record_next']))}"
-    return text
 
 
 def _whole(nats: float) -> str:
@@ -403,22 +434,6 @@ def _whole(nats: float) -> str:
 
 def _id(axis: str, k: int) -> str:
     return f"f-{''.join(c if c.isalnum() else '-' for c in axis)}-{k + 1}"
-
-
-def _sizes(finding: Mapping[str, Any]) -> str:
-    """The estimate: each size with its 90 % interval."""
-    told = []
-    for key, value in finding["estimate"].items():
-        name = _quantity(key)
-        if isinstance(value, Mapping) and "median" in value:
-            unit = "" if value.get("unit") in (None, "1") else f" {value['unit']}"
-            text = f"{name} {number(value['median'])}{unit}"
-            if value.get("q05") is not None and value["q05"] != value["q95"]:
-                text += f" ({number(value['q05'])} to {number(value['q95'])})"
-        else:
-            text = f"{name} {number(value) if isinstance(value, float) else value}"
-        told.append(text)
-    return ", ".join(told)
 
 
 def _quantity(key: str) -> str:
@@ -455,11 +470,11 @@ def _axis(
             f"<p><strong>The Allan curve still leaves its band</strong> with the findings in the model: {allan[0]} of "
             f"{allan[1]} points lie outside. The model does not describe these averaging times.</p>"
         )
-    least = FOLDED * max((_nats(finding) for finding in entry["findings"]), default=0.0)
+    matter = (*entry.get("material", ()), UNEXPLAINED)
     for k, finding in enumerate(entry["findings"]):
         match = _match(finding, one.findings)
         shown = own[match] if match is not None else []
-        yield from _finding(_id(axis, k), finding, shown, folded=_nats(finding) < least)
+        yield from _finding(_id(axis, k), finding, shown, folded=finding["cause"] not in matter)
     yield _Part("<h3>Whole record, measured against simulated</h3>")
     for figure in overview:
         yield _Part(f"<h4>{escape(figure.name)}</h4>{draw(figure)}")
@@ -487,13 +502,13 @@ def _finding(key: str, finding: Mapping[str, Any], shown: Sequence[Figure], *, f
 
 def _facts(finding: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
     """Name and text (HTML) of what is known of a finding."""
-    yield "Size (90 % interval)", escape(_sizes(finding))
+    yield "Size (half of the 90 % interval)", escape(words.sizes(finding["estimate"]))
     when = finding.get("when")
     if when:
         yield "When", f"{number(when[0], 6)} s" + ("" if when[0] == when[1] else f" to {number(when[1], 6)} s")
     yield "Evidence when found", words.evidence(finding, _whole)
     if finding.get("shared_with"):
-        yield "Also on", escape(", ".join(finding["shared_with"]))
+        yield "One with", escape(", ".join(finding["shared_with"]))
     if finding.get("also_possible"):
         yield "It may also be", ", ".join(cause_name(cause) for cause in finding["also_possible"])
     if finding.get("record_next"):

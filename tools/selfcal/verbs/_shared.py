@@ -45,7 +45,11 @@ SincePowerOn = Annotated[
 Gate = Annotated[bool, option("Keep motion out, by the model's stationary gate", "--gate")]
 FailOn = Annotated[
     str | None,
-    option("Exit code 1 when an axis shows it, 2 when one cannot be judged", "--fail-on", metavar="inadequate|CAUSE"),
+    option(
+        "Exit code 1 when an axis shows it, 2 when one cannot be judged",
+        "--fail-on",
+        metavar="inadequate|material|CAUSE",
+    ),
 ]
 LimitsFile = Annotated[
     Path | str | None,

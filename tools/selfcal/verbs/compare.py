@@ -37,7 +37,10 @@ def compare(
     ] = None,
     fail_on: Annotated[
         str | None,
-        option("Exit code 1 when an axis shows it, 2 when one cannot be judged", metavar="changed|inadequate|CAUSE"),
+        option(
+            "Exit code 1 when an axis shows it, 2 when one cannot be judged",
+            metavar="changed|inadequate|material|CAUSE",
+        ),
     ] = None,
     limits: LimitsFile = None,
     junit: Junit = None,

@@ -60,6 +60,7 @@ def diagnose(
     end_s: End = None,
     since_power_on_s: SincePowerOn = 0.0,
     gate: Gate = False,
+    details: Annotated[bool, option("Print every finding of each axis too", "--details")] = False,
     **reading: Unpack[Reading],
 ) -> Diagnosis:
     """Diagnose the axes of a recording; returns the document `selfcal.diagnose/1` and writes it to `json`.
@@ -73,7 +74,7 @@ def diagnose(
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
     write is kept, by a UserError. `fail_on`: see fail_on.py; it is
     only checked here. `limits`, `junit`, `verdicts`, `start_s`, `end_s`, `since_power_on_s`, `gate`: as `identify` has
-    them; times found are those of the whole recording.
+    them; `details` is for the command; times found are those of the whole recording.
     Numbers are in the recording's units. Raises UserError for what the user can put right.
 
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
@@ -106,6 +107,7 @@ def diagnose(
         why_not,
     )
     from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
+    from selfcal.diagnosis.events import add_findings
     from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
     from selfcal.diagnosis.finding import Diagnosed
     from selfcal.diagnosis.loop import INTERRUPTED
@@ -184,17 +186,17 @@ def diagnose(
                     kept = {key: tree["simulate"]["axes"][name][key] for key in ("bias", "N")}
                     tree["simulate"]["axes"][name] = {**law, **kept}
             document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])
-            if shared is not None:
-                document["findings"] = [entry_of(shared, found, recording)]
-                if second is not None:
-                    on_second = of_recording(second, loaded, 1.0 / shared.dt)
-                    document["findings"][0]["gain_on"] = hidden.carried(shared, on_second.axes)
+            quantity = None if shared is None else entry_of(shared, found, recording)
+            if shared is not None and quantity is not None and second is not None:
+                on_second = of_recording(second, loaded, 1.0 / shared.dt)
+                quantity["gain_on"] = hidden.carried(shared, on_second.axes)
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
                 add_carried(document, loaded, tree, record, found, second)
             doing.now("posterior")
-            add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
+            known = add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
+            add_findings(document, recording, found, known, quantity)
             if write_model is not None:
                 write_text(write_model, as_text(tree, recording.path))
                 if out:
@@ -216,7 +218,7 @@ def diagnose(
 def show(document: Diagnosis, given: Mapping[str, Any]) -> int:
     """Print each finding in words; the exit code of `--fail-on` and the limits."""
     from selfcal.batch.fail_on import exit_code
-    from selfcal.diagnosis.diagnose import show as table
+    from selfcal.show.findings import show as table
 
-    table(document, to_stderr=to_stderr(given))
+    table(document, to_stderr=to_stderr(given), details=bool(given.get("details")))
     return exit_code(document, given.get("fail_on"))

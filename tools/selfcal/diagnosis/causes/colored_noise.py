@@ -92,6 +92,8 @@ CAUSE = Cause(
     "colored_noise",
     "The white noise has memory: neighbouring samples are correlated.",
     "Record at the sensor's full rate with its filter off.",
+    source="read-out",
+    alike=lambda a, b: True,
     looks=looks,
     before_motion=looks,
     slow=True,

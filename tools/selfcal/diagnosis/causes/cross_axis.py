@@ -145,6 +145,9 @@ CAUSE = Cause(
     unsure="This axis and another one move together. The record does not show which of them is the source: it may be a "
     "third one that was not recorded, such as the temperature.",
     record_next="Turn the sensor so that the other axis reads something else. Record temperature and supply beside it.",
+    source="sensor",
+    alike=lambda a, b: bool(a.estimate["other"] == b.estimate["other"]),
+    piece=lambda look, axes, jumps: look.estimate["other"] in axes,
     looks=looks,
     settle=_settle,
     pictures=shown("means", "evidence"),

@@ -72,6 +72,8 @@ CAUSE = Cause(
     "flicker",
     "The bias has flicker (1/f) noise, or drifts on two time scales at once.",
     "Record three times as long, and at 10 Hz or more.",
+    source="sensor",
+    alike=lambda a, b: True,
     looks=looks,
     slow=True,
     pictures=shown("allan"),

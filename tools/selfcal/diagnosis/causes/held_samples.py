@@ -42,6 +42,7 @@ CAUSE = Cause(
     "held_samples",
     "The logger asks oftener than the sensor measures: readings repeat.",
     "Log at the sensor's own rate, on its data-ready line.",
+    source="read-out",
     alike=lambda a, b: True,
     no_gain="repeats are left out before and after",
     of_estimate=_of_estimate,

@@ -11,6 +11,7 @@ CAUSE = Cause(
     "missing_samples",
     "Samples are missing.",
     "Check the logger's buffer and the data-ready line.",
+    source="read-out",
     alike=lambda a, b: True,
     pictures=shown("missing"),
     no_gain="gaps are bridged before and after: the model of the noise is the same",

@@ -30,6 +30,7 @@ CAUSE = Cause(
     "motion",
     "The sensor was moved or shaken while it should have rested.",
     "Record on a heavy table, away from traffic.",
+    source="handling",
     alike=lambda a, b: True,
     once="motion is an event of its recording",
     pictures=shown("largest", "fine_level"),

@@ -202,6 +202,7 @@ CAUSE = Cause(
     "oscillation",
     "The bias oscillates: a damped swing of one period that noise drives.",
     "Look for a control loop or a table of this period. Record 20 periods.",
+    source="sensor",
     looks=looks,
     most=1,
     slow=True,

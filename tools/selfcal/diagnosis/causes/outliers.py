@@ -121,6 +121,8 @@ CAUSE = Cause(
     "outliers",
     "Single samples are far off.",
     "Check the bus: log the raw words of those samples.",
+    source="read-out",
+    alike=lambda a, b: True,
     looks=looks,
     once="outliers are events of their recording",
     pictures=shown("largest", "histogram"),

@@ -31,6 +31,8 @@ BANDS_MOST = 5
 HARMONIC_MOST = 0.1
 #: Lines of two axes whose frequencies differ by less are one.
 ONE_LINE = 0.01
+#: Share of its frequency within which another line is a side band.
+SIDE_BAND = 0.1
 #: A band lies at so many of its own widths at least: what is wider is coloured or flicker noise.
 NARROW = 4
 
@@ -282,8 +284,10 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
 
 
 def _alike(a: Look, b: Look) -> bool:
-    f, g = a.estimate["frequency_hz"]["median"], b.estimate["frequency_hz"]["median"]
-    return bool(abs(f / g - 1.0) < ONE_LINE)
+    """One line, a harmonic, or a side band."""
+    f, g = sorted(float(look.estimate["frequency_hz"]["median"]) for look in (a, b))
+    times = g / f
+    return abs(times - round(times)) < ONE_LINE or times < 1.0 + SIDE_BAND
 
 
 def _pictures(look: Look) -> Sequence[str]:
@@ -309,6 +313,7 @@ CAUSE = Cause(
     "periodic",
     "A periodic disturbance of one frequency is in the readings.",
     "Record at another rate: a line that moves is an alias.",
+    source="surroundings",
     looks=looks,
     at=at,
     before_motion=looks,

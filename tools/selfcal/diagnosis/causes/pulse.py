@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
-from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, raised, scan
+from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, at_jump, raised, scan
 from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
@@ -315,11 +315,13 @@ CAUSE = Cause(
     "pulse",
     "The bias jumps, and after a while it jumps back.",
     "Look for what was switched on and off at these times.",
+    source="surroundings",
     looks=looks,
     at=at,
     most=3,
     slow=True,
     alike=_alike,
+    piece=at_jump,
     once="a pulse is an event of its recording",
     pictures=shown("means", "evidence"),
     least=_least,

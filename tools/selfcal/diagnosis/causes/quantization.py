@@ -43,6 +43,8 @@ CAUSE = Cause(
     "quantization",
     "The codes of the converter show in the readings: they are coarse and not stated, or they are not alike.",
     "State the lsb in the model file, or record with a finer range.",
+    source="read-out",
+    alike=lambda a, b: True,
     pictures=shown("lattice"),
     no_gain="the lattice is in the reading and not in the prediction",
     extend=_extend,

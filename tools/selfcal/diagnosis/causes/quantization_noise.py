@@ -85,6 +85,8 @@ CAUSE = Cause(
     "quantization_noise",
     "The readings are differences of a counted angle or velocity: quantization noise stands beside the white noise.",
     "State the increment of the counter, or record the counter itself.",
+    source="read-out",
+    alike=lambda a, b: True,
     pictures=shown("correlation"),
     least=_least,
     law=_law,

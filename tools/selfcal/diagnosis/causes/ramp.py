@@ -57,6 +57,8 @@ CAUSE = Cause(
     "ramp",
     "The bias drifts at a constant rate.",
     "Record three times as long, with the temperature beside it.",
+    source="sensor",
+    alike=lambda a, b: True,
     looks=looks,
     at=at,
     slow=True,

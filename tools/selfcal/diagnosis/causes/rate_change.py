@@ -8,6 +8,8 @@ CAUSE = Cause(
     "rate_change",
     "The sampling rate changes.",
     "Look for what set the rate at that time; record at one rate.",
+    source="read-out",
+    alike=lambda a, b: True,
     no_gain="the record has one rate before and after",
     of_estimate=lambda look: None,  # the record and its model have one rate
     keys={

@@ -31,6 +31,8 @@ CAUSE = Cause(
     "saturation",
     "Readings are clipped at a limit.",
     "Choose a wider range.",
+    source="read-out",
+    alike=lambda a, b: True,
     pictures=shown("limit"),
     no_gain="readings at the limit are scored by no density",
     extend=_extend,

@@ -253,7 +253,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                 own = [one for one in findings if _of_band(one.look, seen, pair)]
                 seen = replace(seen, gain=seen.gain + sum(one.look.gain for one in own))
                 seen = replace(seen, net=seen.net + sum(one.look.net for one in own))
-                findings.append(Finding(seen, last, state, state, (), (other,), partner))
+                findings.append(Finding(seen, last, state, state, partner=partner))
     return [*changed, *(name for name, one in found.items() if _accounted(name, one, found))]
 
 
@@ -319,6 +319,10 @@ CAUSE = Cause(
     "shared",
     "Two axes share noise of a common source.",
     "Change the supply, then the mount: the noise that follows one of them comes from there.",
+    source="surroundings",
+    pairs=True,
+    # Slow noise: the quantity wanders.
+    piece=lambda look, axes, jumps: look.estimate["other"] in axes and look.estimate.get("band_hz", (1.0,))[0] == 0.0,
     settle=_settle,
     pictures=shown("together"),
     together=carried_over,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -189,6 +189,12 @@ def _alike(a: Look, b: Look) -> bool:
     return a.when is not None and b.when is not None and abs(a.when[0] - b.when[0]) < ONE_EVENT_S
 
 
+def at_jump(look: Look, axes: Collection[str], jumps: Sequence[float]) -> bool:
+    """Whether each end of it lies at a jump of the hidden quantity."""
+    times = () if look.when is None else look.when
+    return bool(times) and all(any(abs(time - jump) < ONE_EVENT_S for jump in jumps) for time in times)
+
+
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     """One in the middle of the record."""
     n = record.present.size
@@ -210,11 +216,13 @@ CAUSE = Cause(
     "step",
     "The bias jumps once.",
     "Record again without touching the mount or the cable.",
+    source="handling",
     looks=looks,
     at=at,
     most=3,
     slow=True,
     alike=_alike,
+    piece=at_jump,
     pictures=shown("means", "evidence"),
     once="a jump is an event of its recording",
     least=_least,

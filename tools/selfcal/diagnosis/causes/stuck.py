@@ -22,6 +22,7 @@ CAUSE = Cause(
     "stuck",
     "The readings stop at one value for a while.",
     "Check the bus and the sensor's data-ready line at that time.",
+    source="read-out",
     alike=lambda a, b: bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0]),
     no_gain="readings that stick are no readings: none is scored",
     of_estimate=lambda look: {"intervals": len(look.estimate["intervals"])},

@@ -9,6 +9,7 @@ CAUSE = Cause(
     "supply",
     "The bias follows the supply voltage.",
     "Change the supply by 0.1 V and back, twice, at a constant temperature.",
+    source="surroundings",
     looks=lambda state, record: forms.side_looks(state, record, "supply"),
     at=lambda state, record, theta: forms.side_at(state, record, "supply", theta),
     alike=lambda a, b: True,

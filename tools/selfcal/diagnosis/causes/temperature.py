@@ -9,6 +9,7 @@ CAUSE = Cause(
     "temperature",
     "The bias follows the temperature.",
     "Cycle the temperature up and down, so that it does not only rise with time.",
+    source="surroundings",
     looks=lambda state, record: forms.side_looks(state, record, "temperature"),
     at=lambda state, record, theta: forms.side_at(state, record, "temperature", theta),
     alike=lambda a, b: True,

@@ -313,6 +313,7 @@ CAUSE = Cause(
     "turn_on",
     "The bias settles after power-on.",
     "Start the record four time constants after power-on, or keep the regressor in the model file.",
+    source="sensor",
     looks=looks,
     at=at,
     most=1,

@@ -247,6 +247,7 @@ CAUSE = Cause(
     "two_level",
     "The bias jumps between two levels (popcorn noise).",
     "Record longer: dwell times are known by the jumps. Try another part: single ones have it.",
+    source="sensor",
     looks=looks,
     most=1,
     slow=True,

@@ -25,6 +25,7 @@ CAUSE = Cause(
     "unexplained",
     "The readings differ from every model tried, and no known cause explains it.",
     "Record again: if the statistic stands out a second time, it is the sensor's own.",
+    alike=lambda a, b: bool(a.estimate["statistic"] == b.estimate["statistic"]),
     most=1,
     settle=_settle,
     no_gain="no model was extended",

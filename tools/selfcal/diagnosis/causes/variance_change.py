@@ -14,6 +14,7 @@ import numpy as np
 
 from selfcal.diagnosis.cause import Cause, Extension, Key, medians, positive, shown
 from selfcal.diagnosis.causes import vibration
+from selfcal.diagnosis.causes.step import ONE_EVENT_S
 from selfcal.diagnosis.forms import LN_SMOOTHINGS, SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
@@ -228,10 +229,18 @@ def _extend(at: Extension) -> None:
         add_handling(at.tree, "variance_changes", True)
 
 
+def _alike(a: Look, b: Look) -> bool:
+    if a.when is None or b.when is None:
+        return a.when is b.when and a.estimate["channel"] == b.estimate["channel"]
+    return abs(a.when[0] - b.when[0]) < ONE_EVENT_S
+
+
 CAUSE = Cause(
     "variance_change",
     "The noise level changes.",
     "Look for what was switched on at that time, or for what the channel drives.",
+    source="surroundings",
+    alike=_alike,
     looks=looks,
     most=3,
     before_motion=once,

@@ -1,0 +1,207 @@
+"""Events and sources of all axes: what is one, and which of them matter."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from selfcal.adequacy.document import Identified
+from selfcal.adequacy.summary import Number
+from selfcal.bank.result import Estimate
+from selfcal.batch.fail_on import outcome
+from selfcal.diagnosis import events, words
+from selfcal.diagnosis.events import Member, grouped
+from selfcal.diagnosis.finding import Finding
+from selfcal.likelihood.state import Look, State, interval
+from selfcal.show.findings import show
+from selfcal.verbs.diagnose import diagnose
+
+
+def member(axis: str, cause: str, net: float, time_s: float | None = None, **estimate: Any) -> Member:
+    """A finding that only its look tells apart."""
+    when = None if time_s is None else (time_s, time_s)
+    look = Look(cause, net, net, estimate, {}, when=when)
+    state = cast(State, None)
+    entry = {"when": None if when is None else list(when), "estimate": estimate, "gain": None}
+    return Member(axis, Finding(look, 1, state, state), entry, 1.0)
+
+
+def line(hz: float) -> dict[str, Any]:
+    return {"frequency_hz": interval(hz, 1e-4 * hz, "Hz"), "amplitude": interval(1.0, 0.1, "deg/s")}
+
+
+def parts(members: list[Member], quantity: dict[str, Any] | None = None) -> set[tuple[str, ...]]:
+    """Each event: its cause, then axis and net of every member."""
+    return {
+        (one.cause, *sorted(f"{each.axis} {each.finding.look.net:g}" for each in one.members))
+        for one in grouped(members, quantity)
+    }
+
+
+def test_jumps_of_one_time_are_one_event() -> None:
+    """Two jumps 19 s apart on three axes each: an axis shows an event once, and the nearest one takes it."""
+    times = {"ax": (540.2, 559.1), "ay": (541.0, 558.7), "gz": (539.8, 560.2)}
+    members = [member(axis, "step", 50.0 - k, each) for axis, both in times.items() for k, each in enumerate(both)]
+    assert parts(members) == {("step", "ax 50", "ay 50", "gz 50"), ("step", "ax 49", "ay 49", "gz 49")}
+
+
+def test_a_line_its_harmonics_and_side_bands_are_one_source() -> None:
+    found = [("gx", 0.23), ("gy", 0.46), ("gy", 0.215), ("az", 0.2301), ("az", 0.33)]
+    members = [member(axis, "periodic", 40.0 - k, **line(hz)) for k, (axis, hz) in enumerate(found)]
+    assert parts(members) == {("periodic", "az 37", "gx 40", "gy 38", "gy 39"), ("periodic", "az 36")}
+
+
+def test_pairs_that_meet_are_one_group() -> None:
+    """Also where the pair that joins two groups comes last."""
+    pairs = [("gx", "gy"), ("gz", "ax"), ("ay", "az"), ("gy", "gz")]
+    members = [member(one, "shared", 30.0 - k, other=two) for k, (one, two) in enumerate(pairs)]
+    assert parts(members) == {("shared", "gx 30", "gy 27", "gz 29"), ("shared", "ay 28")}
+
+
+def test_a_law_and_a_channel_are_one_source_and_other_causes_are_not() -> None:
+    members = [member(axis, "flicker", 20.0) for axis in ("gy", "az")]
+    members += [member(axis, "temperature", 30.0) for axis in ("gx", "az")]
+    members += [member("gx", "cross_axis", 25.0, other="ay"), member("gz", "cross_axis", 24.0, other="ay")]
+    members += [member("gy", "cross_axis", 23.0, other="az")]
+    assert parts(members) == {
+        ("flicker", "az 20", "gy 20"),
+        ("temperature", "az 30", "gx 30"),
+        ("cross_axis", "gx 25", "gz 24"),
+        ("cross_axis", "gy 23"),
+    }
+
+
+def test_pieces_of_a_hidden_quantity_are_its_own() -> None:
+    """Jumps of its times, leaks among its axes, and the slow noise that these share. Not its white noise, nor an axis
+    that it does not move."""
+    quantity = {"axes": {"gx": {}, "gy": {}, "ax": {}}, "estimate": {"jumps": [{"time_s": 812.0, "size": 3.0}]}}
+    slow, white = {"band_hz": [0.0, 0.04]}, {}
+    members = [
+        member("gx", "step", 60.0, 815.0),
+        member("gx", "step", 59.0, 1100.0),
+        member("az", "step", 58.0, 813.0),
+        member("ax", "cross_axis", 57.0, other="gy"),
+        member("ax", "cross_axis", 56.0, other="gz"),
+        member("gy", "shared", 55.0, other="gx", **slow),
+        member("gx", "shared", 54.0, other="gy", **white),
+    ]
+    assert parts(members, quantity) == {
+        ("hidden_input", "ax 57", "gx 60", "gy 55"),
+        ("step", "gx 59"),
+        ("step", "az 58"),
+        ("cross_axis", "ax 56"),
+        ("shared", "gx 54"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("half", "identified", "factor", "moved", "matters"),
+    [
+        (0.1, True, 1.21, 0.21, True),
+        (0.1, True, 1.08, 0.08, False),
+        (0.01, True, 0.93, -0.07, True),
+        (0.1, True, math.inf, 0.3, True),
+        (0.4, False, 1.9, 0.6, False),
+        (0.4, False, math.inf, 0.8, True),
+    ],
+)
+def test_a_number_must_move_by_more_than_half_its_interval(
+    half: float, identified: bool, factor: float, moved: float, matters: bool
+) -> None:
+    """Stated: 1 with this half of its interval; one that is not identified has an upper limit, here 1 + half."""
+    estimate = Estimate(1.0, 1.0, half / 1.6449, 1.0 - half, 1.0 + half, identified)
+    known = cast(Identified, SimpleNamespace(summary={"rrw": Number(estimate)}, group_unit="deg/s", unit="deg/s"))
+    assert (events._times("K", factor, moved, known) is not None) == matters
+
+
+def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
+    told = words.inflation_sentence({"N": 1.2345, "K": math.inf, "B": 296.23})
+    assert "N 1.2 times" in told and "K not identified without it" in told and "B 300 times" in told
+    estimate = {
+        "coefficient": interval(0.031100000000000003, 0.0, "deg/s/degC"),
+        "intervals": [[1199.5, 1200.8], [1300.0, 1302.25]],
+        "form_also_possible": ["rate", "square"],
+        "statistic": "jumps_of_the_bias",
+        "measured": 12.32,
+    }
+    text = words.sizes(estimate)
+    assert "0.0311 deg/s/degC" in text and "from 1199.5 s to 1200.8 s, 1300 s to 1302.25 s" in text
+    assert "not to be told from its rate, its square" in text and "the bias jumps" in text
+    assert not set(text) & set("[]'_") and "12.32" not in text
+
+
+@pytest.mark.parametrize(("sd", "applied"), [(0.02, True), (0.06, False)])
+def test_a_coefficient_that_is_known_is_applied(sd: float, applied: bool) -> None:
+    """Half of its 90 % interval is 3.3 % of it, or 9.9 %."""
+    axes = {"gx": {"estimate": {"coefficient": interval(-1.0, sd, "deg/s/V")}}}
+    finding = {"cause": "supply", "axes": axes, "record_next": "Change the supply."}
+    assert words.action(finding).startswith("Apply it") == applied
+
+
+TEMPERATURE = {"gx": 0.0045, "gy": -0.0038, "ax": 0.0013, "az": -0.0011}
+WHITE = {"gx": 0.004, "gy": 0.004, "gz": 0.012, "ax": 0.001, "ay": 0.001, "az": 0.001}
+
+
+@pytest.fixture(scope="module")
+def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """20 minutes at 2 Hz: a warm-up by 9 degC on four axes, and a knock on all for 2 s."""
+    random = np.random.default_rng(5)
+    n, rate = 2400, 2.0
+    t = np.arange(n) / rate
+    warm = 22.0 + 9.0 * (1.0 - np.exp(-t / 400.0)) + 0.4 * np.sin(t / 90.0)
+    knock = np.where((t >= 611.0) & (t < 613.0), 1.0, 0.0)
+    columns = {"t[s]": t}
+    for name, N in WHITE.items():
+        y = N * math.sqrt(rate) * random.standard_normal(n) + TEMPERATURE.get(name, 0.0) * warm
+        unit = "deg/s" if name[0] == "g" else "m/s^2"
+        columns[f"{name}[{unit}]"] = y + 400.0 * N * knock * random.standard_normal(n)
+    columns["temp[degC]"] = warm
+    path = tmp_path_factory.mktemp("events") / "log.csv"
+    rows = np.column_stack(list(columns.values()))
+    np.savetxt(path, rows, delimiter=",", fmt="%.8g", header=",".join(columns), comments="")
+    return dict(diagnose(path))
+
+
+def test_a_knock_hides_no_temperature(drawn: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    """Each is one entry, material, whatever the other's evidence: K of an axis that warms up is the temperature's.
+    Truth: the record is drawn without a walk."""
+    found = {one["cause"]: one for one in drawn["findings"] if one["material"]}
+    assert found.keys() == {"motion", "temperature"} and len(drawn["findings"]) == 2
+    assert set(found["motion"]["axes"]) == set(WHITE) and set(found["temperature"]["axes"]) == set(TEMPERATURE)
+    assert found["motion"]["evidence_nats"] > 20.0 * found["temperature"]["evidence_nats"]
+    for name, change in found["temperature"]["changes"].items():
+        assert {"K", "bias"} <= set(change["material"]), name
+        # The fitted column is about the middle of the record: the bias moves by the temperature's way from there.
+        assert math.copysign(1.0, change["bias"]) == -math.copysign(1.0, TEMPERATURE[name])
+    for name, axis in drawn["axes"].items():
+        N = axis["numbers"]["N"]
+        # 2400 samples know N by 1.4 %; three times that.
+        assert N["after"]["median"] == pytest.approx(WHITE[name], rel=0.05) and N["before"] > 1.5 * WHITE[name]
+        assert axis["verdict"] == "inadequate" and axis["small_findings"] == 0
+        assert {one["of"] for one in axis["findings"]} == set(axis["causes"])
+    assert outcome(drawn, "material").code == 1
+    show(drawn)
+    said = capsys.readouterr().out
+    assert "nats" not in said and "round" not in said.replace("surroundings", "")
+    assert len(said.splitlines()) < 40
+    show(drawn, details=True)
+    assert "nats in round" in capsys.readouterr().out
+
+
+def test_small_findings_leave_an_axis_adequate(tmp_path: Path) -> None:
+    """One reading in 50 is missing: none of the numbers moves. Truth: the record is white noise."""
+    random = np.random.default_rng(9)
+    t = np.arange(1800.0)[random.random(1800) > 0.02]
+    rows = np.column_stack([t, 0.05 * random.standard_normal(t.size)])
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", fmt="%.9g", header="t[s],gx[deg/s]", comments="")
+    document = diagnose(tmp_path / "log.csv")
+    axis = document.axes["gx"]
+    assert [one.cause for one in document.findings] == ["missing_samples"] and not document.findings[0].material
+    assert (axis.verdict, axis.small_findings, axis.causes) == ("adequate", 1, ["missing_samples"])
+    assert [outcome(document, wanted).code for wanted in ("inadequate", "material", "missing_samples")] == [0, 0, 1]
+    assert words.small(document.findings).startswith("1 small finding: it does not change N by more than 0 %")

@@ -1,0 +1,357 @@
+"""Findings of all axes as events and sources: one entry each, what it changes, and those that matter first.
+
+A finding is material where it moves a number that the user takes away: N, K or B of an axis by more than half of the
+stated 90 % interval and by 5 %; or the bias by half of its interval; or the error of the bias ahead by 5 %, on held-out
+time and beyond 2 sd. N, K and B without a finding come from the model that the loop had before it, with it from the one
+after it; the stated intervals are those of the extended model.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from selfcal.adequacy.document import Identified
+from selfcal.bank.result import HALF_90
+from selfcal.base import units
+from selfcal.diagnosis import hidden, words
+from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.score import bias_ahead, numbers
+from selfcal.likelihood.heldout import HARM_SD
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import Recording
+from selfcal.readings.motion import joined
+
+#: Least change of a number that matters, over the number.
+LEAST = 0.05
+#: The numbers, and their names in a summary.
+SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}
+#: Shares of the record that have less noise than the quiet level and the loud one.
+LEVELS = (0.05, 0.95)
+#: What has no name.
+UNEXPLAINED = "unexplained"
+#: Units of what several axes have in common; all else is a size on an axis.
+OF_ALL = ("s", "Hz")
+
+
+@dataclass(frozen=True)
+class Member:
+    """A finding of one axis, and its entry in the document. `factor` turns the axis' inner unit into the recording's.
+    `plain`: the noise of the readings with what the finding left out, over that without."""
+
+    axis: str
+    finding: Finding
+    entry: dict[str, Any]
+    factor: float
+    plain: float = 1.0
+
+    @cached_property
+    def sides(self) -> tuple[dict[str, float], dict[str, float]]:
+        """N, K and B without the finding and with it, in the recording's unit."""
+        before, after = self.finding.before, self.finding.after
+        old = {name: value * self.factor for name, value in numbers(before).items()}
+        if before is after:
+            return {**old, "N": old["N"] * self.plain}, old
+        new = {name: value * self.factor for name, value in numbers(after).items()}
+        if after.r is not before.r:  # the noise level is several: the one that is farthest from a single one's
+            levels = new["N"] * np.sqrt(np.quantile(after.r / before.r, LEVELS))
+            new["N"] = float(max(levels, key=lambda level: abs(math.log(level / old["N"]))))
+        return old, new
+
+    @cached_property
+    def bias(self) -> float:
+        """How far the finding moves the bias, in the recording's unit."""
+        before, after = self.finding.before, self.finding.after
+        return 0.0 if before is after else (bias_ahead(after) - bias_ahead(before)) * self.factor
+
+    def joins(self, other: Member) -> bool:
+        """Whether both are one event or source."""
+        a, b = self.finding.look, other.finding.look
+        if a.cause != b.cause:
+            return False
+        cause = CAUSES[a.cause]
+        if cause.pairs:
+            return bool({self.axis, a.estimate["other"]} & {other.axis, b.estimate["other"]})
+        return (self.axis != other.axis or a.when is None) and cause.alike(a, b)
+
+
+@dataclass
+class Event:
+    """One event or source: its `members`, the strongest first. `entry`: of a hidden quantity, which its pieces join."""
+
+    members: list[Member]
+    entry: dict[str, Any] | None = None
+    id: str = ""
+    changes: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+    @property
+    def cause(self) -> str:
+        return hidden.ID if self.entry is not None else self.members[0].finding.look.cause
+
+    @property
+    def material(self) -> bool:
+        return any(change["material"] for change in self.changes.values())
+
+    @property
+    def order(self) -> tuple[float, ...]:
+        """What moves N, K or B first, then the bias, then its error ahead; by how much."""
+        changes = [change for change in self.changes.values() if change["material"]]
+        most = max((change["most"] for change in changes), default=0.0)
+        nats = sum(member.finding.look.net for member in self.members)
+        return (-most, -float(any("bias" in change["material"] for change in changes)), -float(bool(changes)), -nats)
+
+
+def add_findings(
+    document: dict[str, Any],
+    recording: Recording,
+    found: Mapping[str, Diagnosed],
+    known: Mapping[str, Identified | None],
+    quantity: dict[str, Any] | None,
+) -> None:
+    """Put the list of all axes into the document, the id of its event into each finding of an axis, the verdicts, and
+    N, K and B before and after. `known`: by the extended model, of each axis; `quantity`: the entry of a hidden one."""
+    members = []
+    for name, one in found.items():
+        factor = units.factor(one.state.unit, document["axes"][name]["unit"])
+        for finding, entry in zip(one.by_gain, document["axes"][name]["findings"], strict=True):
+            members.append(Member(name, finding, entry, factor, _plain(one, finding, recording, factor)))
+    events = grouped(members, quantity)
+    for event in events:
+        event.changes = {
+            axis: _changes(event, axis, document["axes"][axis]["unit"], known.get(axis)) for axis in _axes(event)
+        }
+    events.sort(key=lambda event: event.order)
+    counts: dict[str, int] = {}
+    for event in events:
+        counts[event.cause] = counts.get(event.cause, 0) + 1
+        event.id = event.cause if counts[event.cause] == 1 else f"{event.cause}_{counts[event.cause]}"
+        for member in event.members:
+            member.entry["of"] = event.id
+            member.entry["shared_with"] = [axis for axis in _axes(event) if axis != member.axis]
+    document["findings"] = [_entry(event) for event in events]
+    for name, one in found.items():
+        axis = document["axes"][name]
+        own = [event for event in events if name in event.changes]
+        material = [event for event in own if event.changes[name]["material"]]
+        axis["causes"], axis["material"] = (sorted({event.cause for event in some}) for some in (own, material))
+        axis["verdict"] = "inadequate" if material or UNEXPLAINED in axis["causes"] else "adequate"
+        axis["small_findings"] = len(own) - len(material) - axis["causes"].count(UNEXPLAINED)
+        axis["numbers"] = _before_and_after(one, axis["unit"], known.get(name))
+
+
+def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -> list[Event]:
+    """Events and sources: a finding joins the first that it is one with, the nearest in time; else it begins one."""
+    events = [] if quantity is None else [Event([], quantity)]
+    jumps = [] if quantity is None else [jump["time_s"] for jump in quantity["estimate"]["jumps"]]
+    for member in sorted(members, key=lambda member: -member.finding.look.net):
+        look = member.finding.look
+        if quantity is not None and member.axis in quantity["axes"]:
+            start_s = member.entry["when"][0] - look.when[0] if look.when else 0.0
+            if CAUSES[look.cause].piece(look, quantity["axes"], [jump - start_s for jump in jumps]):
+                events[0].members.append(member)
+                continue
+        fitting = [event for event in events if event.entry is None and any(map(member.joins, event.members))]
+        if look.when is not None:  # an axis shows an event once
+            fitting = [event for event in fitting if all(each.axis != member.axis for each in event.members)]
+        if not fitting:
+            events.append(Event([member]))
+            continue
+        nearest = min(fitting, key=lambda event: _apart(event, member))
+        nearest.members.append(member)
+        for other in fitting if CAUSES[look.cause].pairs else ():  # a pair that joins two groups makes them one
+            if other is not nearest:
+                nearest.members += other.members
+                events.remove(other)
+    return events
+
+
+def _apart(event: Event, member: Member) -> float:
+    """Time between an event and a finding, s; 0 where they have none."""
+    one, two = event.members[0].finding.look.when, member.finding.look.when
+    return 0.0 if one is None or two is None else abs(one[0] - two[0])
+
+
+def _axes(event: Event) -> list[str]:
+    """The axes that it acts on, those of its entry and of its members."""
+    known = {} if event.entry is None else event.entry["axes"]
+    return sorted({*known, *(member.axis for member in event.members)}, key=lambda axis: (axis[0] == "a", axis))
+
+
+def _plain(one: Diagnosed, finding: Finding, recording: Recording, factor: float) -> float:
+    """White noise of the readings as they were read over that of those that were kept, by their differences: what was
+    left out before any fit cannot be fitted without. 1 where the loop has a model without the finding."""
+    read = one.record.readings.get(one.state.axis)
+    if finding.before is not finding.after or finding.round or read is None:
+        return 1.0
+    raw = recording.columns[one.state.axis].values
+    if raw.size == read.moving.size:
+        raw = np.where(read.moving, np.nan, raw)
+    kept = _differences(read.working) * factor / math.sqrt(read.recording.rate_hz)
+    return _differences(raw) / math.sqrt(recording.rate_hz) / kept if kept > 0.0 else 1.0
+
+
+def _differences(values: Array) -> float:
+    """Root mean square of the differences of neighbours; 0 without any."""
+    steps = np.diff(values)
+    steps = steps[np.isfinite(steps)]
+    return float(np.sqrt(np.mean(steps**2))) if steps.size else 0.0
+
+
+def _changes(event: Event, axis: str, unit: str, known: Identified | None) -> dict[str, Any]:
+    """What an event does to an axis: N, K and B without it over with it (infinite: with it the record shows none), the
+    bias, its error ahead where that is known; and which of them it moves by as much as matters."""
+    own = [member for member in event.members if member.axis == axis]
+    entry = {} if event.entry is None else event.entry["axes"].get(axis, {})
+    found: dict[str, Any] = {}
+    material, most = [], 0.0
+    for name in SUMMARY:
+        factor, moved = 1.0, 0.0
+        for member in own:
+            old, new = (side[name] for side in member.sides)
+            factor *= old / new if new else math.inf if old else 1.0
+            moved += old - new
+        found[name] = factor
+        times = _times(name, factor, moved, known) if abs(factor - 1.0) > LEAST else None
+        if times is not None:
+            material.append(name)
+            most = max(most, abs(math.log(times)))
+    found["bias"] = sum(member.bias for member in own)
+    if known is not None and abs(found["bias"]) > HALF_90 * known.result.bias_sd:
+        material.append("bias")
+    ahead = _ahead([*(member.entry["gain"] for member in own), entry.get("gain")])
+    if ahead:
+        found["bias_error"] = ahead
+    if any(_better(row) for row in ahead.values()):
+        material.append("bias_error")
+    return {**found, "unit": unit, "material": material, "most": most}
+
+
+def _times(name: str, factor: float, moved: float, known: Identified | None) -> float | None:
+    """The factor by which a number is off without an event, if that is more than half of its stated interval. A number
+    that is not identified has an upper limit, over which it is counted."""
+    number = None if known is None else known.summary.get(SUMMARY[name])
+    if known is None or number is None:
+        return factor if 0.0 < factor < math.inf else 1.0
+    stated = number.estimate.scaled(units.factor(known.group_unit, known.unit))
+    if not stated.identified:
+        return max(1.0, abs(moved) / stated.q95) if abs(moved) > 0.5 * stated.q95 else None
+    if not 0.0 < factor < math.inf:
+        factor = 1.0 + abs(moved) / stated.median
+    return factor if abs(factor - 1.0) * stated.median > 0.5 * (stated.q95 - stated.q05) else None
+
+
+def _ahead(gains: Sequence[Mapping[str, Any] | None]) -> dict[str, dict[str, float]]:
+    """Errors of the bias by horizon, before the first finding and after the last, with the sd of the difference."""
+    found: dict[str, dict[str, float]] = {}
+    for gain in gains:
+        for horizon, row in (gain["bias_rmse"]["horizon_s"] if gain else {}).items():
+            best = found.get(horizon)
+            if best is None or row["before"] - row["after"] > best["before"] - best["after"]:
+                found[horizon] = row
+    return found
+
+
+def _better(row: Mapping[str, float]) -> bool:
+    """Whether the error ahead falls by as much as matters."""
+    less = row["before"] - row["after"]
+    return less > LEAST * row["before"] and less > HARM_SD * row["sd"]
+
+
+def _entry(event: Event) -> dict[str, Any]:
+    """The document's."""
+    looks = [member.finding.look for member in event.members]
+    rows = [member.entry for member in event.members]
+    if event.entry is not None:
+        entry = {key: value for key, value in event.entry.items() if key != "id"}
+    else:
+        pairs = {
+            frozenset((member.axis, str(member.finding.look.estimate.get("other")))): member for member in event.members
+        }
+        counted = list(pairs.values()) if CAUSES[event.cause].pairs else event.members
+        gain = sum(member.finding.look.gain for member in counted)
+        entry = {
+            "cause": event.cause,
+            "estimate": _common([row["estimate"] for row in rows]),
+            "axes": {axis: _on(event, axis) for axis in _axes(event)},
+            "evidence_nats": gain,
+            "net_nats": min(gain, sum(member.finding.look.net for member in counted)),
+            "confirmed": _confirmed([row["gain"] for row in rows]),
+            "also_possible": list(dict.fromkeys(cause for row in rows for cause in row["also_possible"])),
+            "record_next": rows[0]["record_next"],
+        }
+    changes = {axis: {key: one[key] for key in one if key != "most"} for axis, one in event.changes.items()}
+    source = CAUSES[looks[0].cause].source if event.entry is None else "surroundings"
+    found = {"id": event.id, **entry, "source": source, "material": event.material, "changes": changes}
+    return {**found, "words": entry.get("words") or words.event(found)}
+
+
+def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """What all axes have in common: times, frequencies and whatever has no interval, of the strongest finding."""
+    found: dict[str, Any] = {}
+    for key in dict.fromkeys(key for one in estimates for key in one):
+        values = [one[key] for one in estimates if key in one]
+        if all(isinstance(value, Mapping) for value in values):
+            if values[0]["unit"] in OF_ALL:
+                found[key] = values[0]
+        elif key == "intervals":
+            found[key] = [list(each) for each in joined([tuple(each) for value in values for each in value])]
+        elif all(value == values[0] for value in values):
+            found[key] = values[0]
+    return found
+
+
+def _on(event: Event, axis: str) -> dict[str, Any]:
+    """Sizes of an event on one axis, and the probability that it acts there."""
+    own = [member for member in event.members if member.axis == axis]
+    sizes = {
+        key: value
+        for member in reversed(own)
+        for key, value in member.entry["estimate"].items()
+        if isinstance(value, Mapping) and value["unit"] not in OF_ALL
+    }
+    net = min(700.0, max(member.finding.look.net for member in own))
+    return {"estimate": sizes, "probability": 1.0 / (1.0 + math.exp(-net))}
+
+
+def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
+    """Whether held-out time of all axes confirms it beyond 2 sd; None: none is defined."""
+    scores = [gain["log_score_per_sample"] for gain in gains if gain]
+    if not scores:
+        return None
+    more = sum((one["after"] - one["before"]) * one["samples"] for one in scores)
+    return bool(more > HARM_SD * math.hypot(*(one["sd"] * one["samples"] for one in scores)))
+
+
+def _before_and_after(one: Diagnosed, unit: str, known: Identified | None) -> dict[str, dict[str, Any]]:
+    """N, K and B of an axis: without any finding, as plain noise has them; and with all, as the extended model does."""
+    factor = units.factor(one.state.unit, unit)
+    before, after = (numbers(state) for state in (one.first, one.state))
+    found: dict[str, dict[str, Any]] = {}
+    for name, key in SUMMARY.items():
+        own = {"before": before[name] * factor, "unit": units.parameter_unit(key, unit)}
+        if known is None or key not in known.summary:
+            found[name] = {**own, "after": {"median": after[name] * factor, "identified": after[name] > 0.0}}
+            continue
+        number = known.summary[key].estimate.scaled(units.factor(known.group_unit, unit))
+        kept = {part: getattr(number, part) for part in ("median", "q05", "q95", "identified")}
+        found[name] = {**own, "after": kept}
+    return found
+
+
+def small(findings: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
+    """Those of a document that change no number by as much as matters, and are named."""
+    return (one for one in findings if not one["material"] and one["cause"] != UNEXPLAINED)
+
+
+def times_of(finding: Mapping[str, Any]) -> list[float]:
+    """When an event happens, s of the recording; empty where it acts all the time."""
+    estimate = finding["estimate"]
+    times = [estimate["time_s"]["median"]] if "time_s" in estimate else []
+    times += [jump["time_s"] for jump in estimate.get("jumps", ())]
+    return [*times, *(begin for begin, _ in estimate.get("intervals", ()))]

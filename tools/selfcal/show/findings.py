@@ -1,0 +1,128 @@
+"""What `diagnose` prints: a line an event or source, then N, K and B before and after, then the details on demand."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich import box
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from selfcal.adequacy.document import since
+from selfcal.base import units
+from selfcal.base.errors import printable
+from selfcal.diagnosis import words
+from selfcal.diagnosis.events import small
+
+#: Characters a line of a table that no terminal shows.
+WIDTH = 150
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False, details: bool = False) -> None:
+    """What a person reads first. `details`: each finding of each axis, with its evidence and gain, below."""
+    recording, findings = document["recording"], document["findings"]
+    console = Console(stderr=to_stderr)
+
+    def say(line: str, style: str | None = None) -> None:
+        console.print(line, style=style, highlight=False, markup=False, soft_wrap=True)
+
+    say(
+        f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
+        f"{recording['duration_s']:g} s{since(recording)}"
+    )
+    if not console.is_terminal:
+        console.width = max(console.width, WIDTH)
+    less = list(small(findings))
+    shown = [one for one in findings if not any(one is each for each in less)]
+    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
+    if shown:
+        console.print(_events(shown))
+    if axes:
+        console.print(_numbers(axes))
+    if less:
+        say(words.small(less) + ("" if details else " (--details)"))
+    elif not shown and axes:
+        say("nothing found")
+    for name, axis in document["axes"].items():
+        if "error" in axis:
+            say(f"{name}: no result: {axis['error']}")
+    for name, axis in axes.items() if details else ():
+        say(f"\n{name} [{axis['unit']}]: {verdict(axis)}", "bold red" if axis["verdict"] != "adequate" else "green")
+        for finding in axis["findings"]:
+            for line in _lines(finding):
+                say(f"  {line}")
+        for line in words.carried(axis) if len(axis["findings"]) > 1 else ():
+            say(f"  all causes together: {line}")
+
+
+def verdict(axis: Mapping[str, Any]) -> str:
+    """The verdict on an axis, why it is not finished, and what the model file states already."""
+    told = words.verdict(axis) + (f": {axis['unfinished']}" if axis.get("unfinished") else "")
+    return told + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
+
+
+def _events(findings: Sequence[Mapping[str, Any]]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("", "from", "what", "size", "changes", "do"):
+        table.add_column(heading, overflow="fold")
+    for number, finding in enumerate(findings, 1):
+        doubt = "; not confirmed on held-out time" if finding["confirmed"] is False else ""
+        row = (words.what(finding), words.how_much(finding), words.effects(finding) + doubt, words.action(finding))
+        style = "bold" if finding["material"] else None
+        table.add_row(str(number), finding["source"], *map(escape, map(units.typeset, row)), style=style)
+    return table
+
+
+def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> Table:
+    """N, K and B of each axis without its findings and with them."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption_justify="left")
+    table.caption = "before -> with the findings in the model: medians [5 %, 95 %]; –: looked for, not identified"
+    for heading in ("axis", "verdict", "N", "K", "B"):
+        table.add_column(heading, overflow="fold")
+    for name, axis in axes.items():
+        cells = [escape(before_after(axis["numbers"][key])) for key in ("N", "K", "B")]
+        table.add_row(name, escape(verdict(axis)), *cells)
+    return table
+
+
+def before_after(number: Mapping[str, Any]) -> str:
+    """One number of an axis."""
+    after = number["after"]
+    told = "–" if not after["identified"] else f"{after['median']:.3g}"
+    if "q05" in after:
+        told = f"{told} [{after['q05']:.3g}, {after['q95']:.3g}]" if after["identified"] else f"< {after['q95']:.2g}"
+    before = f"{number['before']:.3g}" if number["before"] > 0.0 and math.isfinite(number["before"]) else "–"
+    return f"{before} -> {told} {units.typeset(number['unit'])}"
+
+
+def _lines(finding: Mapping[str, Any]) -> list[str]:
+    """One finding in a few lines."""
+    gain = finding["gain"]
+    lines = [f"{finding['cause']}: {finding['words']}"]
+    evidence = f"  evidence {words.evidence(finding)}"
+    if finding["when"]:
+        evidence += f"; at {finding['when'][0]:.6g} s"
+        evidence += "" if finding["when"][0] == finding["when"][1] else f" to {finding['when'][1]:.6g} s"
+    lines.append(evidence)
+    if gain is not None:
+        score = gain["log_score_per_sample"]
+        errors = ", ".join(
+            f"{horizon} s {row['before']:.3g} -> {row['after']:.3g}"
+            for horizon, row in gain["bias_rmse"]["horizon_s"].items()
+        )
+        lines.append(f"  held-out gain {score['after'] - score['before']:+.4f} ± {score['sd']:.2g} nats a sample")
+        lines[-1] += f"; bias error ahead, {gain['bias_rmse']['unit']}: {errors}" if errors else ""
+    elif finding.get("gain_reason"):
+        lines.append(f"  no held-out gain: {finding['gain_reason']}")
+    lines += [f"  {line}" for line in words.carried(finding)]
+    if finding["inflation_words"]:
+        lines.append(f"  {finding['inflation_words']}")
+    if finding["shared_with"]:
+        lines.append(f"  one with {finding['of'].replace('_', ' ')} on {', '.join(finding['shared_with'])}")
+    if finding["also_possible"]:
+        lines.append(f"  this record cannot tell it from: {', '.join(finding['also_possible'])}")
+    lines.append(f"  next: {finding['record_next']}")
+    return lines
