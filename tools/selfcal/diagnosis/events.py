@@ -73,8 +73,9 @@ class Member:
     def joins(self, other: Member) -> bool:
         """Whether both are one event or source."""
         a, b = self.finding.look, other.finding.look
-        if a.cause != b.cause:
-            return False
+        events = (self.finding.event, other.finding.event)
+        if a.cause != b.cause or all(events):
+            return a.cause == b.cause and events[0] == events[1]
         cause = CAUSES[a.cause]
         if cause.pairs:
             return bool({self.axis, a.estimate["other"]} & {other.axis, b.estimate["other"]})
@@ -280,7 +281,7 @@ def _entry(event: Event) -> dict[str, Any]:
             "estimate": _common([row["estimate"] for row in rows]),
             "axes": {axis: _on(event, axis) for axis in _axes(event)},
             "evidence_nats": gain,
-            "net_nats": min(gain, sum(member.finding.look.net for member in counted)),
+            "net_nats": min(gain, _worth(counted)),
             "confirmed": _confirmed([row["gain"] for row in rows]),
             "also_possible": list(dict.fromkeys(cause for row in rows for cause in row["also_possible"])),
             "record_next": rows[0]["record_next"],
@@ -289,6 +290,12 @@ def _entry(event: Event) -> dict[str, Any]:
     source = CAUSES[looks[0].cause].source if event.entry is None else "surroundings"
     found = {"id": event.id, **entry, "source": source, "material": event.material, "changes": changes}
     return {**found, "words": entry.get("words") or words.event(found)}
+
+
+def _worth(members: Sequence[Member]) -> float:
+    """Nats net of the searches: of an event that was found on several axes together it is paid for once."""
+    together = {member.finding.event: member.finding.look.net for member in members if member.finding.event}
+    return sum(together.values()) + sum(one.finding.look.net for one in members if not one.finding.event)
 
 
 def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

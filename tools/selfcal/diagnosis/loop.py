@@ -10,7 +10,7 @@ from dataclasses import replace
 from selfcal.base.ending import Stopped
 from selfcal.diagnosis import integrity, module, score
 from selfcal.diagnosis.cause import Looks
-from selfcal.diagnosis.causes import CAUSES, motion, outliers, step
+from selfcal.diagnosis.causes import CAUSES, motion, outliers, step, tilt
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.record import Record, carried
 from selfcal.diagnosis.statistics import judged
@@ -238,14 +238,14 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
     for number, event in enumerate(seen.events, 1):
         names = [seen.names[k] for k in event.act.axes]
         theta = module.sharpened(event, [states[name] for name in names], seen.dt)
+        looks = {name: CAUSES[event.cause].located(states[name], record, theta) for name in names}
+        looks = tilt.of_steps(looks, states) if event.cause == "step" else looks
         findings = {}
-        for name in names:
-            look = CAUSES[event.cause].located(states[name], record, theta)
+        for name, look in looks.items():
             after = states[name].refit(**look.changes)
             look = replace(look, net=max(look.net, event.evidence))
-            others = tuple(other for other in names if other != name)
             held_out = score.gain(look, states[name], after, record)
-            findings[name] = Finding(look, 0, states[name], after, shared_with=others, held_out=held_out, event=number)
+            findings[name] = Finding(look, 0, states[name], after, held_out=held_out, event=number)
         if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
             continue
         for name, finding in findings.items():

@@ -1,0 +1,113 @@
+"""The sensor turns: accelerometers step as the direction of gravity does, while the gyroscopes turn with them.
+
+A small turn theta of the sensor changes the specific force f by f x theta. Two angles are seen, those across f.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from selfcal.base import units
+from selfcal.base.errors import UserError
+from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.causes import step
+from selfcal.diagnosis.record import Record
+from selfcal.likelihood.state import Look, State, interval
+from selfcal.likelihood.statemodel import Array
+
+#: Standard gravity, m/s^2, and how far off the specific force at rest may be, as a share of it.
+GRAVITY, NEAR = 9.80665, 0.1
+#: Share of the step's information that two angles explain, at least.
+EXPLAINED = 0.9
+#: Time about the event over which the gyroscopes' rates are summed up, s, and standard deviations beyond which their
+#: angle tells the sense of the turn.
+ABOUT_S, SURE = 3.0, 3.0
+
+
+def of_steps(looks: Mapping[str, Look], states: Mapping[str, State]) -> dict[str, Look]:
+    """The looks at one step of several axes, those that a turn of the sensor explains as looks at the turn."""
+    force = _specific_force(states)
+    known = [name for name in looks if force is not None and name in force]
+    if force is None or len(known) < 2 or len(known) < len(looks):
+        return dict(looks)
+    axes = list(force)
+    f = np.array([force[name][0] for name in axes])
+    size, information = np.zeros(3), np.zeros(3)
+    for k, name in enumerate(axes):
+        amplitude = looks[name].estimate["amplitude"] if name in looks else None
+        if amplitude is not None:
+            size[k], information[k] = amplitude["median"] * force[name][1], (amplitude["sd"] * force[name][1]) ** -2.0
+    size[information == 0.0] = 0.0
+    across = size - f * float(f @ size) / float(f @ f)
+    if float(information @ across**2) < EXPLAINED * float(information @ size**2):
+        return dict(looks)
+    turn = -np.cross(f, size) / float(f @ f)
+    time_s = next(iter(looks.values())).estimate["time_s"]["median"]
+    turned = _turned(states, [f"g{name[-1]}" for name in axes], time_s)
+    if turned is not None and float(turned[0] @ turn) < 0.0 and np.abs(turned[0] / turned[1]).max() > SURE:
+        return dict(looks)
+    weight = np.where(information > 0.0, 1.0 / np.maximum(information, 1e-300), 0.0)
+    angles = {}
+    for k in np.argsort(np.abs(f))[:2]:
+        row = -np.cross(f, np.eye(3))[:, k] / float(f @ f)
+        sd = math.sqrt(float(row**2 @ weight))
+        angles[f"angle_{axes[k][-1]}_deg"] = interval(math.degrees(turn[k]), math.degrees(sd), "deg")
+    return {name: replace(look, cause="tilt", estimate={**look.estimate, **angles}) for name, look in looks.items()}
+
+
+def _specific_force(states: Mapping[str, State]) -> dict[str, tuple[float, float]] | None:
+    """By accelerometer its level and the factor of its unit, m/s^2; None: not three that feel gravity alone."""
+    found = {}
+    for name, state in sorted(states.items()):
+        try:
+            factor = units.factor(state.unit, "m/s^2")
+        except UserError:
+            continue
+        found[name] = ((state.level + float(state.best.c[0])) * factor, factor)
+    size = math.sqrt(sum(level**2 for level, _ in found.values()))
+    return found if len(found) == 3 and abs(size / GRAVITY - 1.0) < NEAR else None
+
+
+def _turned(states: Mapping[str, State], names: list[str], time_s: float) -> tuple[Array, Array] | None:
+    """Angles [3], rad, by which the gyroscopes turn about a time, with their standard deviations; None: unknown."""
+    angle, sd = np.zeros(3), np.zeros(3)
+    for k, name in enumerate(names):
+        state = states.get(name)
+        if state is None:
+            return None
+        try:
+            factor = units.factor(state.unit, "rad/s")
+        except UserError:
+            return None
+        at, reach = round(time_s / state.dt), max(1, round(ABOUT_S / state.dt))
+        during, beside = state.y[max(0, at - reach) : at + reach], state.y[max(0, at - 10 * reach) : at + 10 * reach]
+        if not np.isfinite(during).all() or np.isfinite(beside).sum() < 4 * reach:
+            return None
+        angle[k] = float(np.sum(during - np.nanmedian(beside))) * state.dt * factor
+        sd[k] = state.best.sigma * math.sqrt(during.size) * state.dt * factor
+    return angle, sd
+
+
+def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
+    return np.where(channels.time_s >= keys["time_s"], keys["amplitude"], 0.0)
+
+
+CAUSE = Cause(
+    "tilt",
+    "The sensor turns once: gravity has another direction in it.",
+    "Fasten the mount, and record again without touching it.",
+    source="handling",
+    at=step.at,
+    alike=step.CAUSE.alike,
+    pictures=shown("means", "evidence"),
+    once="a turn is an event of its recording",
+    entry=step.CAUSE.entry,
+    of_column=step.CAUSE.of_column,
+    add=_add,
+    keys={"time_s": Key(lambda s: s.duration_s / 2.0), "amplitude": Key(lambda s: 2.0 * s.n)},
+)
