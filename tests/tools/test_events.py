@@ -15,9 +15,11 @@ from selfcal.adequacy.summary import Number, noisier
 from selfcal.bank.result import Estimate
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis import events, words
+from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.events import Member, grouped
 from selfcal.diagnosis.finding import Finding
 from selfcal.likelihood.state import Look, State, interval
+from selfcal.logs.recording import load, save
 from selfcal.show import table
 from selfcal.show.findings import show
 from selfcal.verbs.diagnose import diagnose
@@ -140,8 +142,22 @@ def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
 def test_a_coefficient_that_is_known_is_applied(sd: float, applied: bool) -> None:
     """Half of its 90 % interval is 3.3 % of it, or 9.9 %."""
     axes = {"gx": {"estimate": {"coefficient": interval(-1.0, sd, "deg/s/V")}}}
-    finding = {"cause": "supply", "axes": axes, "record_next": "Change the supply."}
+    finding = {"cause": "supply", "axes": axes, "estimate": {}, "record_next": "Change the supply."}
     assert words.action(finding).startswith("Apply it") == applied
+
+
+@pytest.mark.parametrize(("hz", "shown"), [(3.29, 0.29), (11.38, 0.38), (0.71, 0.29)])
+def test_a_line_in_means_is_looked_up_in_the_readings(hz: float, shown: float, tmp_path: Path) -> None:
+    """Half an hour at 40 Hz, white noise of 1 and a line of 0.3. Means of 1 s show it at `shown`. Truth: what is drawn.
+    A bin is 1/1800 Hz; the noise leaves 0.0053 of the amplitude, times the root of the bins about it: 5 %."""
+    random = np.random.default_rng(4)
+    t = np.arange(72_000) / 40.0
+    values = random.standard_normal(t.size) + 0.3 * np.sin(2.0 * np.pi * hz * t)
+    save(tmp_path / "log.npz", {"gx": ("deg/s", values)}, 40.0)
+    seen = of_readings(load(tmp_path / "log.npz"), "gx", shown, 5e-4, 1.0)
+    assert seen is not None
+    assert seen[0] == pytest.approx(hz, abs=1.0 / 1800.0) and seen[1] == pytest.approx(0.3, rel=0.1)
+    assert of_readings(load(tmp_path / "log.npz"), "gx", 0.17, 5e-4, 1.0) is None
 
 
 TEMPERATURE = {"gx": 0.0045, "gy": -0.0038, "ax": 0.0013, "az": -0.0011}
