@@ -11,13 +11,16 @@ import numpy as np
 import pytest
 
 from selfcal.adequacy.document import Identified
-from selfcal.adequacy.summary import Number
+from selfcal.adequacy.summary import Number, noisier
 from selfcal.bank.result import Estimate
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis import events, words
+from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.events import Member, grouped
 from selfcal.diagnosis.finding import Finding
 from selfcal.likelihood.state import Look, State, interval
+from selfcal.logs.recording import load, save
+from selfcal.show import table
 from selfcal.show.findings import show
 from selfcal.verbs.diagnose import diagnose
 
@@ -139,8 +142,22 @@ def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
 def test_a_coefficient_that_is_known_is_applied(sd: float, applied: bool) -> None:
     """Half of its 90 % interval is 3.3 % of it, or 9.9 %."""
     axes = {"gx": {"estimate": {"coefficient": interval(-1.0, sd, "deg/s/V")}}}
-    finding = {"cause": "supply", "axes": axes, "record_next": "Change the supply."}
+    finding = {"cause": "supply", "axes": axes, "estimate": {}, "record_next": "Change the supply."}
     assert words.action(finding).startswith("Apply it") == applied
+
+
+@pytest.mark.parametrize(("hz", "shown"), [(3.29, 0.29), (11.38, 0.38), (0.71, 0.29)])
+def test_a_line_in_means_is_looked_up_in_the_readings(hz: float, shown: float, tmp_path: Path) -> None:
+    """Half an hour at 40 Hz, white noise of 1 and a line of 0.3. Means of 1 s show it at `shown`. Truth: what is drawn.
+    A bin is 1/1800 Hz; the noise leaves 0.0053 of the amplitude, times the root of the bins about it: 5 %."""
+    random = np.random.default_rng(4)
+    t = np.arange(72_000) / 40.0
+    values = random.standard_normal(t.size) + 0.3 * np.sin(2.0 * np.pi * hz * t)
+    save(tmp_path / "log.npz", {"gx": ("deg/s", values)}, 40.0)
+    seen = of_readings(load(tmp_path / "log.npz"), "gx", shown, 5e-4, 1.0)
+    assert seen is not None
+    assert seen[0] == pytest.approx(hz, abs=1.0 / 1800.0) and seen[1] == pytest.approx(0.3, rel=0.1)
+    assert of_readings(load(tmp_path / "log.npz"), "gx", 0.17, 5e-4, 1.0) is None
 
 
 TEMPERATURE = {"gx": 0.0045, "gy": -0.0038, "ax": 0.0013, "az": -0.0011}
@@ -205,3 +222,36 @@ def test_small_findings_leave_an_axis_adequate(tmp_path: Path) -> None:
     assert (axis.verdict, axis.small_findings, axis.causes) == ("adequate", 1, ["missing_samples"])
     assert [outcome(document, wanted).code for wanted in ("inadequate", "material", "missing_samples")] == [0, 0, 1]
     assert words.small(document.findings).startswith("1 small finding: it does not change N by more than 0 %")
+
+
+def axis_of(**checks: dict[str, Any]) -> dict[str, Any]:
+    return {"bias_now": {"unit": "deg/s"}, "checks": {name: {"passed": False, **one} for name, one in checks.items()}}
+
+
+def test_identify_tells_an_event_in_one_line() -> None:
+    """A knock of three axes, a jump of two, and statistics that they move; an axis with statistics alone keeps its own
+    lines."""
+    knock = {"value": 0.01, "intervals": [[88.0, 90.5]]}
+    lag = {"innovation_lag1": {"value": 0.3, "limit": 0.1}}
+    axes = {
+        "gx": axis_of(motion=knock, jump={"value": 47.0, "time_s": 301.0}, **lag),
+        "gy": axis_of(motion=knock, jump={"value": 12.4, "time_s": 299.5}, allan_4s={"value": 0.4}),
+        "gz": axis_of(motion=knock),
+        "ax": axis_of(**lag, allan_8s={"value": -0.21}, allan_16s={"value": 0.07}),
+    }
+    assert table._not_adequate(axes) == [
+        "not adequate: gx, gy, gz: motion, left out: 88 to 90.5 s",
+        "not adequate: gx, gy: jump: the bias jumps at 301 s, by 12 to 47 nats: K includes that",
+        "not adequate: ax: innovation_lag1 +0.300, beyond ±0.100",
+        "not adequate: ax: allan_8s model -21 %, 16s +7 %",
+        "not adequate: statistics of gx, gy (allan_4s model +40 %) as well",
+    ]
+
+
+def test_a_noisy_axis_is_told_beside_its_siblings() -> None:
+    """Three times the others' noise, known to 10 %; half as noisy, or with one sibling alone, is nothing."""
+    white = {name: {**interval(1.0, 0.06, "deg/s/sqrt(Hz)")} for name in ("gx", "gy")}
+    white |= {"gz": interval(3.1, 0.2, "deg/s/sqrt(Hz)"), "ax": interval(9.0, 0.1, "g/sqrt(Hz)")}
+    white |= {"ay": interval(1.0, 0.1, "g/sqrt(Hz)")}
+    assert noisier(white) == ["gz is 3.1 times as noisy as gx and gy"]
+    assert noisier(white | {"gz": interval(1.9, 0.1, "deg/s/sqrt(Hz)")}) == []

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,6 +36,8 @@ _DRAWS, _PER_OCTAVE = 256, 16
 MOST_REST, _HALVINGS = 100.0, 8
 #: Laws of smaller probability do not count.
 _LEAST = 1e-3
+#: White noise over that of the other axes of a sensor that a line names: their data sheets have one number for all.
+NOISIER = 2.0
 #: Share of the posterior that must have a walk, or a minimum, for the number to be identified.
 _SURE = 0.95
 #: Why a number is not identified: words of the table and the JSON.
@@ -147,6 +150,20 @@ def summarize(
     elif left_open:  # then the prior of the drift makes the minimum
         found["bias_instability"] = _without(found["bias_instability"], WIDE)
     return found
+
+
+def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """A line an axis whose white noise is another than that of its siblings, by names that differ in the last letter:
+    NOISIER times their median or more, the 90 % intervals apart. `white`: median, q05, q95 and unit."""
+    lines = []
+    for name, own in white.items():
+        others = [one for one in white if one != name and one[:-1] == name[:-1] and white[one]["unit"] == own["unit"]]
+        if len(others) < 2:
+            continue
+        times = own["median"] / float(np.median([white[one]["median"] for one in others]))
+        if times >= NOISIER and own["q05"] > max(white[one]["q95"] for one in others):
+            lines.append(f"{name} is {times:.2g} times as noisy as {' and '.join(others)}")
+    return lines
 
 
 def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, float | None]:

@@ -78,7 +78,7 @@ def _axis(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
 def _of_identify(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
     if wanted == INADEQUATE:
         return axis["adequate"] is False, "no check was made" if axis["adequate"] is None else ""
-    if axis.get("suspicion") == wanted:
+    if wanted == axis.get("suspicion") or not axis["checks"].get(wanted, {"passed": True})["passed"]:
         return True, ""
     return False, f"{wanted} cannot be judged: identify looks for no single cause, diagnose --fail-on {wanted} does"
 

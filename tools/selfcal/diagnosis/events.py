@@ -20,10 +20,12 @@ from selfcal.adequacy.document import Identified
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
 from selfcal.diagnosis import hidden, words
+from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood.heldout import HARM_SD
+from selfcal.likelihood.state import interval
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.readings.motion import joined
@@ -136,6 +138,9 @@ def add_findings(
             member.entry["of"] = event.id
             member.entry["shared_with"] = [axis for axis in _axes(event) if axis != member.axis]
     document["findings"] = [_entry(event) for event in events]
+    for entry in document["findings"]:
+        if "frequency_hz" in entry["estimate"]:
+            _add_readings(entry, recording, found)
     for name, one in found.items():
         axis = document["axes"][name]
         own = [event for event in events if name in event.changes]
@@ -292,10 +297,29 @@ def _entry(event: Event) -> dict[str, Any]:
     return {**found, "words": entry.get("words") or words.event(found)}
 
 
+<<<<<<< HEAD
 def _worth(members: Sequence[Member]) -> float:
     """Nats net of the searches: of an event that was found on several axes together it is paid for once."""
     together = {member.finding.event: member.finding.look.net for member in members if member.finding.event}
     return sum(together.values()) + sum(one.finding.look.net for one in members if not one.finding.event)
+=======
+def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> None:
+    """What a line in means is in the readings: its frequency there, and its amplitude on each axis."""
+    told = []
+    for axis, one in entry["axes"].items():
+        line, rate_hz = entry["estimate"]["frequency_hz"], found[axis].record.rate_hz
+        if rate_hz > 0.5 * recording.rate_hz:
+            continue
+        seen = of_readings(recording, axis, line["median"], line["q95"] - line["median"], rate_hz)
+        if seen is not None and abs(seen[0] / line["median"] - 1.0) > LEAST:
+            told.append(seen[0])
+            unit = recording.columns[axis].unit
+            one["estimate"] = {"readings_amplitude": {"median": seen[1], "unit": unit}, **one["estimate"]}
+    if told:
+        sd = 1.0 / recording.duration_s
+        entry["estimate"]["readings_hz"] = interval(float(np.median(told)), sd, "Hz")
+        entry["words"] = words.event(entry)
+>>>>>>> matters
 
 
 def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

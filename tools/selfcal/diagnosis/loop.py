@@ -243,9 +243,9 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
         findings = {}
         for name, look in looks.items():
             after = states[name].refit(**look.changes)
-            look = replace(look, net=max(look.net, event.evidence))
-            held_out = score.gain(look, states[name], after, record)
-            findings[name] = Finding(look, 0, states[name], after, held_out=held_out, event=number)
+            known = replace(look, net=max(look.net, event.evidence))
+            held_out = score.gain(known, states[name], after, record)
+            findings[name] = Finding(known, 0, states[name], after, held_out=held_out, event=number)
         if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
             continue
         for name, finding in findings.items():

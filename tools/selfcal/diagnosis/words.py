@@ -28,6 +28,8 @@ LABELS = {
     "before_hz": "from",
     "after_hz": "to",
     "frequency_hz": "frequency",
+    "readings_hz": "an alias of",
+    "readings_amplitude": "amplitude in the readings",
     "width_hz": "half width",
     "tau_s": "time constant",
     "amplitude_2": "second amplitude",
@@ -211,9 +213,10 @@ def effects(finding: Mapping[str, Any]) -> str:
 
 def action(finding: Mapping[str, Any]) -> str:
     """What to do. A coefficient that is known well enough is applied, and not measured again."""
-    cause = CAUSES.get(finding["cause"])
+    if "readings_hz" in finding["estimate"]:
+        return f"Look for what turns or switches at {finding['estimate']['readings_hz']['median']:.3g} Hz."
     known = [one["estimate"].get("coefficient") for one in finding["axes"].values()]
-    if cause is not None and cause.entry is not None and known and all(map(_sure, known)):
+    if "source" not in finding["estimate"] and all(map(_sure, known)):
         return f"Apply it: it is known to {100.0 * APPLIED:.0f} %. --write-model states it."
     return str(finding["record_next"])
 

@@ -114,23 +114,37 @@ def slower(values: Array) -> list[Slower]:
 def _slower(same: Mask, ratio: int, chance: float) -> Slower:
     """The likeliest stretch of rows [n] that repeat the one before, but for every `ratio`th row."""
     n, best = same.size, Slower(ratio, np.zeros(0, np.int64), 0.0)
+    more, less = math.log((1.0 - MISSED) / chance), math.log(MISSED / (1.0 - chance))
+    paid = 2.0 * math.log(n) + math.log(RATIO_MOST**2)
+    places = np.ascontiguousarray(same[: n - n % ratio].reshape(-1, ratio).T).view(np.int8)
+    repeats = places.sum(axis=0, dtype=np.int8)
+    of_group = less * (ratio - 1) + (more - less) * np.arange(ratio)
+    # By whole groups of rows first: a stretch holds two parts of one more at most.
+    price = paid - 2.0 * (ratio - 1) * more
+    if _best_sum(of_group[np.minimum(repeats, ratio - 1)])[0] <= price:
+        return best
     for phase in range(ratio):
+        if _best_sum(of_group[repeats - places[phase]])[0] - price <= best.nats:
+            continue
         holds = np.arange(n) % ratio != phase
-        worth = np.where(same, math.log((1.0 - MISSED) / chance), math.log(MISSED / (1.0 - chance)))
-        total = np.concatenate([[0.0], np.cumsum(np.where(holds, worth, 0.0))])
-        gain = total - np.minimum.accumulate(total)
-        end = int(np.argmax(gain))
-        begin = int(np.argmin(total[: end + 1]))
+        _, begin, end = _best_sum(np.where(holds, np.where(same, more, less), 0.0))
         rows = begin + np.flatnonzero((holds & same)[begin:end])
         # Readings that rest, or are narrower in this stretch, repeat at every place.
         new = same[begin:end][~holds[begin:end]]
         own = max(chance, (float(new.sum()) - SUPPOSED) / max(new.size, 1))
         held = int(np.count_nonzero(holds[begin:end]))
-        nats = rows.size * math.log((1.0 - MISSED) / own) + (held - rows.size) * math.log(MISSED / (1.0 - own))
-        nats -= 2.0 * math.log(n) + math.log(RATIO_MOST**2)
+        nats = rows.size * math.log((1.0 - MISSED) / own) + (held - rows.size) * math.log(MISSED / (1.0 - own)) - paid
         if nats > best.nats:
             best = Slower(ratio, rows, nats)
     return best
+
+
+def _best_sum(worth: Array) -> tuple[float, int, int]:
+    """The largest sum of neighbours, and the places of its first one and after its last."""
+    total = np.concatenate([[0.0], np.cumsum(worth)])
+    gain = total - np.minimum.accumulate(total)
+    end = int(np.argmax(gain))
+    return float(gain[end]), int(np.argmin(total[: end + 1])), end
 
 
 def updates(values: Array, at: Rows) -> Rows | None:

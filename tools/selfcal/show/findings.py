@@ -12,6 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from selfcal.adequacy.document import since
+from selfcal.adequacy.summary import noisier
 from selfcal.base import units
 from selfcal.base.errors import printable
 from selfcal.diagnosis import words
@@ -42,6 +43,9 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, details: bool 
         console.print(_events(shown))
     if axes:
         console.print(_numbers(axes))
+    known = {name: axis["numbers"]["N"] for name, axis in axes.items() if "q05" in axis["numbers"]["N"]["after"]}
+    for line in noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()}):
+        say(line)
     if less:
         say(words.small(less) + ("" if details else " (--details)"))
     elif not shown and axes:

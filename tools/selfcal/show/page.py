@@ -265,17 +265,17 @@ def _summary(
         yield _readings(shown, axes, found)
         yield _matrix(axes)
         yield _noise(axes, found, allan)
-    yield from (_box(one) for one in findings if not any(one["id"] == each.get("of") for each in _boxes(axes)))
+    yield from (_box(one) for one in findings if _stands_alone(one, axes))
     yield "</section>"
 
 
-def _boxes(axes: Mapping[str, Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-    """The findings that stand with their axes."""
-    return (finding for axis in axes.values() for finding in axis["findings"])
+def _stands_alone(finding: Mapping[str, Any], axes: Mapping[str, Mapping[str, Any]]) -> bool:
+    """Whether no axis has a box of it."""
+    return all(each["cause"] != finding["cause"] for axis in axes.values() for each in axis["findings"])
 
 
 def _box(finding: Mapping[str, Any]) -> str:
-    """A finding of several axes that stands with none."""
+    """A finding that has no box with an axis."""
     facts = "".join(
         f"<dt>{escape(axis)}</dt><dd>{escape(words.sizes(one['estimate']))}</dd>"
         for axis, one in finding["axes"].items()
@@ -293,12 +293,13 @@ def _events(
     """Findings of all axes: what, where from, the size, what it changes and what to do; linked to their boxes."""
     rows = ""
     for place, finding in enumerate(findings, 1):
-        links = [
-            f"<a href='#{_id(axis, k)}'>{escape(axis)}</a>"
-            for axis, entry in axes.items()
-            for k, each in enumerate(entry["findings"])
-            if each.get("of") == finding["id"]
-        ] or [f"<a href='#{_id(finding['id'], 0)}'>more</a>"]
+        boxes: dict[str, int] = {}
+        for axis, entry in axes.items():
+            for k, each in enumerate(entry["findings"]):
+                if each.get("of") == finding["id"]:
+                    boxes.setdefault(axis, k)
+        links = [f"<a href='#{_id(axis, k)}'>{escape(axis)}</a>" for axis, k in boxes.items()]
+        links += [f"<a href='#{_id(finding['id'], 0)}'>all</a>"] if _stands_alone(finding, axes) else []
         doubt = "; not confirmed on held-out time" if finding["confirmed"] is False else ""
         cells = (
             escape(finding["source"]),

@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from selfcal.adequacy.document import as_typed, since
-from selfcal.adequacy.summary import MOST_REST
+from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.base import units
 from selfcal.base.errors import called, printable
@@ -25,6 +25,10 @@ TABLE_WIDTH = 140
 TOLD_OF = 0.01
 #: Stretches of motion that are listed at most.
 TIMES_MOST = 4
+#: Checks that state no cause, by the beginning of their names.
+STATISTICS = ("innovation_", "allan_")
+#: Jumps of two axes so close to each other, s, are one event.
+ONE_EVENT_S = 30.0
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False) -> None:
@@ -122,8 +126,8 @@ def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _why(check: str, outcome: Mapping[str, Any], unit: str) -> str:
-    """What a failed check of an axis in `unit` shows, and what helps."""
+def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
+    """What a failed check of an axis in `unit` shows, and what helps. `nats`: the evidence for a cause."""
     value = outcome["value"]
     match check:
         case "lattice":
@@ -153,13 +157,13 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str) -> str:
             more = len(outcome["intervals"]) - TIMES_MOST
             return f"motion, left out: {times}{f' and {more} more' if more > 0 else ''}"
         case "channel":
-            told = f"{outcome['column']} ({outcome['form']}) explains {value:.0f} nats of it"
+            told = f"{outcome['column']} ({outcome['form']}) explains {nats} nats of it"
             return f"channel: {told}: N, K and the bias include that"
         case "turn_on":
-            told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {value:.0f} nats"
+            told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {nats} nats"
             return f"turn_on: {told}: K includes that"
         case "jump":
-            return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {value:.0f} nats: K includes that"
+            return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {nats} nats: K includes that"
     return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
 
 
@@ -192,6 +196,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             outside.setdefault(", ".join(axis["own_priors"]), []).append(name)
     line = "priors: {}: from this record, which lies outside the model's: {}"
     kept = [line.format(", ".join(names), own) for own, names in outside.items()]
+    lost: dict[str, list[str]] = {}
+    for name, axis in axes.items():
+        counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
+        lost.setdefault(", ".join(counts), []).append(name)
+    kept += [f"kept out: {', '.join(names)}: {counts}" for counts, names in lost.items() if counts]
     for name, axis in axes.items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]
@@ -225,29 +234,15 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         ]
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
-        counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
-        if counts:
-            kept.append(f"kept out: {name}: {', '.join(counts)}")
-        failed += [
-            f"not adequate: {name}: {_why(check, outcome, bias['unit'])}"
-            for check, outcome in axis["checks"].items()
-            if not outcome["passed"] and not check.startswith("allan_")
-        ]
-        off = [
-            f"{check.removeprefix('allan_')} {100.0 * outcome['value']:+.0f} %"
-            for check, outcome in axis["checks"].items()
-            if not outcome["passed"] and check.startswith("allan_")
-        ]
-        if off:  # allan_16s model -9 %, 128s +22 %: the model's deviation over the recording's
-            failed.append(f"not adequate: {name}: allan_{', '.join(off).replace(' ', ' model ', 1)}")
+    failed += _not_adequate(axes)
     for said, chosen in (("identified with", True), ("strongest suspicion", False)):
-        suspected = [
-            f"{name}: {axis['suspicion'].replace('_', ' ')}"
-            for name, axis in axes.items()
-            if "suspicion" in axis and ("added_law" in axis) is chosen
-        ]
+        suspected: dict[str, list[str]] = {}
+        for name, axis in axes.items():
+            if "suspicion" in axis and ("added_law" in axis) is chosen:
+                suspected.setdefault(axis["suspicion"].replace("_", " "), []).append(name)
         if suspected:
-            failed.append(f"{said}: {'; '.join(suspected)}")
+            told = "; ".join(f"{', '.join(names)}: {cause}" for cause, names in suspected.items())
+            failed.append(f"{said}: {told}")
     for name, axis in axes.items():
         if "more_laws" in axis:
             laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]
@@ -255,7 +250,67 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             failed.append(f"with the laws of sums.yaml: {name}: {told}")
     if any(line.startswith("not adequate") for line in failed):
         failed.append(f"why, and what mends it: {called()} diagnose {as_typed(recording)}")
-    return table, [*kept, *_unidentified(axes), *_ahead(axes), *failed]
+    N = {name: axis["summary"]["arw"] for name, axis in axes.items() if axis.get("summary")}
+    return table, [*kept, *_unidentified(axes), *noisier(N), *_ahead(axes), *failed]
+
+
+def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
+    """What speaks against the laws: a line an event or source. The statistics of an axis that shows one are its own."""
+    found: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
+    named: set[str] = set()
+    for name, axis in axes.items():
+        for check, outcome in axis["checks"].items():
+            if outcome["passed"] or check.startswith(STATISTICS):
+                continue
+            named.add(name)
+            known = next((one for one in found if one[0] == check and _one(check, one[2][0], outcome)), None)
+            if known is None:
+                found.append((check, [name], [outcome]))
+            else:
+                known[1].append(name)
+                known[2].append(outcome)
+    lines = []
+    for check, names, outcomes in found:
+        values = [f"{one['value']:.0f}" for one in sorted(outcomes, key=lambda one: float(one["value"]))]
+        nats = values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
+        told = _why(check, outcomes[0], axes[names[0]]["bias_now"]["unit"], nats)
+        lines.append(f"not adequate: {', '.join(names)}: {told}")
+    beside = []
+    for name, axis in axes.items():
+        failed = {check: one for check, one in axis["checks"].items() if not one["passed"]}
+        unit = axis["bias_now"]["unit"]
+        # The model's deviation over the recording's, by averaging time.
+        off = [
+            (100.0 * one["value"], check.removeprefix("allan_"))
+            for check, one in failed.items()
+            if check.startswith("allan_")
+        ]
+        if name in named:
+            most, at = max(off, key=lambda one: abs(one[0]), default=(0.0, ""))
+            if any(check.startswith(STATISTICS) for check in failed):
+                beside.append(name + (f" (allan_{at} model {most:+.0f} %)" if off else ""))
+            continue
+        own = [_why(check, one, unit, "") for check, one in failed.items() if not check.startswith("allan_")]
+        if off:  # allan_16s model -9 %, 128s +22 %
+            own.append("allan_" + ", ".join(f"{at} {most:+.0f} %" for most, at in off).replace(" ", " model ", 1))
+        lines += [f"not adequate: {name}: {told}" for told in own]
+    if beside:
+        lines.append(f"not adequate: statistics of {', '.join(beside)} as well")
+    return lines
+
+
+def _one(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether two axes fail a check by one event or source."""
+    match check:
+        case "jump":
+            return bool(abs(a["time_s"] - b["time_s"]) < ONE_EVENT_S)
+        case "turn_on":
+            return True
+        case "channel":
+            return bool(a["column"] == b["column"])
+        case "motion":
+            return list(a["intervals"]) == list(b["intervals"])
+    return False
 
 
 def _ahead(axes: Mapping[str, Any]) -> list[str]:

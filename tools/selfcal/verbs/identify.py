@@ -103,6 +103,7 @@ def identify(
     from rich.console import Console
     from rich.progress import Progress
 
+    from selfcal.adequacy.checks import against
     from selfcal.adequacy.document import Identified, to_document
     from selfcal.adequacy.identify import chosen_axes, identify_axis, left_out_together, stretch_of, with_reasons
     from selfcal.bank.priors import add_sources, for_record
@@ -162,7 +163,11 @@ def identify(
         with_reasons(found, recording, loaded_model)
         document = to_document(recording, found, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)
-        doubtful = [name for name, axis in found.items() if isinstance(axis, Identified) and not axis.adequate]
+        doubtful = [  # motion is left out already: what is left is judged
+            name
+            for name, axis in found.items()
+            if isinstance(axis, Identified) and against(axis.judged.checks).keys() - {"motion"}
+        ]
         if doubtful and suspicion:
             from selfcal.diagnosis.suspicion import suspicions, weigh_more_laws, with_added_laws
 
@@ -171,7 +176,7 @@ def identify(
             for name, shown in suspected.items():
                 document["axes"][name]["suspicion"] = shown.cause
             for name in doubtful:
-                for cause in ("held_samples", "outliers", "saturation", "motion"):  # shown by the readings themselves
+                for cause in ("held_samples", "outliers", "saturation"):  # shown by the readings themselves
                     if cause in document["axes"][name]["checks"]:
                         document["axes"][name]["suspicion"] = cause
             if model is None:

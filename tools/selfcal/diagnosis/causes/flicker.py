@@ -71,7 +71,7 @@ def _extend(at: Extension) -> None:
 CAUSE = Cause(
     "flicker",
     "The bias has flicker (1/f) noise, or drifts on two time scales at once.",
-    "Record three times as long, and at 10 Hz or more.",
+    "Use B, not K: --write-model states its law. A record three times as long makes sure.",
     source="sensor",
     alike=lambda a, b: True,
     looks=looks,

@@ -16,7 +16,6 @@ from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.cause import Cause, Channels, Key, shown
 from selfcal.diagnosis.causes import step
-from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import Look, State, interval
 from selfcal.likelihood.statemodel import Array
 

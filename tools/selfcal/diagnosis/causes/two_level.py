@@ -72,7 +72,9 @@ def switching(y: Array, theta: Array, keep: bool = False) -> Filtered:
             odds = np.log(w / (1.0 - w)) + 0.5 * (lower - (e - half) ** 2 / S)
             most = np.maximum(odds, 0.0)
             total += np.log1p(-w) + most + np.log(np.exp(-most) + np.exp(odds - most)) - 0.5 * (np.log(S) + lower)
-            w = np.clip(1.0 / (1.0 + np.exp(-np.clip(odds, -30.0, 30.0))), LEAST, 1.0 - LEAST)
+            # np.clip takes five times as long over so few.
+            odds = np.minimum(np.maximum(odds, -30.0), 30.0)
+            w = np.minimum(np.maximum(1.0 / (1.0 + np.exp(-odds)), LEAST), 1.0 - LEAST)
             gain = P / S
             x = x + gain * (e - half * (2.0 * w - 1.0))
             P = P * (1.0 - gain) + (gain * A) ** 2 * w * (1.0 - w)

@@ -1,0 +1,58 @@
+"""A line that means show at a frequency below half of their rate: which one of the recorded readings it is."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from scipy.fft import rfft
+
+from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import Recording, bridged
+
+#: Bins of the spectrum on each side that hold a line, at least; and those beside them that give the noise below it.
+HALF, BESIDE = 4, 40
+#: Share of its frequency by which a line wanders along a record: its power is looked for within that.
+WANDERS = 0.02
+#: Power of a line over the scatter of the noise below it, at least.
+LEAST = 10.0
+
+
+def of_readings(
+    recording: Recording, axis: str, frequency_hz: float, half_width_hz: float, rate_hz: float
+) -> tuple[float, float] | None:
+    """Frequency, Hz, and amplitude, in the recording's unit, of the line of an axis that makes one of `frequency_hz` in
+    means at `rate_hz`. None where none is clear.
+
+    Every line at k rate ± frequency does. The one is taken of which most power is left in the means."""
+    own = recording.along(axis)
+    y = bridged(own.columns[axis].values)
+    n, recorded_hz = y.size, own.rate_hz
+    power = np.abs(np.asarray(rfft(y - y.mean()))) ** 2
+    bin_hz = recorded_hz / n
+    best, place = 0.0, 0.0
+    for k in range(math.ceil(0.5 * recorded_hz / rate_hz) + 1):
+        for hz in {k * rate_hz + frequency_hz, abs(k * rate_hz - frequency_hz)}:
+            more, noise, centre = _line(power, hz / bin_hz, max(HALF, math.ceil(half_width_hz / bin_hz)))
+            left = math.sin(math.pi * hz / rate_hz) * rate_hz / (recorded_hz * math.sin(math.pi * hz / recorded_hz))
+            if more > LEAST * noise and more * left**2 > best:
+                best, place = more * left**2, centre
+    if best == 0.0:
+        return None
+    more, _, _ = _line(power, place, max(HALF, math.ceil(WANDERS * place)))
+    return place * bin_hz, 2.0 * math.sqrt(max(more, 0.0)) / n
+
+
+def _line(power: Array, place: float, half: int) -> tuple[float, float, float]:
+    """Power of a line about a place of the spectrum beyond the noise there, the scatter of that noise, and the line's
+    middle. Nothing where the spectrum ends."""
+    low, high = round(place) - half, round(place) + half + 1
+    if low < 1 or high >= power.size:
+        return 0.0, 0.0, place
+    beside = np.concatenate([power[max(1, low - BESIDE) : low], power[high : high + BESIDE]])
+    noise = float(np.median(beside)) / math.log(2.0)
+    return (
+        float((power[low:high] - noise).sum()),
+        noise * math.sqrt(high - low),
+        float(np.average(np.arange(low, high), weights=power[low:high])),
+    )
