@@ -297,12 +297,12 @@ def _entry(event: Event) -> dict[str, Any]:
     return {**found, "words": entry.get("words") or words.event(found)}
 
 
-<<<<<<< HEAD
 def _worth(members: Sequence[Member]) -> float:
     """Nats net of the searches: of an event that was found on several axes together it is paid for once."""
     together = {member.finding.event: member.finding.look.net for member in members if member.finding.event}
     return sum(together.values()) + sum(one.finding.look.net for one in members if not one.finding.event)
-=======
+
+
 def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> None:
     """What a line in means is in the readings: its frequency there, and its amplitude on each axis."""
     told = []
@@ -319,7 +319,6 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
         sd = 1.0 / recording.duration_s
         entry["estimate"]["readings_hz"] = interval(float(np.median(told)), sd, "Hz")
         entry["words"] = words.event(entry)
->>>>>>> matters
 
 
 def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
