@@ -286,7 +286,7 @@ def channels(seen: Seen) -> Iterator[Candidate]:
         about = values - values.mean()
         smooth = uniform_filter1d(about, max(1, round(SMOOTH_S / seen.dt)), mode="nearest")
         price = LN_SMOOTHINGS + LN_SLOW
-        shapes: list[Shape] = [(cause, (), smooth, price)]
+        shapes: list[Shape] = [(cause, (), about, price), (cause, (), smooth, price)]
         lag = 4.0 * seen.dt * seen.coarse
         while lag < LONGEST_LAG * seen.n * seen.dt:
             shapes.append((cause, (lag,), formed(about, "lag", lag, 0.0, seen.dt), price + LN_FORMS["lag"]))

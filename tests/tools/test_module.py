@@ -1,0 +1,202 @@
+"""What acts on several axes at once (diagnosis/module.py, causes/tilt.py).
+
+Truth: records drawn here by numpy, each axis white noise of variance 1 and a walk of its own; the normal density of a
+small record, by dense matrices.
+"""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from selfcal.diagnosis import module
+from selfcal.diagnosis.causes import tilt
+from selfcal.likelihood.joint import Joint, act, course, information
+from selfcal.likelihood.state import Look, interval
+
+from conftest import case_records
+
+NAMES = ("gx", "gy", "gz", "ax", "ay", "az")
+#: Walk of a sample over the white noise.
+WALK = 0.03
+Array = NDArray[np.float64]
+
+
+def drawn(seed: int, n: int, m: int = 6) -> Array:
+    """[m, n]: white noise of variance 1 and a walk."""
+    random = np.random.default_rng([58, seed])
+    found: Array = random.normal(size=(m, n)) + np.cumsum(WALK * random.normal(size=(m, n)), axis=1)
+    return found
+
+
+def seen(y: Array, **channels: Array) -> module.Module:
+    """The records looked at together."""
+    states: dict[str, Any] = {
+        name: SimpleNamespace(
+            y=row,
+            dt=1.0,
+            best=SimpleNamespace(c=np.zeros(1)),
+            series=SimpleNamespace(columns=np.ones((1, row.size))),
+            below_lattice=False,
+        )
+        for name, row in zip(NAMES, y, strict=False)
+    }
+    found = module.together(states, channels)
+    assert found is not None
+    return found
+
+
+def test_score_and_information_are_the_dense_ones() -> None:
+    """Of three axes with a common quantity and correlated noise, one of them with a gap: x' S^-1 y and x' S^-1 x beside
+    the levels. Equal to 1e-4: the wide prior of the levels is 1e6 in both."""
+    random = np.random.default_rng(3)
+    n, m = 40, 3
+    correlation = np.array([[1.0, 0.5, 0.0], [0.5, 1.0, -0.2], [0.0, -0.2, 1.0]])
+    own = np.array([[0.0, -2.0, -1.0, -1.5], [0.2, -3.0, -0.5, -2.0], [-0.1, -2.5, -1.5, -1.0]])
+    model = Joint(own, correlation, np.array([0.5, -0.3, 0.8]), 0.1)
+    y = random.normal(size=(m, n))
+    y[1, 10:14] = np.nan
+    t = np.arange(n)
+    S = np.kron(np.outer(model.loading, model.loading), np.exp(-model.rate * np.abs(t[:, None] - t)))
+    S += np.kron(correlation * np.outer(model.white, model.white), np.eye(n))
+    for k, (ln_n, ln_rho, ln_m, ln_a) in enumerate(own):
+        part = np.exp(2.0 * (ln_n + ln_rho)) * np.minimum.outer(t, t) + 1e6 * np.exp(0.4)
+        S[k * n : (k + 1) * n, k * n : (k + 1) * n] += part + np.exp(2.0 * (ln_n + ln_m)) * np.exp(
+            -np.exp(ln_a) * np.abs(t[:, None] - t)
+        )
+    there = np.isfinite(y.ravel())
+    inverse = np.zeros_like(S)
+    inverse[np.ix_(there, there)] = np.linalg.inv(S[np.ix_(there, there)])
+    column = np.exp(-t / 7.0)
+    found = course(model, y, smooth=True)
+    dense = (inverse @ np.nan_to_num(y.ravel())).reshape(m, n)
+    assert found.weights.T @ column == pytest.approx(dense @ column, rel=1e-4)
+    on = np.kron(np.eye(m), column)
+    assert information(model, found, column[None])[0] == pytest.approx(on @ inverse @ on.T, rel=1e-4, abs=1e-4)
+    steps = np.kron(np.eye(m), (t >= 20).astype(float))
+    assert found.known[20] == pytest.approx(steps @ inverse @ steps.T, rel=1e-4, abs=1e-4)
+    assert found.shock[20] == pytest.approx(steps @ inverse @ np.nan_to_num(y.ravel()), rel=1e-4, abs=1e-4)
+
+
+def test_evidence_of_nothing_is_small() -> None:
+    """Scores of noise alone, of axes that correlate by up to 0.8: a Bayes factor exceeds e^x with e^-x at most
+    (Markov's inequality)."""
+    random = np.random.default_rng(8)
+    draws, above = 2000, np.zeros(2)
+    for _ in range(draws):
+        root = np.linalg.cholesky(0.8 * np.ones((4, 4)) + 0.2 * np.eye(4))
+        known = root @ root.T * np.outer(scale := random.uniform(1.0, 30.0, 4), scale)
+        score = scale * (root @ random.normal(size=4))
+        above += act(score[None], known).evidence > np.log([10.0, 50.0])
+    assert above[0] <= draws / 10.0
+    assert above[1] <= draws / 50.0
+
+
+def _step(n: int) -> tuple[Array, tuple[float, ...]]:
+    return (np.arange(n) >= 0.6 * n).astype(float), (0.6 * n,)
+
+
+def _pulse(n: int) -> tuple[Array, tuple[float, ...]]:
+    t = np.arange(n)
+    return ((t >= 0.3 * n) & (t < 0.4 * n)).astype(float), (0.3 * n, 0.4 * n)
+
+
+def _line(n: int) -> tuple[Array, tuple[float, ...]]:
+    return np.sin(2.0 * math.pi * 0.0731 * np.arange(n) + 0.4), (0.0731,)
+
+
+@pytest.mark.parametrize(
+    ("cause", "shape", "nats"), [("step", _step, 16.0), ("pulse", _pulse, 18.0), ("periodic", _line, 17.0)]
+)
+def test_an_event_of_several_axes_has_their_names(cause: str, shape: Any, nats: float) -> None:
+    """Each axis of the four has so many nats: too few for some of them alone, beyond doubt together. The amplitude
+    follows from the information of the column beside a walk: x' S^-1 x."""
+    n, axes, right = 2400, [0, 2, 3, 5], 0
+    column, theta = shape(n)
+    own = np.tile([0.0, math.log(WALK), -12.0, -3.0], (1, 1))
+    model = Joint(own, np.eye(1), np.zeros(1), 0.1)
+    size = math.sqrt(
+        2.0 * nats / float(information(model, course(model, np.zeros((1, n)), True), column[None])[0, 0, 0])
+    )
+    records = case_records(1, 30)
+    for seed in range(records):
+        y = drawn(seed, n)
+        y[axes] += np.outer([size, -size, size, -size], column)
+        found = seen(y)
+        assert found.hidden is None
+        if [event.cause for event in found.events] == [cause]:
+            (event,) = found.events
+            close = all(
+                abs(a - b) < (0.5 / n if cause == "periodic" else 5.0) for a, b in zip(event.theta, theta, strict=True)
+            )
+            right += close and event.act.axes == axes
+    # An axis of 16 nats is below the limit of its own prior in 1 of 50; four axes: 8 % of the records.
+    assert right >= math.floor(0.85 * records)
+
+
+def test_a_recorded_temperature_comes_before_a_hidden_quantity() -> None:
+    """A temperature that wanders and moves five axes by 3 N a sd."""
+    random = np.random.default_rng(4)
+    n = 3600
+    temperature = np.cumsum(random.normal(size=n))
+    temperature = (temperature - temperature.mean()) / temperature.std()
+    y = drawn(1, n)
+    y[:5] += 3.0 * temperature
+    found = seen(y, temperature=25.0 + temperature)
+    assert found.hidden is None
+    assert {event.cause for event in found.events} == {"temperature"}
+    assert found.events[0].act.axes == [0, 1, 2, 3, 4]
+
+
+def test_axes_of_their_own_have_no_events() -> None:
+    """Each search may name something in 1 of 2000 records: none of these does, by more than a chance of 1 in 30."""
+    for seed in range(case_records(2, 60)):
+        found = seen(drawn(100 + seed, 1200, 2 + seed % 5))
+        assert not found.events, seed
+        assert found.hidden is None, seed
+
+
+def _looks(sizes: dict[str, float], turned: float) -> dict[str, Look]:
+    """Steps at 500 s on accelerometers with 1 g on az, and gyroscopes that turn by so many times the true angle."""
+    states: dict[str, Any] = {}
+    angles = {"gx": -sizes.get("ay", 0.0), "gy": sizes.get("ax", 0.0), "gz": 0.0}
+    for name in NAMES:
+        y = np.zeros(1000)
+        if name[0] == "g":
+            y[499:501] = 0.5 * turned * math.degrees(angles[name] / 9.80665)
+        level = -9.80665 if name == "az" else 0.0
+        fit = SimpleNamespace(c=np.zeros(1), sigma=0.01)
+        unit = "deg/s" if name[0] == "g" else "m/s^2"
+        states[name] = SimpleNamespace(y=y, dt=1.0, level=level, best=fit, unit=unit)
+    looks = {
+        name: Look(
+            "step",
+            50.0,
+            40.0,
+            {"time_s": interval(499.5, 0.3, "s"), "amplitude": interval(size, 0.003, "m/s^2")},
+            {},
+            when=(499.5, 499.5),
+        )
+        for name, size in sizes.items()
+    }
+    return tilt.of_steps(looks, states)
+
+
+def test_a_turn_of_the_sensor_is_a_tilt() -> None:
+    """f = (0, 0, -g): a turn (a, b, 0) changes f by f x theta = (g b, -g a, 0), which the gyroscopes' angles tell."""
+    found = _looks({"ax": 0.05, "ay": -0.08}, 1.0)
+    assert {look.cause for look in found.values()} == {"tilt"}
+    estimate = found["ax"].estimate
+    assert estimate["angle_x_deg"]["median"] == pytest.approx(math.degrees(0.08 / 9.80665), rel=1e-6)
+    assert estimate["angle_y_deg"]["median"] == pytest.approx(math.degrees(0.05 / 9.80665), rel=1e-6)
+
+
+def test_what_is_no_turn_is_a_step() -> None:
+    """Along gravity; or against what the gyroscopes say; or with a gyroscope among the axes."""
+    for sizes, turned in (({"ax": 0.01, "az": 0.08}, 0.0), ({"ax": 0.05, "ay": -0.08}, -1.0)):
+        assert {look.cause for look in _looks(sizes, turned).values()} == {"step"}
