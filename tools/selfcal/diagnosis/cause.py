@@ -112,6 +112,7 @@ class Cause:
     unsure       words instead where the estimate has `source`: which axis is the source is not shown.
     looks        candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
     at           the look at it with a known shape, on an axis that it is known to act on.
+    of_means     slow: means show all of it, and the look at every sample takes it from them.
     most         times at most that the loop names it on an axis; 0: as often as it is found.
     before_motion  looks that motion must not be taken for: they come before motion.
     slow         a drift of another law may show it: `identify` weighs more laws.
@@ -151,6 +152,7 @@ class Cause:
     unsure: str = ""
     looks: Looks | None = None
     at: Callable[[State, Record, Sequence[float]], Look] | None = None
+    of_means: bool = False
     most: int = 0
     before_motion: Looks | None = None
     slow: bool = False

@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
+from types import MappingProxyType
 from typing import Any
 
 from selfcal.adequacy.document import Identified, parameters_entry, recording_entry, regressors_entry
@@ -57,7 +58,13 @@ def add_carried(
                 entry["gain_on_reason"] = one.reason
 
 
-def looked_at(record: Record, names: Sequence[str], ending: Held, doing: Doing) -> dict[str, Diagnosed]:
+def looked_at(
+    record: Record,
+    names: Sequence[str],
+    ending: Held,
+    doing: Doing,
+    means: Mapping[str, Diagnosed] = MappingProxyType({}),
+) -> dict[str, Diagnosed]:
     """The loop in a thread, so that a signal is answered while the compiled filter runs. What a signal left undone is
     `unfinished`, and the threads are then left behind."""
     found: dict[str, Diagnosed] = {}
@@ -66,7 +73,7 @@ def looked_at(record: Record, names: Sequence[str], ending: Held, doing: Doing) 
 
     def loop() -> None:
         with work.within(work.Work(lambda: stopped.is_set() or ending.asked)):
-            diagnose_record(record, judged, doing.now, found)
+            diagnose_record(record, judged, doing.now, found, means)
 
     pool = ThreadPoolExecutor(1)
     future = pool.submit(loop)

@@ -92,6 +92,7 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
 
 def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict[str, Any]:
     look = finding.look
+    record = finding.record or record
     inner = finding.before.unit
     try:
         known = finding.held_out or gain(look, finding.before, finding.after, record, finding.partner)

@@ -17,7 +17,8 @@ ROUNDS = 12
 @dataclass(frozen=True)
 class Finding:
     """One named cause on one axis. `partner`: the other axis, of a cause that two share. `held_out`: its gain, where
-    the loop has asked for it. `event`: above 0, the one of several axes that it is a part of."""
+    the loop has asked for it. `event`: above 0, the one of several axes that it is a part of.
+    `record`: the means that it was found in, where its axis was looked at in every sample."""
 
     look: Look
     round: int
@@ -27,6 +28,7 @@ class Finding:
     partner: State | None = None
     held_out: HeldOut | None = None
     event: int = 0
+    record: Record | None = None
 
     @property
     def columns(self) -> tuple[Regressor, ...]:

@@ -6,9 +6,12 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from types import MappingProxyType
+
+import numpy as np
 
 from selfcal.base.ending import Stopped
-from selfcal.diagnosis import integrity, module, score
+from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, outliers, step, tilt
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
@@ -17,11 +20,13 @@ from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import work
 from selfcal.likelihood.heldout import harmful
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State
 from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
+#: Those of a round at every sample, after one at means.
+QUICK: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and not cause.of_means)
 #: Those that motion must not be taken for, and what they must show to be taken first.
 STATIONARY: tuple[Looks, ...] = tuple(cause.before_motion for cause in CAUSES.values() if cause.before_motion)
 CERTAIN = 25.0
@@ -41,8 +46,10 @@ def diagnose_record(
     axes: Sequence[str],
     advance: Callable[[str], None] = lambda text: None,
     found: dict[str, Diagnosed] | None = None,
+    means: Mapping[str, Diagnosed] = MappingProxyType({}),
 ) -> dict[str, Diagnosed]:
-    """Walk the loop on every axis of `axes`; the others of the record serve as side channels.
+    """Walk the loop on every axis of `axes`; the others of the record serve as side channels. `means`: what a look at
+    means has found, of which the slow causes stay.
 
     `found` is filled as the rounds go, for who stops it: Stopped then goes on to the caller, and axes that are not done
     are `unfinished`. So is an axis whose work is spent (work.py), with what was found until then."""
@@ -69,7 +76,7 @@ def diagnose_record(
             found[name] = Diagnosed(spoilt.get(name, states[name]), states[name], record, unfinished=INTERRUPTED)
     seen: dict[str, Seen] = {name: {} for name in states}
     record = _integrity(record, found, handled, advance, works, seen)
-    record = _together(record, found, advance)
+    record = _of_means(record, found, means) if means else _together(record, found, advance)
 
     def walk(name: str) -> None:
         one, spent = found[name], ""
@@ -77,7 +84,7 @@ def diagnose_record(
         with suppress(Stopped):
             try:
                 with work.within(works[name]):
-                    _rounds(record, one, advance, seen=seen[name])
+                    _rounds(record, one, advance, QUICK if name in means else LOOKS, seen=seen[name])
             except work.Spent:
                 spent = SPENT
             _end(one, advance)
@@ -112,7 +119,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
     events: dict[int, list[tuple[Diagnosed, Finding]]] = {}
     for one in found.values():
         for finding in one.findings:
-            if finding.event:
+            if finding.event and finding.record is None:
                 events.setdefault(finding.event, []).append((one, finding))
     for parts in sorted(events.values(), key=lambda parts: sum(finding.look.gain for _, finding in parts)):
         price = sum(finding.look.gain for _, finding in parts) - max(finding.look.net for _, finding in parts)
@@ -130,6 +137,8 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
 
 def _measured(finding: Finding, final: State) -> Finding:
     """The finding with its sizes beside all others: a later column may have taken a part of an earlier one."""
+    if finding.record is not None:
+        return finding
     beside = final.without({column.name for column in finding.columns})
     return replace(finding, look=finding.look.measured(beside))
 
@@ -237,7 +246,9 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
                 states[name] = states[name].refit(regressors=(*states[name].regressors, on.column))
     for number, event in enumerate(seen.events, 1):
         names = [seen.names[k] for k in event.act.axes]
-        theta = module.sharpened(event, [states[name] for name in names], seen.dt)
+        theta = event.theta
+        if event.cause in module.JUMPS:
+            theta = module.sharpened(theta, [states[name] for name in names], seen.dt)
         looks = {name: CAUSES[event.cause].located(states[name], record, theta) for name in names}
         looks = tilt.of_steps(looks, states) if event.cause == "step" else looks
         findings = {}
@@ -255,6 +266,52 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
     for name, one in found.items():
         one.state = states[name]
     return replace(record, axes=states)
+
+
+def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str, Diagnosed]) -> Record:
+    """Put what means have found of slow causes into the models of every sample."""
+
+    def carried(name: str) -> State:
+        state, one = record.axes[name], means.get(name)
+        if one is None:
+            return state
+        kept = [finding for finding in one.findings if CAUSES[finding.look.cause].of_means]
+        owned = {column.name: finding for finding in kept for column in finding.columns}
+        extras = replace(
+            state.extras,
+            flicker=any(finding.after.extras.flicker and not finding.before.extras.flicker for finding in kept),
+            oscillation=any(
+                finding.after.extras.oscillation and not finding.before.extras.oscillation for finding in kept
+            ),
+        )
+        columns = [
+            _stretched(column, one.record, state, record)
+            for column in one.state.regressors
+            if column.name in owned or column.cause == hidden.ID
+        ]
+        if name in found:
+            found[name].hidden = one.hidden
+            found[name].findings += [replace(finding, record=one.record, round=0) for finding in kept]
+        if not columns and extras == state.extras:
+            return state
+        return state.refit(regressors=(*state.regressors, *columns), extras=extras)
+
+    states = dict(zip(record.axes, work.each(carried, record.axes), strict=True))
+    for name, one in found.items():
+        one.state = states[name]
+    return replace(record, axes=states)
+
+
+def _stretched(column: Regressor, means: Record, state: State, record: Record) -> Regressor:
+    """A column of means on the grid of a state. The edges of an event are moved to where the samples have them."""
+    n = state.y.size
+    times = [float(column.entry[key]) for key in ("time_s", "start_s", "end_s") if key in column.entry]
+    if column.entry.get("kind") not in ("step", "pulse"):
+        middle = (np.arange(means.present.size) + 0.5) / means.rate_hz
+        return replace(column, values=np.interp((np.arange(n) + 0.5) * state.dt, middle, column.values))
+    edges = module.sharpened(times, [state], 1.0 / means.rate_hz)
+    begin, end = round(edges[0] / state.dt), round(edges[1] / state.dt) if len(edges) > 1 else n
+    return replace(column, values=step.raised(n, begin, end))
 
 
 def _rounds(
@@ -302,7 +359,9 @@ def _rounds(
 def _gone(finding: Finding, state: State) -> bool:
     """Whether a later finding took the place of this one's columns."""
     kept = {id(column) for column in state.regressors}
-    return bool(finding.columns) and not any(id(column) in kept for column in finding.columns)
+    return (
+        finding.record is None and bool(finding.columns) and not any(id(column) in kept for column in finding.columns)
+    )
 
 
 def _looked(

@@ -413,15 +413,15 @@ class Module:
     hidden: Hidden | None
 
 
-def sharpened(event: Candidate, states: Sequence[State], span: float) -> tuple[float, ...]:
-    """The shape of an event on the axes' own grid: its times are known to a mean alone."""
+def sharpened(times: Sequence[float], states: Sequence[State], span: float) -> tuple[float, ...]:
+    """Times of jumps on the axes' own grid, s: means of `span` s know them to a mean alone."""
     dt = states[0].dt
-    if event.cause not in JUMPS or dt > 0.5 * span:
-        return event.theta
+    if dt > 0.5 * span:
+        return tuple(times)
     gain = np.sum([scan(state.series, state.best).gain for state in states], axis=0)
     reach = round(1.5 * span / dt)
     found = []
-    for time in event.theta:
+    for time in times:
         low = max(0, round(time / dt) - reach)
         found.append((low + int(np.argmax(gain[low : low + 2 * reach + 1]))) * dt)
     return tuple(found)

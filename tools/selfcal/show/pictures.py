@@ -71,7 +71,7 @@ def figures(one: Diagnosed, record: Record, factor: float, unit: str) -> tuple[l
 
     `factor` turns the axis' inner unit into `unit`."""
     overview = [_allan(one.first, one.state, factor, unit), _spectrum(one.first, one.state, factor, unit)]
-    plans = [_plan(finding, record, factor, unit) for finding in one.findings]
+    plans = [_plan(finding, finding.record or record, factor, unit) for finding in one.findings]
     compared = [*overview, *(item for plan in plans for item in plan if isinstance(item, Compared))]
     pairs = _ensembles(compared)
 

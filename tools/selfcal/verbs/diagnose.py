@@ -144,7 +144,7 @@ def diagnose(
             if means is not None and record.axes:
                 first = looked_at(means, names, ending, doing)
                 show_first(recording, first, [name for name in names if name in record.axes], ending)
-        seen = looked_at(record, names, ending, doing) if not ending.asked else {}
+        seen = looked_at(record, names, ending, doing, first) if not ending.asked else {}
         looked = {
             name: first.get(name)
             if name not in seen and below_lattice(record, name)

@@ -73,6 +73,7 @@ CAUSE = Cause(
     "The bias has flicker (1/f) noise, or drifts on two time scales at once.",
     "Use B, not K: --write-model states its law. A record three times as long makes sure.",
     source="sensor",
+    of_means=True,
     alike=lambda a, b: True,
     looks=looks,
     slow=True,

@@ -206,6 +206,7 @@ CAUSE = Cause(
     looks=looks,
     most=1,
     slow=True,
+    of_means=True,
     alike=_alike,
     pictures=shown("allan", "spectrum"),
     extend=_extend,

@@ -87,7 +87,7 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
     gain, fit = state.with_columns(column)
     edge = state.dt / math.sqrt(12.0)
     estimate = {
-        "time_s": interval(begin * state.dt - 0.5 * state.dt, edge, "s"),
+        "time_s": interval(begin * state.dt - 0.5 * state.dt / state.block, edge, "s"),
         "duration_s": interval((end - begin) * state.dt, math.sqrt(2.0) * edge, "s"),
         "amplitude": interval(float(fit.c[-1]), float(fit.sd[-1]), state.unit),
     }
@@ -261,7 +261,7 @@ def posterior(time_s: Array, begin: int, end: int, state: State, brief: bool = F
     # An edge lies between the last reading before it and the first one after it.
     edge = state.dt / math.sqrt(12.0)
     return {
-        "time_s": mixture(weight, begun - 0.5 * state.dt, edge, "s"),
+        "time_s": mixture(weight, begun - 0.5 * state.dt / state.block, edge, "s"),
         "duration_s": mixture(weight, ended - begun, math.sqrt(2.0) * edge, "s"),
         "amplitude": mixture(weight, np.concatenate(amplitude), np.concatenate(sd), state.unit),
     }
@@ -320,6 +320,7 @@ CAUSE = Cause(
     at=at,
     most=3,
     slow=True,
+    of_means=True,
     alike=_alike,
     piece=at_jump,
     once="a pulse is an event of its recording",

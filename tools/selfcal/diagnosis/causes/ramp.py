@@ -58,6 +58,7 @@ CAUSE = Cause(
     "The bias drifts at a constant rate.",
     "Record three times as long, with the temperature beside it.",
     source="sensor",
+    of_means=True,
     alike=lambda a, b: True,
     looks=looks,
     at=at,

@@ -116,7 +116,7 @@ def _look(state: State, record: Record, place: int, gain: float, worth: float, c
     time = float(record.time_s[place])
     column = Regressor(f"step_{time:.6g}s", "step", raised(n, place), "1", {"kind": "step", "time_s": time})
     estimate = {
-        "time_s": mixture(np.ones(1), np.array([time - 0.5 * state.dt]), state.dt / math.sqrt(12.0), "s"),
+        "time_s": mixture(np.ones(1), np.array([time - 0.5 * state.dt / state.block]), state.dt / math.sqrt(12.0), "s"),
         "amplitude": mixture(np.ones(1), chosen.c[-1:], chosen.sd[-1:], state.unit),
     }
     changes = {"regressors": (*state.regressors, column)}
@@ -150,8 +150,8 @@ def posterior(time_s: Array, place: int, state: State) -> dict[str, Any]:
         where.append(good)
     ln_all = np.concatenate(ln_weight)
     weight = np.exp(ln_all - ln_all.max())
-    # A step lies between the last reading before it and the first one with it.
-    times = time_s[np.concatenate(where)] - 0.5 * state.dt
+    # A step lies between the last reading before it and the first one with it: means begin with their first reading.
+    times = time_s[np.concatenate(where)] - 0.5 * state.dt / state.block
     return {
         "time_s": mixture(weight, times, state.dt / math.sqrt(12.0), "s"),
         "amplitude": mixture(weight, np.concatenate(amplitude), np.concatenate(sd), state.unit),
@@ -221,6 +221,7 @@ CAUSE = Cause(
     at=at,
     most=3,
     slow=True,
+    of_means=True,
     alike=_alike,
     piece=at_jump,
     pictures=shown("means", "evidence"),

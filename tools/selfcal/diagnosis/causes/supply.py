@@ -12,6 +12,7 @@ CAUSE = Cause(
     source="surroundings",
     looks=lambda state, record: forms.side_looks(state, record, "supply"),
     at=lambda state, record, theta: forms.side_at(state, record, "supply", theta),
+    of_means=True,
     alike=lambda a, b: True,
     pictures=shown("means", "evidence"),
     least=lambda state, record: forms.least(state, record, "supply"),

@@ -102,6 +102,7 @@ CAUSE = Cause(
     "Fasten the mount, and record again without touching it.",
     source="handling",
     at=step.at,
+    of_means=True,
     alike=step.CAUSE.alike,
     pictures=shown("means", "evidence"),
     once="a turn is an event of its recording",

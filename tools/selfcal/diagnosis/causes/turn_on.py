@@ -318,6 +318,7 @@ CAUSE = Cause(
     at=at,
     most=1,
     slow=True,
+    of_means=True,
     alike=_alike,
     pictures=shown("means", "evidence"),
     trained=_trained,
