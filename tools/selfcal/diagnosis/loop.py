@@ -84,7 +84,10 @@ def diagnose_record(
         with suppress(Stopped):
             try:
                 with work.within(works[name]):
-                    _rounds(record, one, advance, QUICK if name in means else LOOKS, seen=seen[name])
+                    if name in means:
+                        _rounds(record, one, advance, QUICK, seen=seen[name])
+                    else:
+                        _rounds(record, one, advance, seen=seen[name])
             except work.Spent:
                 spent = SPENT
             _end(one, advance)
