@@ -269,15 +269,20 @@ def numbers(state: State) -> dict[str, float]:
 
 
 def bias_ahead(state: State) -> float:
-    """Mean of the predicted bias over the next BIAS_S, without the level and the columns, in the axis' unit: lines and
-    bands have averaged out, the drift has not."""
+    """Mean of the predicted bias over the next BIAS_S, without the level, in the axis' unit: lines and bands have
+    averaged out, the drift has not. Of the columns events stay as they ended, and channels are at their reference."""
     fit = state.best
     m = matrices(fit.terms, fit.theta, state.dt, state.series.duration_s, state.block)
     x = run(state.series, fit.terms, fit.theta)[0][-1].x
     total, step, count = np.eye(len(m.F)), m.F, 1
     while count * state.dt < BIAS_S:
         total, step, count = total + step @ total, step @ step, 2 * count
-    return float(fit.c[0] + (x[0] - fit.c @ x[1:]) @ (m.h @ total) / count)
+    events = [
+        c * column.values[-1]
+        for c, column in zip(fit.c[1:], state.regressors, strict=True)
+        if column.cause in CAUSES and CAUSES[column.cause].once
+    ]
+    return float(fit.c[0] + sum(events) + (x[0] - fit.c @ x[1:]) @ (m.h @ total) / count)
 
 
 def inflation(before: State, after: State) -> Mapping[str, float]:
