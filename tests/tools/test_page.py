@@ -324,7 +324,7 @@ def test_causes_by_axis_and_the_noise_stand_at_the_top(case: Case) -> None:
         assert sign == ("●" if cause in axes["gx"]["material"] else "○") and other == "–"
     gx, gy = cells_of(text, "N, K and B before and after")[1:]
     before, after = (axes["gx"]["numbers"]["N"][key] for key in ("before", "after"))
-    assert gx[1].startswith(f"{before:.3g} → {after['median']:.3g}") and gy[0] == "gy"
+    assert gx[1].startswith(f"{before:.3g} → {after['median']:.3g} °/s/√Hz") and gy[0] == "gy"
     gx, gy = cells_of(text, "Noise of each axis")[1:]
     assert gx[:3] == ["gx", "random walk", "0.8"] and gx[3].startswith("0.035 (0.0315 to 0.0385) °/s/√Hz")
     assert gx[4].startswith("0.002 (0.0018 to 0.0022)") and gx[5] == "–" and gx[6].endswith("points outside")

@@ -167,7 +167,8 @@ class Change(Object):
 
 class Event(Object):
     """An event or source of all axes that it acts on: what these have in common (`estimate`), its sizes and probability
-    by axis, what it changes, and where it comes from. `confirmed`: held-out time shows it; None: none can."""
+    by axis, what it changes, and where it comes from. `confirmed`: held-out time shows it, and
+    `confirmed_on` a second recording; None: none can."""
 
     id: str
     cause: str
@@ -179,6 +180,7 @@ class Event(Object):
     net_nats: float
     material: bool
     confirmed: bool | None
+    confirmed_on: bool | None
     changes: dict[str, Change]
     also_possible: list[str]
     record_next: str

@@ -64,7 +64,7 @@ def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict
 
 def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """What can change: parameters of the likeliest law, the bias, the coefficients of the model file's regressors, and
-    the size of each cause found."""
+    the size of each cause found. A cause is `small` where it changes no number by as much as matters."""
     found: dict[str, Mapping[str, Any]] = {}
     if "hypotheses" in identified:
         law = max(identified["hypotheses"], key=lambda name: identified["hypotheses"][name])
@@ -84,6 +84,11 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
                 if math.isfinite(estimate["median"]):
                     found[f"{column}.coefficient"] = estimate
     counted: dict[str, int] = {}
+    matter = (*diagnosed.get("material", ()), "unexplained")
+    own = [finding["cause"] for finding in diagnosed.get("findings", [])]
+    for cause in diagnosed.get("causes", ()):
+        if cause not in own:  # of several axes
+            found[cause] = {"present": True, "small": cause not in matter}
     for finding in diagnosed.get("findings", []):
         cause = str(finding["cause"])
         counted[cause] = counted.get(cause, 0) + 1
@@ -91,18 +96,18 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
         for key, estimate in finding["estimate"].items():
             if key in SIZES and isinstance(estimate, Mapping):
                 found[f"{label}.{key}"] = estimate
-        found.setdefault(f"{label}", {"present": True})
+        found.setdefault(label, {"present": True, "small": cause not in matter})
     return found
 
 
 def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What is in one recording alone, and what changed beyond the limit, a row each."""
+    """What is in one recording alone and matters there, and what changed beyond the limit, a row each."""
     rows: list[dict[str, Any]] = []
     for key in sorted(before.keys() | after.keys()):
         a, b = before.get(key), after.get(key)
         if a is None or b is None:
             one = a or b
-            if one is not None and "present" in one:
+            if one is not None and "present" in one and not one["small"]:
                 rows.append({"quantity": key, "what": "appeared" if a is None else "gone"})
             continue
         if "present" in a:

@@ -291,6 +291,9 @@ def _entry(event: Event) -> dict[str, Any]:
             "also_possible": list(dict.fromkeys(cause for row in rows for cause in row["also_possible"])),
             "record_next": rows[0]["record_next"],
         }
+    on_second = [row.get("gain_on") for row in rows] + [entry.get("gain_on")]
+    if any(on_second):
+        entry["confirmed_on"] = _confirmed(on_second)
     changes = {axis: {key: one[key] for key in one if key != "most"} for axis, one in event.changes.items()}
     source = CAUSES[looks[0].cause].source if event.entry is None else "surroundings"
     found = {"id": event.id, **entry, "source": source, "material": event.material, "changes": changes}

@@ -187,7 +187,7 @@ def _by_unit(values: Sequence[tuple[str, float, str]]) -> str:
 
 
 def effects(finding: Mapping[str, Any]) -> str:
-    """What it changes by as much as matters."""
+    """What it changes by as much as matters, and whether time that the fit did not see confirms it."""
     told = []
     changes = finding["changes"]
     for name in ("N", "K", "B"):
@@ -208,7 +208,10 @@ def effects(finding: Mapping[str, Any]) -> str:
     if less:
         most, horizon = max(less)
         told.append(f"bias {horizon} s ahead known {100.0 * most:.0f} % better")
-    return ", ".join(told)
+    seen = ["not confirmed on held-out time"] if finding["confirmed"] is False else []
+    if finding.get("confirmed_on") is not None:
+        seen.append("holds on the second recording" if finding["confirmed_on"] else "not seen on the second recording")
+    return "; ".join([*([", ".join(told)] if told else []), *seen])
 
 
 def action(finding: Mapping[str, Any]) -> str:
@@ -229,14 +232,15 @@ def _sure(coefficient: Mapping[str, Any] | None) -> bool:
 
 def small(findings: Sequence[Mapping[str, Any]]) -> str:
     """One line on the findings that matter little: by how much they move a number at most."""
-    told = []
+    told: list[str] = []
     for name in ("N", "K", "B"):
         factors = [one[name] for finding in findings for one in finding["changes"].values()]
         most = max((abs(one - 1.0) for one in factors if one is not None and math.isfinite(one)), default=0.0)
-        told.append(f"{name} by more than {100.0 * most:.0f} %")
-    count = f"{len(findings)} small finding{'s' if len(findings) != 1 else ''}"
-    none = "none changes" if len(findings) != 1 else "it does not change"
-    return f"{count}: {none} {', '.join(told)}, or any of these and the bias by more than half of its interval"
+        told.append(f"{name} by {'' if told else 'more than '}{100.0 * most:.0f} %")
+    count, none = f"{len(findings)} small findings", "none changes"
+    if len(findings) == 1:
+        count, none = "1 small finding", "it does not change"
+    return f"{count}: {none} {', '.join(told)}, or the bias by half of its interval"
 
 
 def ratio(value: float) -> str:

@@ -19,7 +19,7 @@ from selfcal.diagnosis import words
 from selfcal.diagnosis.events import small
 
 #: Characters a line of a table that no terminal shows.
-WIDTH = 150
+WIDTH = 114
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False, details: bool = False) -> None:
@@ -43,6 +43,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, details: bool 
         console.print(_events(shown))
     if axes:
         console.print(_numbers(axes))
+        say("without -> with the findings: medians ± half of the 90 % interval; –: looked for, not identified")
     known = {name: axis["numbers"]["N"] for name, axis in axes.items() if "q05" in axis["numbers"]["N"]["after"]}
     for line in noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()}):
         say(line)
@@ -70,11 +71,11 @@ def verdict(axis: Mapping[str, Any]) -> str:
 
 def _events(findings: Sequence[Mapping[str, Any]]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("", "from", "what", "size", "changes", "do"):
+    for heading in ("", "from", "what", "changes", "do"):
         table.add_column(heading, overflow="fold")
     for number, finding in enumerate(findings, 1):
-        doubt = "; not confirmed on held-out time" if finding["confirmed"] is False else ""
-        row = (words.what(finding), words.how_much(finding), words.effects(finding) + doubt, words.action(finding))
+        what = "; ".join(filter(None, (words.what(finding), words.how_much(finding))))
+        row = (what, words.effects(finding), words.action(finding))
         style = "bold" if finding["material"] else None
         table.add_row(str(number), finding["source"], *map(escape, map(units.typeset, row)), style=style)
     return table
@@ -82,13 +83,12 @@ def _events(findings: Sequence[Mapping[str, Any]]) -> Table:
 
 def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> Table:
     """N, K and B of each axis without its findings and with them."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, caption_justify="left")
-    table.caption = "before -> with the findings in the model: medians [5 %, 95 %]; –: looked for, not identified"
-    for heading in ("axis", "verdict", "N", "K", "B"):
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
+    for heading in ("axis", "verdict", "N, per √Hz", "K, per s and √Hz", "B"):
         table.add_column(heading, overflow="fold")
     for name, axis in axes.items():
         cells = [escape(before_after(axis["numbers"][key])) for key in ("N", "K", "B")]
-        table.add_row(name, escape(verdict(axis)), *cells)
+        table.add_row(f"{name}, {units.typeset(axis['unit'])}", escape(verdict(axis)), *cells)
     return table
 
 
@@ -97,9 +97,11 @@ def before_after(number: Mapping[str, Any]) -> str:
     after = number["after"]
     told = "–" if not after["identified"] else f"{after['median']:.3g}"
     if "q05" in after:
-        told = f"{told} [{after['q05']:.3g}, {after['q95']:.3g}]" if after["identified"] else f"< {after['q95']:.2g}"
+        half = 0.5 * (after["q95"] - after["q05"])
+        known = f"{words.rounded(after['median'], 10.0 * half)} ± {half:.1g}"
+        told = known if after["identified"] else f"< {after['q95']:.2g}"
     before = f"{number['before']:.3g}" if number["before"] > 0.0 and math.isfinite(number["before"]) else "–"
-    return f"{before} -> {told} {units.typeset(number['unit'])}"
+    return f"{before} -> {told}"
 
 
 def _lines(finding: Mapping[str, Any]) -> list[str]:

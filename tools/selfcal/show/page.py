@@ -300,12 +300,11 @@ def _events(
                     boxes.setdefault(axis, k)
         links = [f"<a href='#{_id(axis, k)}'>{escape(axis)}</a>" for axis, k in boxes.items()]
         links += [f"<a href='#{_id(finding['id'], 0)}'>all</a>"] if _stands_alone(finding, axes) else []
-        doubt = "; not confirmed on held-out time" if finding["confirmed"] is False else ""
         cells = (
             escape(finding["source"]),
             f"{escape(unit_module.typeset(words.what(finding)))} <span class=soft>({' '.join(links)})</span>",
             escape(unit_module.typeset(words.how_much(finding))),
-            escape(unit_module.typeset(words.effects(finding)) + doubt),
+            escape(unit_module.typeset(words.effects(finding))),
             escape(words.action(finding)),
         )
         rows += f"<tr><th scope=row>{place}</th>{''.join(f'<td>{cell}</td>' for cell in cells)}</tr>"
@@ -317,15 +316,19 @@ def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> str:
     """N, K and B of each axis without its findings and with them."""
     rows = "".join(
         f"<tr><th scope=row>{escape(axis)}</th>"
-        + "".join(f"<td>{escape(before_after(entry['numbers'][name]))}</td>" for name in ("N", "K", "B"))
+        + "".join(f"<td>{escape(_with_unit(entry['numbers'][name]))}</td>" for name in ("N", "K", "B"))
         + "</tr>"
         for axis, entry in axes.items()
         if "numbers" in entry
     )
     heads = "".join(f"<th scope=col>{head}</th>" for head in ("axis", "N", "K", "B"))
-    caption = "Before → with the findings in the model: medians, 5 to 95 %. –: looked for, not identified."
+    caption = "Without → with the findings: medians ± half of the 90 % interval. –: looked for, not identified."
     table = f"<thead><tr>{heads}</tr></thead><tbody>{rows}</tbody>"
     return scrolled("N, K and B before and after", caption, table.replace("-&gt;", "→"), "glance numbers")
+
+
+def _with_unit(number: Mapping[str, Any]) -> str:
+    return f"{before_after(number)} {unit_module.typeset(str(number['unit']))}"
 
 
 def _readings(
