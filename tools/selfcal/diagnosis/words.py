@@ -122,7 +122,7 @@ def _size(key: str, value: Any) -> str:
             return FORMS.get(value, "")
         case "form_also_possible":
             return f"not to be told from {', '.join(FORM_NAMES.get(one, str(one)) for one in value)}"
-        case "jumps":
+        case "jumps" if not isinstance(value, int):
             times = ", ".join(f"{one['time_s']:.0f}" for one in value)
             return f"jumps at {times} s" if times else ""
         case "statistic":
