@@ -172,7 +172,8 @@ def diagnose(
                 ending.check()
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
             doing.now("held-out gain")
-            tree = extended(loaded, record, found)
+            sensor = recording.path.name.partition(".")[0] if model is None else None
+            tree, read_out = extended(loaded, record, found, sensor)
             out = left_out(loaded, found)
             doing.now("what the axes share")
             shared = shared_by(found, loaded) if not ending.asked else None
@@ -194,7 +195,8 @@ def diagnose(
             doing.now("posterior")
             add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
             if write_model is not None:
-                write_text(write_model, as_text(tree, recording.path))
+                write_text(write_model, as_text(tree, recording.path, read_out))
+                note(f"{write_model}: {read_out}")
                 if out:
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
                     note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
