@@ -164,7 +164,8 @@ class Ensemble:
         if metric.size < LEAST_SHARE * len(self.seeds):
             raise UserError(
                 f"--want '{self.wishes[k].text}': hardly a part of {self.model.path} has a law with "
-                f"{self.wishes[k].parameter}: state `hypothesis` under simulate.axes.{self.axis}"
+                f"{self.wishes[k].parameter} on {self.axis}: state `hypothesis` under simulate.axes.{self.axis}, "
+                "of a recording in the file that `part` writes"
             )
         return math.log(max(float(np.quantile(metric, SHARE)), TINY) / self.wishes[k].most)
 

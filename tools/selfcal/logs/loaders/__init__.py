@@ -125,6 +125,12 @@ def is_text(path: Path) -> bool:
     return path.name.lower().removesuffix(".gz").endswith(TEXT)
 
 
+def is_recording(path: Path | str) -> bool:
+    """Whether a name is a recording's: by its suffix, or a folder."""
+    path = Path(path)
+    return path.is_dir() or is_text(path) or path.suffix.lower() in (ZIP, *(s for one in FORMATS for s in one.suffixes))
+
+
 def format_of(path: Path, *, frames: bool = False) -> Format | None:
     """The format of a file that is no text, by its first bytes, else by its suffix; None for a text. `frames`: it is a
     log of CAN frames, which may be a text. Raises UserError, and OSError."""
