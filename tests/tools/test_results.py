@@ -8,7 +8,7 @@ import pickle
 
 import pytest
 
-from selfcal.base.results import Comparison, Diagnosis, Finding, Identification, IdentifiedAxis, Posterior
+from selfcal.show.results import Comparison, Diagnosis, Finding, Identification, IdentifiedAxis, Posterior
 
 POSTERIOR = {"mean": 1.0, "median": 1.0, "sd": 0.1, "q05": 0.8, "q95": 1.2, "unit": "deg/s", "identified": True}
 DOCUMENT = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -169,10 +170,19 @@ def plotter() -> Any:
     where files of strangers may lie, would be taken first."""
     with contextlib.chdir("/"):
         import matplotlib
-    matplotlib.use("Agg")
+    if "matplotlib.pyplot" not in sys.modules and not os.environ.get("MPLBACKEND", "").startswith("module:"):
+        matplotlib.use("Agg")  # a notebook has its own
     from matplotlib import pyplot
 
     return pyplot
+
+
+def png_of(figure: Any, dpi: int) -> bytes:
+    """A figure as PNG; it is closed."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=dpi)
+    plotter().close(figure)
+    return stream.getvalue()
 
 
 def save_picture(figure: Any, path: Path | str, dpi: int) -> None:

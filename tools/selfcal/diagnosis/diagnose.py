@@ -187,10 +187,10 @@ def options_given(
     return [*given, *recording.options]
 
 
-def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False, console: Console | None = None) -> None:
     """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
     recording = document["recording"]
-    console = Console(stderr=to_stderr)
+    console = console or Console(stderr=to_stderr)
     console.print(
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s{since(recording)}\n",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -27,15 +28,17 @@ TOLD_OF = 0.01
 TIMES_MOST = 4
 
 
-def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False) -> None:
+def show(
+    document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False, console: Console | None = None
+) -> None:
     """The tables a person reads: per axis the numbers of a data sheet; then the laws, their probabilities and
     parameters, and the bias.
 
-    They go to stderr where stdout is the JSON's. `datasheet`: the laws' numbers in the units of data sheets. In a
-    terminal that is too narrow columns lose their intervals: those of the data sheets' units, then the recording's; of
-    the laws that of 1/alpha, then N's, then K's.
+    They go to stderr where stdout is the JSON's, or to a `console`. `datasheet`: the laws' numbers in the units of data
+    sheets. In a terminal that is too narrow columns lose their intervals: those of the data sheets' units, then the
+    recording's; of the laws that of 1/alpha, then N's, then K's.
     """
-    console = Console(stderr=to_stderr)
+    console = console or Console(stderr=to_stderr)
     recording = document["recording"]
     title = (
         f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
@@ -254,7 +257,9 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             told = ", ".join(f"{law} {P:.2g}" for law, P in laws)
             failed.append(f"with the laws of sums.yaml: {name}: {told}")
     if any(line.startswith("not adequate") for line in failed):
-        failed.append(f"why, and what mends it: {called()} diagnose {as_typed(recording)}")
+        there = Path(recording["path"]).exists() or recording.get("paths")
+        typed = f"{called()} diagnose {as_typed(recording)}" if there else "selfcal.diagnose() of the same readings"
+        failed.append(f"why, and what mends it: {typed}")
     return table, [*kept, *_unidentified(axes), *_ahead(axes), *failed]
 
 

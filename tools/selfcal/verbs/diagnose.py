@@ -29,7 +29,7 @@ from selfcal.verbs._shared import (
 )
 
 if TYPE_CHECKING:
-    from selfcal.base.results import Diagnosis
+    from selfcal.show.results import Diagnosis
 
 
 @on_a_line
@@ -85,7 +85,6 @@ def diagnose(
     from selfcal.base.ending import held
     from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.base.progress import Doing
-    from selfcal.base.results import Diagnosis
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.diagnosis import hidden
@@ -114,6 +113,7 @@ def diagnose(
     from selfcal.likelihood import work
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
+    from selfcal.show.results import Diagnosis
 
     check(fail_on)
     check_options(limits, junit, verdicts)

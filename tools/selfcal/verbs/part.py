@@ -12,12 +12,13 @@ from selfcal.logs.loaders import READ, Reading
 from selfcal.verbs._shared import End, Start
 
 if TYPE_CHECKING:
+    from selfcal.logs.recording import Data
     from selfcal.model.file import Model
 
 
 def part(
     log: Annotated[
-        Sequence[Path | str], argument(f"Recording at rest: {READ}; or --datasheet alone", "[LOG...]", kind=list[Path])
+        Data, argument(f"Recording at rest: {READ}; or --datasheet alone", "[LOG...]", kind=list[Path])
     ] = (),
     output: Annotated[
         Path | str,
@@ -49,11 +50,12 @@ def part(
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
 
-    if not log and not datasheet:
+    given = not isinstance(log, Sequence) or len(log) > 0
+    if not given and not datasheet:
         raise UserError("give a recording at rest, or numbers of a data sheet: --datasheet 'N=0.012deg/sqrt(h)'")
-    check_writable(output, inputs=tuple(list_of(log)) if log else ())
+    check_writable(output, inputs=tuple(list_of(log)))
     stated = [parse(text) for text in datasheet]
-    recording = load(log, sensors=(*SENSORS, *axes), **reading).between(start_s, end_s) if log else None
+    recording = load(log, sensors=(*SENSORS, *axes), **reading).between(start_s, end_s) if given else None
     tree, said = tree_of(recording, axes, stated, name, reading.get("rate"))
     model = Model.of_tree(tree, Path(output))
     write_text(output, as_text(tree, recording, said))

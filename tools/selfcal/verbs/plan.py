@@ -5,16 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import Reading
 from selfcal.verbs._shared import End, Json, Scheduler, Start, to_stderr
 
+if TYPE_CHECKING:
+    from selfcal.logs.recording import Data
+
 
 def plan(
-    model: Annotated[Path | str, argument("Model file of the part, or a recording of it at rest", "MODEL.yaml|LOG")],
+    model: Annotated[
+        Data, argument("Model file of the part, or a recording of it at rest", "MODEL.yaml|LOG", kind=Path)
+    ],
     *,
     want: Annotated[
         Sequence[str],
@@ -50,16 +55,16 @@ def plan(
     from selfcal.batch.plan import SCHEMA, SHARE, SWEEP_S, Ensemble, Wish, cycling, picture, rates, refusal
     from selfcal.batch.spread import record_seeds
     from selfcal.logs.loaders import is_recording
+    from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.model.regressors import coefficient_unit
 
-    check_writable(json, plot, inputs=(model,))
+    check_writable(json, plot, inputs=list_of(model))
     if plot is not None:
         check_picture(plot)
-    if is_recording(model):
+    if not isinstance(model, Path | str) or is_recording(model):
         from selfcal.adequacy.part import tree_of
         from selfcal.base.units import SENSORS
-        from selfcal.logs.recording import load
 
         sensors = SENSORS if axis is None else (*SENSORS, axis)
         recording = load(model, sensors=sensors, **reading).between(start_s, end_s)

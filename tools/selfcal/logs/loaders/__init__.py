@@ -76,6 +76,7 @@ class Reading(TypedDict, total=False):
     """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
 
     rate: Annotated[float | None, option("Sampling rate, for recordings without a t column", metavar="HZ")]
+    rate_hz: float | None
     columns: Annotated[
         Mapping[str, str] | None,
         option(
@@ -87,7 +88,7 @@ class Reading(TypedDict, total=False):
         ),
     ]
     units: Annotated[
-        Mapping[str, str] | None,
+        Mapping[str, str] | str | None,
         option(
             "Unit of a column whose header states none (repeat for more)",
             "--unit",
