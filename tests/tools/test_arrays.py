@@ -190,9 +190,12 @@ def run_notebook(cells: list[dict[str, Any]]) -> list[str]:
     shown = []
     for cell in cells:
         tree = ast.parse("".join(cell["source"]))
-        last = tree.body.pop() if isinstance(tree.body[-1], ast.Expr) else None
+        last = tree.body[-1]
+        tree.body[-1:] = [] if isinstance(last, ast.Expr) else [last]
         exec(compile(tree, "cell", "exec"), names)
-        value = None if last is None else eval(compile(ast.Expression(last.value), "cell", "eval"), names)  # type: ignore[attr-defined]
+        value = None
+        if isinstance(last, ast.Expr):
+            value = eval(compile(ast.Expression(last.value), "cell", "eval"), names)
         shown.append("" if value is None or isinstance(value, Picture) else repr(value))
     return shown
 
