@@ -17,6 +17,7 @@ from selfcal.adequacy.document import parameters_entry, recording_entry, regress
 from selfcal.adequacy.identify import identify_axis, moved_beside
 from selfcal.base.ending import Held, Stopped, abandon
 from selfcal.base.errors import UserError, note, printable
+from selfcal.base.output import console_of
 from selfcal.base.progress import Doing
 from selfcal.diagnosis import hidden, words
 from selfcal.diagnosis.causes import CAUSES
@@ -190,7 +191,7 @@ def options_given(
 def show(document: Mapping[str, Any], *, to_stderr: bool = False, console: Console | None = None) -> None:
     """What a person reads: per axis the verdict, each finding in words with its evidence and gain, what to do next."""
     recording = document["recording"]
-    console = console or Console(stderr=to_stderr)
+    console = console or console_of(to_stderr=to_stderr)
     console.print(
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s{since(recording)}\n",

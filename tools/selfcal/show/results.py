@@ -15,9 +15,7 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from selfcal.base.errors import UserError, install
-
-#: Columns of a repr.
-_WIDTH = 140
+from selfcal.base.output import TABLE_WIDTH
 
 
 class Object(dict[str, Any]):
@@ -183,7 +181,7 @@ class Document(Object):
     def _console(self, **more: Any) -> Any:
         from rich.console import Console
 
-        console = Console(file=io.StringIO(), width=_WIDTH, **more)
+        console = Console(file=io.StringIO(), width=TABLE_WIDTH, **more)
         self._print(console)
         return console
 

@@ -17,11 +17,10 @@ from selfcal.adequacy.summary import MOST_REST
 from selfcal.bank.priors import OF_RECORD
 from selfcal.base import units
 from selfcal.base.errors import called, printable
+from selfcal.base.output import TABLE_WIDTH, console_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 
-#: The table never folds its numbers: a narrower terminal wraps its lines.
-TABLE_WIDTH = 140
 #: Laws of smaller probability are not spoken of where the grid does not bear them.
 TOLD_OF = 0.01
 #: Stretches of motion that are listed at most.
@@ -38,7 +37,7 @@ def show(
     sheets. In a terminal that is too narrow columns lose their intervals: those of the data sheets' units, then the
     recording's; of the laws that of 1/alpha, then N's, then K's.
     """
-    console = console or Console(stderr=to_stderr)
+    console = console or console_of(to_stderr=to_stderr, fits=True)
     recording = document["recording"]
     title = (
         f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
@@ -52,8 +51,6 @@ def show(
     notes = choices[0][1]
     first = summary if numbered else laws
     first.title, first.title_justify = title, "left"
-    if not console.is_terminal:
-        console.width = max(console.width, TABLE_WIDTH)
     if numbered:
         console.print(summary)
     console.print(laws)

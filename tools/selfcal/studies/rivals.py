@@ -28,7 +28,7 @@ from selfcal.adequacy.identify import chosen_axes
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
-from selfcal.base.output import check_writable, write_json
+from selfcal.base.output import check_writable, console_of, write_json
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
 from selfcal.logs.recording import Recording, as_float, load
@@ -254,7 +254,7 @@ def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table an axis: a row for each method and law."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     brief = console.is_terminal and console.width < WHOLE_WIDTH
     console.width = max(console.width, BRIEF_WIDTH if brief else WHOLE_WIDTH)
     for name, axis in document["axes"].items():
@@ -309,7 +309,7 @@ def _table(name: str, axis: Mapping[str, Any], *, brief: bool) -> Table:
 
 def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table for each number of samples and law, then the choice of a law over all laws."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     console.width = max(console.width, WHOLE_WIDTH)
     cells: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for entry in document["cells"]:
