@@ -214,15 +214,13 @@ def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
         return {"title": rival.title, "error": rival.missing}
     try:
         with workers(1) as pool:
-            found = pool.submit(_alone, rival, problem).result()
+            found = pool.submit(_alone, rival, problem, unit).result()
     except BrokenProcessPool:
         found = {"error": "it ended without an answer"}
-    if "answer" in found:
-        found |= entry_of(found.pop("answer"), problem.group.unit, unit)
     return {"title": rival.title, **found}
 
 
-def _alone(rival: Rival, problem: Problem) -> dict[str, Any]:
+def _alone(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
     try:
         function = rival.load()
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -230,10 +228,13 @@ def _alone(rival: Rival, problem: Problem) -> dict[str, Any]:
         answer = function(problem)
         seconds = time.process_time() - start
         grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        if not isinstance(answer, Answer):
+            return {"error": f"it returned {type(answer).__name__}: a rival returns a selfcal.studies.methods.Answer"}
+        entry = entry_of(answer, problem.group.unit, unit)
     except Exception as error:  # whatever another's library raises is the answer for this record
         return {"error": first_line(error)}
     unit_bytes = 1 if sys.platform == "darwin" else 1024
-    return {"answer": answer, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes}
+    return {**entry, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes}
 
 
 def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
