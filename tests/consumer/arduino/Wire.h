@@ -1,4 +1,4 @@
-/* An MPU-6050 on the bus, on this machine: at rest, with noise of known size. Its registers are those of RM-MPU-6000A. */
+/* An MPU-6050 on the bus, on this machine: at rest, with noise of known size. Registers as in RM-MPU-6000A. */
 #ifndef WIRE_H
 #define WIRE_H
 
