@@ -21,10 +21,9 @@ from collections.abc import Callable
 from functools import wraps
 from importlib import import_module
 from importlib.util import find_spec
-from inspect import Parameter, signature
 from itertools import islice
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 #: File of each verb; it has a function of its name.
 VERBS = {path.stem: path for path in sorted((Path(__file__).parent / "verbs").glob("[a-z]*.py"))}
@@ -58,7 +57,7 @@ def __getattr__(name: str) -> Any:
 
 
 class Names(dict[str, Any]):
-    """The names of a verb's file. What it imports for type checkers alone has its name as it is."""
+    """The names of a verb's file. One that it imports for type checkers alone is any type."""
 
     def __missing__(self, name: str) -> Any:
         return getattr(builtins, name, Any)
@@ -66,6 +65,9 @@ class Names(dict[str, Any]):
 
 def _plain(module: Any, name: str) -> Callable[..., Any]:
     """A verb whose signature has the types alone, without the options of the command line, and each keyword."""
+    from inspect import Parameter, signature
+    from typing import Annotated, get_args, get_origin, get_type_hints
+
     verb = getattr(module, name)
     shown = []
     for one in signature(verb).parameters.values():

@@ -186,7 +186,10 @@ class Document(Object):
         return console
 
     def __repr__(self) -> str:
-        return str(self._console().file.getvalue()).rstrip("\n")
+        try:
+            return str(self._console().file.getvalue()).rstrip("\n")
+        except (KeyError, NotImplementedError):  # a part of a document, or one that has no table
+            return super().__repr__()
 
     def _repr_html_(self) -> str:
         form = '<pre style="white-space:pre;overflow-x:auto;line-height:normal">{code}</pre>'
@@ -302,7 +305,7 @@ class Diagnosis(Document):
                     yield {**of, "key": key, **(value if isinstance(value, Mapping) else {"median": value})}
 
 
-class Comparison(Object):
+class Comparison(Document):
     """`selfcal.compare/1`. By axis the list of its changes, or {"error": ..., "changes": [...]}; `verdicts` by
     recording and axis."""
 
@@ -310,3 +313,10 @@ class Comparison(Object):
     recordings: list[str]
     axes: dict[str, Any]
     verdicts: dict[str, dict[str, Any]]
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        """Axis and each of its changes; of an axis that cannot be compared the reason."""
+        for name, axis in self["axes"].items():
+            if isinstance(axis, Mapping):
+                yield {"axis": name, "error": axis["error"]}
+            yield from ({"axis": name, **change} for change in (axis["changes"] if isinstance(axis, Mapping) else axis))
