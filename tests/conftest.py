@@ -16,12 +16,12 @@ import sys
 import tempfile
 import traceback
 import warnings
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from contextlib import redirect_stderr
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import numpy as np
 import pytest
@@ -283,3 +283,16 @@ def worst_difference(report: AxisResult, exact: AxisResult) -> tuple[float, floa
             sd.append(abs(found.sd / value.sd - 1.0))
     probability = [abs(p - report.probability[law]) for law, p in exact.probability.items()]
     return float(np.max(evidence)), float(np.max(probability)), float(np.max(mean)), float(np.max(sd))
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    """Debian's chromium, headless."""
+    program = shutil.which("chromium")
+    if program is None:
+        pytest.skip("NO BROWSER: the page is not looked at in one (apt-get install chromium)")
+    api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER: playwright is missing (make setup-dev)")
+    with api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=program)
+        yield chromium
+        chromium.close()

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from selfcal.base import units
-from selfcal.base.results import IdentifiedAxis
 from selfcal.diagnosis.causes import colored_noise
 from selfcal.likelihood.state import NET_LEAST
 from selfcal.readings.lattice import WHITE_REMAINDERS, Lattice, lattice_of
+from selfcal.show.results import IdentifiedAxis
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 

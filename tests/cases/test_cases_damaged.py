@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 
 from selfcal.base.errors import UserError
-from selfcal.base.results import Recording as Entry
 from selfcal.logs.recording import Recording, load
+from selfcal.show.results import Recording as Entry
 from selfcal.verbs.identify import identify
 
 from conftest import case_records, run, shared_case

@@ -209,7 +209,7 @@ def test_half_of_the_evidence_carries_over(law: str) -> None:
         second = noise(random, law, round(SECONDS), 1.0) + swing.drawn(random, round(SECONDS), 1.0)
         there = swing.evidence(recorded(second, 1.0)[0])
         found = diagnose_record(record, ["gx"])
-        tree = extended(model, record, found)
+        tree, _ = extended(model, record, found)
         names = [finding.look.cause for finding in found["gx"].by_gain]
         log = Recording(Path("second"), 1.0, {"gx": Column("gx", "deg/s", second)}, np.zeros(second.size, np.int64), {})
         gains = dict(zip(names, carried.gains(model, tree, record, found, log)["gx"][0], strict=True))

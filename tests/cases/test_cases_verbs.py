@@ -516,7 +516,7 @@ def test_work_is_bounded_and_said(
     axis = document["axes"]["gx"]
     assert axis["unfinished"] == loop.SPENT
     capsys.readouterr()
-    diagnose_module.show(document)
+    show(document, details=True)
     so_far = "inadequate" if axis["findings"] else "nothing found so far"
     assert f"gx [deg/s]: {so_far}, not finished: {loop.SPENT}" in capsys.readouterr().out
     assert len(axis["findings"]) < 2 or axis["findings"] != whole["findings"]

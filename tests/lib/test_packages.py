@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import math
 import os
 import re
 import shutil
@@ -230,23 +231,47 @@ def test_zephyr(tables: Path, tmp_path: Path) -> None:
     assert biases(call(tmp_path / "product")) == list(OWN_AXES)
 
 
-def test_arduino(tmp_path: Path) -> None:
-    """Arduino's flat layout: files at the top of a library's folder are compiled, each with the tops of the libraries
-    as places of headers; a sketch is C++. Truth: the bias that the sketch simulates, once a minute."""
-    libraries = tmp_path / "libraries"
+def sketch(name: str, tables: Path, folder: Path) -> str:
+    """What a sketch prints in ten minutes, built by Arduino's flat layout: files at the top of a library's folder are
+    compiled, each with the tops of the libraries as places of headers; a sketch is C++."""
+    libraries = folder / "libraries"
     shutil.copytree(LIBRARY, libraries / "selfcal", ignore=shutil.ignore_patterns("utility"))
-    shutil.copytree(LIBRARY / "default", libraries / "selfcal_tables")
-    shutil.copyfile(LIBRARY / "examples" / "rest" / "rest.ino", tmp_path / "sketch.cpp")
+    shutil.copytree(tables, libraries / "selfcal_tables")
+    shutil.copyfile(LIBRARY / "examples" / name / f"{name}.ino", folder / "sketch.cpp")
     sources = [*sorted((libraries / "selfcal").glob("*.c")), *sorted((libraries / "selfcal_tables").glob("*.c"))]
     places = ("-I", libraries / "selfcal", "-I", libraries / "selfcal_tables")
-    (tmp_path / "objects").mkdir()
-    call("cc", "-std=gnu11", "-c", *places, *sources, cwd=tmp_path / "objects")
-    objects = sorted((tmp_path / "objects").iterdir())
+    (folder / "objects").mkdir()
+    call("cc", "-std=gnu11", "-c", *places, *sources, cwd=folder / "objects")
+    objects = sorted((folder / "objects").iterdir())
     call(
-        "c++", "-std=gnu++17", *places, "-I", CONSUMER / "arduino", "-I", tmp_path, CONSUMER / "arduino" / "main.cpp",
-        *objects, "-lm", "-o", tmp_path / "sketch",
+        "c++", "-std=gnu++17", "-Wall", "-Wextra", *places, "-I", CONSUMER / "arduino", "-I", folder,
+        CONSUMER / "arduino" / "main.cpp", *objects, "-lm", "-o", folder / "sketch",
     )  # fmt: skip
-    assert len(biases(call(tmp_path / "sketch"))) == 10
+    return call(folder / "sketch")
+
+
+def test_an_mpu6050_prints_its_data_sheet(tmp_path: Path) -> None:
+    """Truth: the noise and the bias of the sensor on the stand-in's bus (Wire.h), at 100 Hz: N = sd / 10 in 60 times
+    deg/s or m/s^2. The last minute's numbers within 4.5 sd: twelve of them, and rounding adds 0.3 % to N."""
+    codegen("mpu6050", tmp_path / "tables", rate=100.0, target="cortex-m4f")
+    lines = sketch("mpu6050", tmp_path / "tables", tmp_path).splitlines()
+    assert len(lines) == 60
+    mean, sd = (196.5, -655.0, 40.0, 0.0, 120.0, 16384.0), (6.0, 6.0, 6.0, 40.0, 40.0, 40.0)
+    for k, line in enumerate(lines[-6:]):
+        unit = 1.0 / 131.0 if k < 3 else 9.80665 / 16384.0
+        found = re.fullmatch(
+            r"(\w\w): [AV]RW (\S+) \[(\S+), (\S+)\] \S+, RRW [^,]+(?:, [^,]+)?, bias (\S+) \+- (\S+) (deg/s|m/s\^2)",
+            line,
+        )
+        assert found is not None and found[1] == ("gx", "gy", "gz", "ax", "ay", "az")[k], line
+        middle, low, high, bias, of_bias = map(float, found.groups()[1:6])
+        assert abs(math.log(middle / (6.0 * sd[k] * unit))) < 4.5 * math.log(high / low) / 3.29 + 0.003, line
+        assert abs(bias - mean[k] * unit) < 4.5 * of_bias, line
+
+
+def test_arduino(tmp_path: Path) -> None:
+    """Truth: the bias that the sketch simulates, once a minute."""
+    assert len(biases(sketch("rest", LIBRARY / "default", tmp_path))) == 10
     properties = dict(
         line.split("=", 1) for line in (LIBRARY / "library.properties").read_text(encoding="utf-8").splitlines()
     )

@@ -15,6 +15,7 @@ import subprocess
 import sys
 import tempfile
 import textwrap
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -198,6 +199,17 @@ def test_every_command_of_the_documents_runs(name: str, request: pytest.FixtureR
         verb.make_context(words[0], words[1:])
         if CASE_RECORDS and command not in ran and not excused(command):
             shell(f".venv/bin/selfcal {command}", request.getfixturevalue("desk"))
+
+
+def test_every_extra_of_the_documents_exists() -> None:
+    """`selfcal[ros,px4]`, and in place of the name a wheel's."""
+    known = tomllib.loads((ROOT / "tools" / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    named = [
+        re.findall(r"selfcal(?:-\S+\.whl)?\[([a-z0-9,]+)\]", (ROOT / name).read_text(encoding="utf-8"))
+        for name in DOCUMENTS
+    ]
+    extras = {extra for texts in named for text in texts for extra in text.split(",")}
+    assert extras and extras <= known["optional-dependencies"].keys() | {"name"}
 
 
 def test_the_sizes_of_the_images_are_those_of_the_bench() -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ import yaml
 from selfcal.adequacy.overbound import overbound, upper_limit
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
-from selfcal.show.export import FORMS
+from selfcal.show.export import FORMS, Kind
 from selfcal.verbs.identify import identify
 
 RATE = 4.0
@@ -46,21 +48,57 @@ def test_kalibr_is_in_si_and_names_the_worst_axis(log: Path, tmp_path: Path) -> 
     assert gyro == pytest.approx(0.1 / math.sqrt(RATE), rel=4 / math.sqrt(2000))
 
 
-def test_px4_and_vins_per_sample_values_follow_from_the_densities(log: Path, tmp_path: Path) -> None:
-    kalibr, px4, vins = (tmp_path / name for name in ("k", "p", "v"))
-    for form, out in (("kalibr", kalibr), ("px4", px4), ("vins", vins)):
-        identify(log, export=(form, out))
-    densities = yaml.safe_load(kalibr.read_text())
-    parameters = dict(re.findall(r"param set (\S+) (\S+)", px4.read_text()))
-    # noise = N / sqrt(dt), bias noise = K / sqrt(dt)
-    n, k = densities["gyroscope_noise_density"], densities["gyroscope_random_walk"]
-    assert float(parameters["EKF2_GYR_NOISE"]) == pytest.approx(n * math.sqrt(RATE), rel=1e-5)
-    assert float(parameters["EKF2_GYR_B_NOISE"]) == pytest.approx(k * math.sqrt(RATE), rel=1e-5)
-    found = re.search(r"gyr_w: (\S+) .*?Hz: (\S+) rad/s", vins.read_text())
-    assert found is not None
-    # a random walk takes steps of K sqrt(dt)
-    assert float(found[1]) == pytest.approx(k, rel=1e-5)
-    assert float(found[2]) == pytest.approx(k / math.sqrt(RATE), rel=1e-5)
+def _kalibr(of: Mapping[str, float], dt: float) -> tuple[float, float]:
+    """kalibr_common/ConfigReader.py: noise density / sqrt(dt) a sample; the walk is continuous."""
+    return (of["gyroscope_noise_density"] / dt**0.5 * dt) ** 2, of["gyroscope_random_walk"] ** 2 * dt
+
+
+#: By format what its reader adds in a step: the gyro's numbers by their names in the file, and the step, s, give the
+#: variance of an angle and of the bias. Each formula is the reader's own, with its place.
+READERS: dict[str, Callable[[Mapping[str, float], float], tuple[float, float]]] = {
+    "kalibr": _kalibr,
+    "allan_variance_ros": _kalibr,  # the package's file is kalibr's
+    # open_vins, ov_msckf/src/state/Propagator.cpp: Qc = sigma_w^2 / dt, through G = dt; sigma_wb^2 dt
+    "openvins": lambda of, dt: (of["gyroscope_noise_density"] ** 2 / dt * dt**2, of["gyroscope_random_walk"] ** 2 * dt),
+    # ORB_SLAM3, src/Tracking.cc: sf = sqrt(IMU.Frequency), Calib(Ng sf, Na sf, Ngw / sf, Naw / sf); ImuTypes.cc: B = dt
+    "orbslam3": lambda of, dt: (
+        (of["IMU.NoiseGyro"] * of["IMU.Frequency"] ** 0.5 * dt) ** 2,
+        of["IMU.GyroWalk"] ** 2 / of["IMU.Frequency"],
+    ),
+    # VINS, factor/integration_base.h: V has 0.5 dt for either reading's noise, and dt for the walk's
+    "vins": lambda of, dt: (2.0 * (0.5 * dt * of["gyr_n"]) ** 2, (dt * of["gyr_w"]) ** 2),
+    # PX4, src/modules/ekf2/EKF/covariance.cpp: sq(dt gyro_noise), sq(dt gyro_bias_p_noise); dt is EKF2_PREDICT_US
+    "px4": lambda of, dt: ((dt * of["EKF2_GYR_NOISE"]) ** 2, (dt * of["EKF2_GYR_B_NOISE"]) ** 2),
+    # rotors_gazebo_plugins/src/gazebo_imu_plugin.cpp: density / sqrt(dt); sqrt(-w^2 tau / 2 (exp(-2 dt / tau) - 1))
+    "rotors": lambda of, dt: (
+        (of["gyroscopeNoiseDensity"] / dt**0.5 * dt) ** 2,
+        -(of["gyroscopeRandomWalk"] ** 2)
+        * of["gyroscopeBiasCorrelationTime"]
+        / 2.0
+        * math.expm1(-2.0 * dt / of["gyroscopeBiasCorrelationTime"]),
+    ),
+}
+
+
+@pytest.mark.parametrize("rate_hz", [4.0, 61.7, 250.0])
+@pytest.mark.parametrize("form", FORMS)
+def test_its_reader_has_the_densities(form: str, rate_hz: float) -> None:
+    """N^2 dt and K^2 dt a step of whoever reads the file, at its own step, whatever rate the recording has. Of RotorS'
+    Gauss-Markov drift what it does in a step beside a correlation time of 40 s; six digits are written."""
+    N, K, alpha = 3.1e-4, 7.7e-6, 0.025
+    spread = {"N": N, "K": K, "sigma_m": K / math.sqrt(2.0 * alpha), "alpha": alpha}
+    gyro = Kind(spread, {"N": 2.0 * N, "K": 2.0 * K}, 0.95, False, ())
+    text = FORMS[form](
+        gyro, replace(gyro, median={**spread, "N": 9.0 * N}), {"path": "a", "rate_hz": rate_hz, "duration_s": 1.0}
+    )
+    pairs = re.findall(r"<(\w+)>([-+.e\d]+)<|^(?:param set )?\s*([\w.]+):? ([-+.e\d]+)\s+#", text, re.MULTILINE)
+    found = {one or other: float(value or number) for one, value, other, number in pairs}
+    dt = 0.01 if form == "px4" else 1.0 / rate_hz
+    angle, bias = READERS[form](found, dt)
+    assert angle == pytest.approx(N**2 * dt, rel=1e-5)
+    assert bias == pytest.approx(K**2 * dt, rel=1e-5 + alpha * dt)
+    if form in ("px4", "vins"):  # the file's words say how to change the step
+        assert ("EKF2_PREDICT_US 10000" if form == "px4" else f"of an IMU at {rate_hz:g} Hz") in text
 
 
 #: What ov_core::YamlParser and Kalibr's intrinsics are asked for (open_vins, config/rpng_sim/kalibr_imu_chain.yaml).
@@ -165,7 +203,7 @@ def test_an_overbound_takes_the_medians_place(log: Path, tmp_path: Path) -> None
     assert f"<gyroscopeRandomWalk>{k:.6e}<" in xml
     assert "<gyroscopeBiasCorrelationTime>1.000000e+09<" in xml  # a walk, not a Gauss-Markov drift
     parameters = dict(re.findall(r"param set (\S+) (\S+)", px4.read_text()))
-    assert float(parameters["EKF2_GYR_NOISE"]) == pytest.approx(n * math.sqrt(RATE), rel=1e-5)
+    assert float(parameters["EKF2_GYR_NOISE"]) == pytest.approx(n * math.sqrt(100.0), rel=1e-5)
     for level in (0.4, 1.0, math.nan):
         with pytest.raises(UserError, match=r"--overbound must be 0\.5 to 0\.99999"):
             identify(log, export=("kalibr", kalibr), overbound=level)

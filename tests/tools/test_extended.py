@@ -84,7 +84,7 @@ def case(cause: str, seed: int, folder: Path) -> Case:
     simulate(model, log, seed=seed, effects=[f"{cause}:{text},axis=gx"])
     record = of_recording(load(log), Model.load(model))
     found = diagnose_record(record, ["gx"])
-    return Case(log, base, found["gx"], extended(Model.load(model), record, found))
+    return Case(log, base, found["gx"], extended(Model.load(model), record, found)[0])
 
 
 def averaged(state: State, sd: list[float]) -> float:

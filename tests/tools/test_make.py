@@ -14,7 +14,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+import selfcal
 from selfcal.logs import recording
 from selfcal.model.file import Model
 from selfcal.wire import replay as verb
@@ -297,3 +299,27 @@ def test_compiler_commands_hold_no_path_of_the_checkout() -> None:
     compiled = [line for line in said.splitlines() if " -c " in line and ("/objects && " in line or "host/" in line)]
     assert compiled
     assert not [line for line in compiled if str(ROOT) in line]
+
+
+def test_the_files_for_the_host_name_what_there_is() -> None:
+    """Each `make` target, folder and extra of the CI file, of pre-commit, of the container and of the forms."""
+    rules = "".join(path.read_text(encoding="utf-8") for path in [ROOT / "Makefile", *ROOT.glob("*/**/*.mk")])
+    files = [
+        *(ROOT / ".github").rglob("*.yml"),
+        *(ROOT / name for name in (".pre-commit-config.yaml", ".devcontainer/devcontainer.json", "CITATION.cff")),
+    ]
+    named = set()
+    for path in files:
+        text = path.read_text(encoding="utf-8")
+        assert isinstance(yaml.safe_load(text), dict), path  # JSON is YAML
+        named |= set(re.findall(r"make ([a-z][a-z-]*)(?=\n|\"|$)", text, re.MULTILINE))
+        for place in re.findall(r"tools/setup/\S+\.sh", text):
+            assert (ROOT / place).exists()
+    assert {"check", "test", "docs", "setup-dev", "check-format"} <= named
+    for target in named:  # `setup-dev` of a list of groups
+        group = re.search(r"^OPTIONAL := (.*)$", rules, re.MULTILINE)
+        assert group is not None
+        groups = [f"setup-{one}" for one in group[1].split()]
+        assert target in groups or re.search(rf"(^|[ :]){target}\b", rules, re.MULTILINE), target
+    verbs = re.findall(r"selfcal (\w+) ", (ROOT / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8"))
+    assert verbs and set(verbs) <= set(selfcal.VERBS)

@@ -11,8 +11,7 @@ import json
 import math
 import re
 import shlex
-import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from html.parser import HTMLParser
 from itertools import pairwise
@@ -513,19 +512,6 @@ def test_a_figure_of_nothing_but_gaps_draws() -> None:
 
 
 # ------------------------------------------------------------------------------------------------------ in a browser
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    """Debian's chromium, headless."""
-    program = shutil.which("chromium")
-    if program is None:
-        pytest.skip("NO BROWSER: the page is not looked at in one (apt-get install chromium)")
-    api = pytest.importorskip("playwright.sync_api", reason="NO BROWSER: playwright is missing (make setup-dev)")
-    with api.sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=program)
-        yield chromium
-        chromium.close()
 
 
 @pytest.fixture(scope="module")

@@ -15,10 +15,12 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
+from test_cases_priors import at_rest, write
 
 from selfcal.base.errors import UserError
 from selfcal.batch.plan import LEAST, Wish, _half_interval, coefficient_rows, rows_of
 from selfcal.model.file import DEFAULT, Model
+from selfcal.verbs.part import part as part_of_log
 from selfcal.verbs.plan import plan
 
 from conftest import case_records, run
@@ -86,6 +88,22 @@ def test_the_planned_length_suffices(tmp_path: Path, name: str) -> None:
         if reached > 0.9 + off[1] and samples > LEAST:
             assert share(wish, math.floor(0.97 * samples)) <= 0.9 + off[1], (text, reached)
     assert document["duration_s"] == max(one["duration_s"] for one in document["wishes"])
+
+
+def test_the_plan_of_a_recording_is_that_of_its_part(tmp_path: Path) -> None:
+    """`part` then `plan`, and `plan LOG`, say the same; and nearly what the true part's plan says. By the
+    information the record knows K/N to 10 % (sd), and the length goes with N/K. Ensembles of 20 scatter by 15 %."""
+    truth: dict[str, Any] = {"hypothesis": "random_walk", "N": 0.013, "K": 9e-4}
+    log = write(tmp_path / "rest.npz", 5.0, gz=("deg/s", at_rest(5, 0.013, 9e-4, 5.0, 3600.0, 0.2)))
+    part_of_log([log], tmp_path / "own.yaml")
+    wants = ["K within 35 %"]
+    own, direct = (plan(one, want=wants, records=20) for one in (tmp_path / "own.yaml", log))
+    known = plan(part(tmp_path, **truth), want=wants, records=20)
+    assert own["wishes"] == direct["wishes"] and direct["axis"] == "gz"
+    for one, other in zip(own["wishes"], known["wishes"], strict=True):
+        assert abs(math.log(one["duration_s"] / other["duration_s"])) < 3.0 * math.hypot(0.1, 0.15)
+    with pytest.raises(UserError, match=r"the options of a recording .* are for plan LOG"):
+        plan(tmp_path / "own.yaml", want=wants, rate=10.0)
 
 
 def test_the_information_is_that_of_known_cases() -> None:

@@ -5,6 +5,7 @@ Of intervals that hold 90 % each, 82 of 100 or more cover the truth in 99.2 % of
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -31,6 +32,7 @@ from influences import (
 from scipy.stats import binom
 
 from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
 from selfcal.readings.held import updates
 from selfcal.verbs.response import response
 
@@ -154,6 +156,25 @@ def test_the_source_is_not_told_where_the_input_is_not_first(draw: Callable[[Dra
         draw(drawn)
         verdicts.append(response(drawn.write(tmp_path / "log.npz"), input="gy", output="gx")["source"]["verdict"])
     assert verdicts.count("cannot tell") >= at_least(0.95, count), verdicts
+
+
+def test_no_axis_acts_on_a_temperature(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both at once: of two axes either may act, of a temperature and an axis the first alone. In a pipe of 40 columns
+    no number is cut."""
+    random = np.random.default_rng(12)
+    slow = np.cumsum(0.04 * random.standard_normal(400))
+    gx = 0.3 * slow + 0.01 * random.standard_normal(400)
+    monkeypatch.setenv("COLUMNS", "40")
+    for name, unit, said in (
+        ("temp", "degC", "the input may act, or a common cause on both"),
+        ("gy", "deg/s", "either may act on the other, or a common cause on both"),
+    ):
+        save(tmp_path / "log.npz", {"gx": ("deg/s", gx), name: (unit, slow)}, 1.0)
+        done = run("response", "log.npz", "--input", name, "--output", "gx", "--json", "r.json", cwd=tmp_path)
+        found = json.loads((tmp_path / "r.json").read_text(encoding="utf-8"))
+        assert found["source"] == {"verdict": "cannot tell", "reason": f"both move at once: {said}"}
+        gain = found["estimate"]["gain"]
+        assert "…" not in done.stdout and f"{gain['q95']:.4g} " in done.stdout and f" {gain['unit']} " in done.stdout
 
 
 def test_the_ratio_of_spectra_follows_a_known_lag(tmp_path: Path) -> None:

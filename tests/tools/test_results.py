@@ -8,7 +8,7 @@ import pickle
 
 import pytest
 
-from selfcal.base.results import Comparison, Diagnosis, Finding, Identification, IdentifiedAxis, Posterior
+from selfcal.show.results import Comparison, Diagnosis, Finding, Identification, IdentifiedAxis, Posterior
 
 POSTERIOR = {"mean": 1.0, "median": 1.0, "sd": 0.1, "q05": 0.8, "q95": 1.2, "unit": "deg/s", "identified": True}
 DOCUMENT = {
@@ -31,6 +31,7 @@ def test_a_result_is_its_document() -> None:
     found = Identification(DOCUMENT)
     assert found == DOCUMENT
     assert json.loads(json.dumps(found)) == DOCUMENT
+    assert "'random_walk': 0.8" in repr(found)  # a part of a document is no table
     for again in (copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
         assert again == found and isinstance(again.axes["gx"], IdentifiedAxis)
     gx = found.axes["gx"]
@@ -59,3 +60,12 @@ def test_findings_and_changes() -> None:
     changes = [{"from": "a", "to": "b", "quantity": "N"}]
     comparison = Comparison({"schema": "selfcal.compare/1", "axes": {"gx": changes}, "verdicts": {}})
     assert comparison.axes["gx"] == changes
+    pytest.importorskip("pandas")
+    part = Comparison({"axes": {"gx": changes, "gy": {"error": "too short", "changes": changes}}})
+    assert part.to_frame().fillna("").to_dict("list") == {
+        "axis": ["gx", "gy", "gy"],
+        "from": ["a", "", "a"],
+        "to": ["b", "", "b"],
+        "quantity": ["N", "", "N"],
+        "error": ["", "too short", ""],
+    }

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -16,6 +18,7 @@ from scipy.stats import multivariate_normal
 from selfcal.adequacy.allan import relative_variance
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.model.laws import NAMED
 from selfcal.studies import methods as registry
@@ -30,7 +33,7 @@ from selfcal.studies.methods.wavelets import covariance
 from selfcal.studies.rivals import longest_stretch, problem_of, show
 from selfcal.verbs.rivals import rivals
 
-from conftest import ROOT, run, shared_recording
+from conftest import COMMAND, ROOT, run, shared_recording
 
 ENSEMBLE = ROOT / "tools" / "selfcal" / "model" / "models" / "ensemble.yaml"
 SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
@@ -358,3 +361,28 @@ def test_wavelet_moments_beside_simts() -> None:
             assert found["N"].value == pytest.approx(N, rel=0.02)
         assert 1 / 1.5 < found["sigma_m"].value / sigma_m < 1.5
         assert 1 / 5.0 < 1.0 / found["alpha"].value / T < 5.0
+
+
+def test_another_packages_method_joins(tmp_path: Path) -> None:
+    """By its entry point, as pip lays it down: its numbers in the recording's unit, its faults in its place."""
+    info = tmp_path / "own-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: own\nVersion: 1.0\n")
+    names = ("mean", "none", "odd", "library")
+    (info / "entry_points.txt").write_text("[selfcal.rivals]\n" + "".join(f"{name} = own:{name}\n" for name in names))
+    (tmp_path / "own.py").write_text(
+        "from selfcal.studies.methods import Answer, Value\n"
+        "def mean(problem): return Answer({'constant': {'N': Value(problem.dt_s * problem.y.size)}})\n"
+        "def none(problem): return None\n"
+        "def odd(problem): return Answer({'constant': {'wind': Value(1.0)}})\n"
+    )
+    save(tmp_path / "log.npz", {"gx": ("rad/s", 0.01 * np.random.default_rng(3).standard_normal(300))}, 1.0)
+    found = subprocess.run(
+        [*COMMAND, "rivals", "log.npz", *(f"--only={name}" for name in names), "--json", "-"],
+        cwd=tmp_path, capture_output=True, text=True, check=True, env=os.environ | {"PYTHONPATH": str(tmp_path)},
+    )  # fmt: skip
+    rows = json.loads(found.stdout)["axes"]["gx"]["rivals"]
+    value = rows["mean"]["parameters"]["constant"]["N"]
+    assert value["value"] == pytest.approx(300.0 * math.pi / 180.0) and value["unit"] == "rad/s/sqrt(Hz)"
+    assert rows["none"]["error"] == "it returned NoneType: a rival returns a selfcal.studies.methods.Answer"
+    assert "wind" in rows["odd"]["error"] and rows["library"]["title"] == "selfcal, the library"

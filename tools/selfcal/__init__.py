@@ -1,7 +1,24 @@
-"""selfcal: an inertial sensor at rest identifies its own error model. Every verb of the command is a function here."""
+"""An inertial sensor at rest identifies its own error model. Every verb of the command is a function here.
+
+    import numpy as np
+    import selfcal
+
+    random = np.random.default_rng(1)
+    gyro = 0.02 * random.standard_normal((6000, 3))  # 10 minutes at 10 Hz; a file's name or a data frame will do
+    found = selfcal.identify(gyro, rate_hz=10.0, units="deg/s")
+    print(found)  # the command's table
+    print(found.axes["gx"].law, found.axes["gx"].bias_now.mean)
+    found.plot("allan.png")  # in a notebook: found.plot()
+    print(selfcal.diagnose(gyro, axes=["gx"], rate_hz=10.0, units="deg/s"))
+
+`help(selfcal.identify)` has its keywords. Errors that you can put right are `selfcal.UserError`.
+"""
 
 from __future__ import annotations
 
+import builtins
+from collections.abc import Callable
+from functools import wraps
 from importlib import import_module
 from importlib.util import find_spec
 from itertools import islice
@@ -12,7 +29,12 @@ from typing import Any
 VERBS = {path.stem: path for path in sorted((Path(__file__).parent / "verbs").glob("[a-z]*.py"))}
 
 #: What scripts take beside the verbs, and where it is.
-_OTHERS = {"load": "logs.recording", "save": "logs.recording", "UserError": "base.errors"}
+_OTHERS = {
+    "load": "logs.recording",
+    "save": "logs.recording",
+    "Recording": "logs.recording",
+    "UserError": "base.errors",
+}
 #: Lines of /proc/cpuinfo that tell of the first core.
 MOST_LINES = 100
 
@@ -20,7 +42,8 @@ MOST_LINES = 100
 def __getattr__(name: str) -> Any:
     """The verb called `name`, imported when it is first asked for so that the command starts at once."""
     if name in VERBS:
-        return getattr(import_module(f"selfcal.verbs.{name}"), name)
+        globals()[name] = _plain(import_module(f"selfcal.verbs.{name}"), name)
+        return globals()[name]
     if name in _OTHERS:
         return getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
     if name == "_library32":
@@ -31,6 +54,38 @@ def __getattr__(name: str) -> Any:
 
         return version("selfcal")
     raise AttributeError(f"module 'selfcal' has no attribute '{name}'")
+
+
+class Names(dict[str, Any]):
+    """The names of a verb's file. One that it imports for type checkers alone is any type."""
+
+    def __missing__(self, name: str) -> Any:
+        return getattr(builtins, name, Any)
+
+
+def _plain(module: Any, name: str) -> Callable[..., Any]:
+    """A verb whose signature has the types alone, without the options of the command line, and each keyword."""
+    from inspect import Parameter, signature
+    from typing import Annotated, get_args, get_origin, get_type_hints
+
+    verb = getattr(module, name)
+    shown = []
+    for one in signature(verb).parameters.values():
+        hint = eval(one.annotation, {}, Names(vars(module)))  # our own source
+        if one.kind is not Parameter.VAR_KEYWORD:
+            of = get_args(hint)[0] if get_origin(hint) is Annotated else one.annotation
+            shown.append(one.replace(annotation=of))
+            continue
+        for key, of in get_type_hints(get_args(hint)[0]).items():
+            shown.append(Parameter(key, Parameter.KEYWORD_ONLY, default=None, annotation=of))
+
+    @wraps(verb)
+    def call(*arguments: Any, **options: Any) -> Any:
+        return verb(*arguments, **options)
+
+    call.__signature__ = signature(verb).replace(parameters=shown)  # type: ignore[attr-defined]
+    call.__module__ = __name__
+    return call
 
 
 def _fma() -> bool:
@@ -46,3 +101,6 @@ def _fma() -> bool:
 
 def __dir__() -> list[str]:
     return [*globals(), *VERBS, *_OTHERS, "__version__"]
+
+
+__all__ = [*VERBS, *_OTHERS]  # noqa: PLE0604 (their names)

@@ -64,7 +64,7 @@ def _command(name: str) -> Any:
     for own in signature(verb).parameters.values():
         hint = own.annotation
         if isinstance(hint, str):  # `from __future__ import annotations`; our own source, not a user's
-            hint = eval(hint, vars(module))
+            hint = eval(hint, {}, selfcal.Names(vars(module)))
         fields = {own.name: (hint, own.default)}
         if own.kind is Parameter.VAR_KEYWORD:  # Unpack[TypedDict]: each of its keys is an option
             fields = {key: (one, None) for key, one in get_type_hints(get_args(hint)[0], include_extras=True).items()}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import math
 import os
@@ -15,10 +16,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from selfcal.base.errors import UserError
 from selfcal.base.limits import STREAMS, named_pipe
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 
 def check_place(path: Path | str) -> None:
@@ -154,6 +158,9 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
+#: Columns of a table at most, and of what is no terminal.
+TABLE_WIDTH = 140
+_NO_WIDTH = 1000
 #: What a picture's name may end in.
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
@@ -164,15 +171,37 @@ def check_picture(path: Path | str) -> None:
         raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 
 
+def console_of(*, to_stderr: bool = False, fits: bool = False) -> Console:
+    """Where tables are printed. No number is cut: a pipe has no width, and a narrow terminal wraps the lines of a table
+    that does not choose its columns by the width (`fits`)."""
+    from rich.console import Console
+
+    console = Console(stderr=to_stderr)
+    if not console.is_terminal:
+        console.width = _NO_WIDTH
+    elif not fits:
+        console.width = max(console.width, TABLE_WIDTH)
+    return console
+
+
 def plotter() -> Any:
     """matplotlib's pyplot, without a screen. Its settings are the user's own: those of the folder that the user is in,
     where files of strangers may lie, would be taken first."""
     with contextlib.chdir("/"):
         import matplotlib
-    matplotlib.use("Agg")
+    if "matplotlib.pyplot" not in sys.modules and not os.environ.get("MPLBACKEND", "").startswith("module:"):
+        matplotlib.use("Agg")  # a notebook has its own
     from matplotlib import pyplot
 
     return pyplot
+
+
+def png_of(figure: Any, dpi: int) -> bytes:
+    """A figure as PNG; it is closed."""
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=dpi)
+    plotter().close(figure)
+    return stream.getvalue()
 
 
 def save_picture(figure: Any, path: Path | str, dpi: int) -> None:

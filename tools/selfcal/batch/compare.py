@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from selfcal.bank.result import HALF_90
 from selfcal.base.errors import printable
+from selfcal.base.output import console_of
 
 SCHEMA = "selfcal.compare/1"
 #: A difference counts from so many standard deviations on: once in 1600 quantities by chance.
@@ -130,7 +130,7 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """One line a change."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     table = Table(box=box.SIMPLE_HEAD, title="changes beyond what the recordings leave open", title_justify="left")
     for heading in ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings"):
         table.add_column(heading, no_wrap=True)

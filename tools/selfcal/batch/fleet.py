@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
-
 from selfcal.base.errors import printable
+from selfcal.base.output import console_of
 from selfcal.batch.fail_on import outcome
 from selfcal.batch.table import Unit
 from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
@@ -87,7 +86,7 @@ def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What a person reads: how many, and by name the devices that need a look."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     for line in _lines(document):
         console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 

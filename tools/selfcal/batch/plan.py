@@ -23,14 +23,13 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
 
 from selfcal.adequacy.allan import information_of, terms_of
 from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, short
-from selfcal.base.output import plotter, save_picture
+from selfcal.base.output import console_of, plotter, save_picture
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.simulate import truth_of
@@ -164,7 +163,8 @@ class Ensemble:
         if metric.size < LEAST_SHARE * len(self.seeds):
             raise UserError(
                 f"--want '{self.wishes[k].text}': hardly a part of {self.model.path} has a law with "
-                f"{self.wishes[k].parameter}: state `hypothesis` under simulate.axes.{self.axis}"
+                f"{self.wishes[k].parameter} on {self.axis}: state `hypothesis` under simulate.axes.{self.axis}, "
+                "of a recording in the file that `part` writes"
             )
         return math.log(max(float(np.quantile(metric, SHARE)), TINY) / self.wishes[k].most)
 
@@ -352,7 +352,7 @@ def picture(document: Mapping[str, Any], path: Path | str) -> None:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """How long for each wish, in all, and what another rate would change."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     for line in _lines(document):
         console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 

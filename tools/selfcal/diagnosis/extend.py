@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from selfcal.adequacy.part import read_out, rounding, without
 from selfcal.bank.priors import state_own
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError, remark
@@ -23,7 +24,7 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import finish
 from selfcal.likelihood.state import Regressor as Column
-from selfcal.model.file import MOST_COLUMNS, MOST_STATED, SMALLEST, Model
+from selfcal.model.file import LONGEST_TEXT, MOST_COLUMNS, MOST_STATED, SMALLEST, Model
 from selfcal.model.forms import NUMBER, formed
 from selfcal.model.laws import averaged
 from selfcal.model.regressors import trailing_mean
@@ -36,12 +37,19 @@ HEAD = "# Written by `selfcal diagnose`"
 WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
 
-def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> dict[str, Any]:
-    """The model file's tree; `record` is the finest of those that `found` was found in. `simulate` in
-    it reproduces each axis: its law, parameters, bias and effects."""
+def extended(
+    model: Model, record: Record, found: Mapping[str, Diagnosed], sensor: str | None = None
+) -> tuple[dict[str, Any], str]:
+    """The model file's tree, and a line on its read-out; `record` is the finest of those that `found` was found in.
+    `simulate` in it reproduces each axis: its law, parameters, bias and effects. `sensor`: a name for it where nobody
+    stated a model, so that its read-out is the recording's alone."""
     tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
     tree["name"] = f"{model.name}, extended"
     state_own(tree, model)
+    if sensor is not None:
+        tree["sensor"]["name"] = remark(sensor)[:LONGEST_TEXT]
+    readings = {name: record.readings[name] for name in found if name in record.readings}
+    said = read_out(tree, model, readings, stated=sensor is None)
     kept = _regressors(model, record, found)
     if kept:
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]
@@ -57,10 +65,13 @@ def extended(model: Model, record: Record, found: Mapping[str, Diagnosed]) -> di
     tree["simulate"] = {
         "rate_hz": record.rate_hz if colored else record.recorded_hz,
         "duration_s": float(record.present.size / record.rate_hz),
-        "axes": {name: fitted_law(one, block) for name, one in found.items()},
+        "axes": {
+            name: fitted_law(one, block, rounding(tree["groups"][model.group_of(name).name], tree["sensor"]["rate_hz"]))
+            for name, one in found.items()
+        },
         "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
     }
-    return tree
+    return tree, said
 
 
 def _columns_of(entry: Mapping[str, Any]) -> int:
@@ -203,11 +214,11 @@ def _with_values(one: Diagnosed, name: str, width: float, entry: Mapping[str, An
     return finish(replace(one.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
 
 
-def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
+def fitted_law(one: Diagnosed, block: int | None = None, rounded: float = 0.0) -> dict[str, Any]:
     """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias.
 
     The fit takes the drift for a point at each of its samples, which are means of `block` others (laws.averaged), by
-    default of the recording's.
+    default of the recording's. `rounded`: density that the read-out adds by itself (part.rounding).
     """
     block = max(1, round(one.record.recorded_hz / one.record.rate_hz)) if block is None else block
     fit = one.state.best
@@ -219,8 +230,7 @@ def fitted_law(one: Diagnosed, block: int | None = None) -> dict[str, Any]:
         m = math.tanh(fit.value("color"))
         lag1 = m if fit.terms.color == "ar" else m / (1.0 + m * m)
         N *= math.sqrt((1.0 + lag1) / (1.0 - lag1))
-    # The read-out adds lsb^2 / 12 by itself.
-    N = math.sqrt(max(N * N - one.state.lsb**2 / 12.0 * fit.dt, 1e-4 * N * N))
+    N = without(N, rounded)
     drift: dict[str, Any] = {"hypothesis": "constant"}
     lacking = 0.0
     if fit.terms.walk:
@@ -329,7 +339,7 @@ def check_not_by_hand(path: Path | str) -> None:
             )
 
 
-def as_text(tree: Mapping[str, Any], source: Path | str) -> str:
-    """The file's text."""
-    head = f"{HEAD} from {remark(Path(source).name)}: the model with what was found in it.\n"
+def as_text(tree: Mapping[str, Any], source: Path | str, said: str) -> str:
+    """The file's text. `said`: of its read-out."""
+    head = f"{HEAD} from {remark(Path(source).name)}: the model with what was found in it.\n# {remark(said)}\n"
     return head + str(yaml.safe_dump(dict(tree), sort_keys=False, allow_unicode=True, width=110))

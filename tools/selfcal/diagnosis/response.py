@@ -10,12 +10,11 @@ from typing import Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
-from selfcal.base.output import plotter, save_picture
+from selfcal.base.output import console_of, plotter, save_picture
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
@@ -120,8 +119,9 @@ def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], In
     seen = transfer.empirical(u, bridged(state.y), dt)
     entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
     if shown:
+        acts_back = not any(units.same_kind(unit, side) for _, side in SIDE_CHANNELS.values())
         drawn = transfer.posterior(state, chosen, transfer.undistorted(state, given, chosen))
-        verdict, reason = transfer.source(state, u, chosen, drawn)
+        verdict, reason = transfer.source(state, u, chosen, drawn, acts_back=acts_back)
         entry |= {
             "structure": chosen.structure.name,
             "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, within)), "probability": orders},
@@ -228,7 +228,7 @@ def _empirical(found: Empirical) -> dict[str, list[float]]:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The answer in a few lines, and the table of its numbers."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
 
     def line(text: str) -> None:
         console.print(printable(text), highlight=False, markup=False, soft_wrap=True)

@@ -342,28 +342,32 @@ def undistorted(state: State, given: Input, one: Tried) -> Array:
     return found
 
 
-def source(state: State, u: Array, one: Tried, drawn: Posterior) -> tuple[str, str]:
+def source(state: State, u: Array, one: Tried, drawn: Posterior, *, acts_back: bool) -> tuple[str, str]:
     """Whether the record tells that the input acts: "input first" or "cannot tell", and the reason in words.
+    `acts_back`: the output may act on the input. No axis acts on a temperature or a supply.
 
     A common cause that reaches the input first, and all of it, always looks as the input does."""
+    feedback = "feedback, or a common cause" if acts_back else "a common cause"
     columns = one.structure.columns(one.number)
     ahead = [late(u[::-1], lag, state.dt)[::-1] for lag in _lags(u.size, state.dt)]
     both = state.scores([np.vstack([columns, column]) for column in ahead], one.fit)
     if net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST:
-        return "cannot tell", "the input's later values explain the output as well: feedback, or a common cause"
+        return "cannot tell", f"the input's later values explain the output as well: {feedback}"
     fitted = replace(state, fits=(one.fit,))
     if max(inconstancy(fitted, columns[j], np.delete(columns, j, 0)) for j in range(len(drawn.c[0]))) >= NET_LEAST:
-        return "cannot tell", "the gain depends on the frequency as in no structure: a common cause, or feedback"
+        return "cannot tell", f"the gain depends on the frequency as in no structure: {feedback}"
     if not one.structure.poles:
-        return "cannot tell", "both move at once: either may act on the other, or a common cause on both"
+        either = "either may act on the other" if acts_back else "the input may act"
+        return "cannot tell", f"both move at once: {either}, or a common cause on both"
     own = dict(zip(one.structure.keys, np.abs(drawn.c.T), strict=False))
     slower = np.mean(own.get("direct", 0.0) < own["gain"]) if "gain" in own else 0.0
     if slower < 0.5 + PROBABILITY / 2.0:
-        return "cannot tell", "the output moves before the input: feedback, or a common cause"
+        return "cannot tell", f"the output moves before the input: {feedback}"
     if "direct" in own:
         return "cannot tell", "a part comes at once, the rest late: two ways, or a common cause that both answer late"
     if one.gain - state.with_columns(ahead[int(np.argmax(state.scores(ahead, one.fit)))])[0] < ALIKE:
-        return "cannot tell", "the output may follow the input, or the input the output"
+        other = "the input the output" if acts_back else "both a common cause"
+        return "cannot tell", f"the output may follow the input, or {other}"
     return "input first", "the output follows the input; a common cause that reaches the input first looks the same"
 
 

@@ -20,7 +20,7 @@ from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,7 +42,7 @@ from selfcal.base.limits import (
 from selfcal.base.options import Scale
 from selfcal.base.output import together, whole
 from selfcal.base.units import SENSORS
-from selfcal.logs import written
+from selfcal.logs import arrays, written
 from selfcal.logs.loaders import WRITTEN, check_library, format_of
 from selfcal.logs.loaders.child import tables_of
 from selfcal.logs.loaders.damage import SOUND, Damaged, bytes_of
@@ -90,7 +90,7 @@ class Column:
     clock: Clock | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Recording:
     """A checked recording of n rows. `missing_before` int64[n]: samples missing just before each row.
 
@@ -118,6 +118,26 @@ class Recording:
     paths: tuple[Path, ...] = ()
     #: Options of the command line that it was read with, and their values, empty for a switch.
     options: tuple[tuple[str, str], ...] = ()
+
+    def __repr__(self) -> str:
+        columns = ", ".join(f"{one.name}[{one.unit}]" for one in self.columns.values())
+        return f"<Recording {self.path}: {self.samples} rows at {self.rate_hz:g} Hz, {self.duration_s:g} s: {columns}>"
+
+    @staticmethod
+    def from_arrays(
+        data: Data,
+        rate_hz: float | None = None,
+        units: Mapping[str, str] | str | None = None,
+        name: str = "arrays",
+        **reading: Any,
+    ) -> Recording:
+        """The recording of readings that are in memory, which every verb takes in place of a file.
+
+        `data`: an array [n], [n, 3] or [n, 6] of gx, gy, gz, ax, ay, az; a mapping of arrays by heading, `gyro` and
+        `accel` [n, 3] among them; a data frame. `units`: of all axes, `"deg/s"`, or by name, `{"gyro": "rad/s"}`;
+        a heading `gx[deg/s]` needs none. `rate_hz`: without a time column. `name`: of the recording in results.
+        The other options are `load`'s. Raises UserError."""
+        return replace(load(data, rate_hz=rate_hz, units=units, **reading), path=Path(name))
 
     @property
     def samples(self) -> int:
@@ -302,6 +322,10 @@ def as_float(values: NDArray[np.float64]) -> NDArray[np.float32]:
         return values.astype(np.float32)
 
 
+#: A file, several ones that are joined, or readings in memory: a Recording, an array, a mapping of arrays, a frame.
+Data: TypeAlias = "Path | str | Sequence[Path | str] | Recording | NDArray[Any] | Mapping[str, Any] | Any"
+
+
 @dataclass(frozen=True)
 class _Field:
     """A column to be read: key in the file, name and unit here, size of its LSB (1 if it is in the unit itself)."""
@@ -317,10 +341,10 @@ class _Field:
 
 
 def load(
-    path: Path | str | Sequence[Path | str],
+    path: Data,
     rate: float | None = None,
     columns: Mapping[str, str] | None = None,
-    units: Mapping[str, str] | None = None,
+    units: Mapping[str, str] | str | None = None,
     scale: Mapping[str, Scale] | float | None = None,
     sensors: Collection[str] = SENSORS,
     *,
@@ -328,10 +352,13 @@ def load(
     skip_bad: bool = False,
     sources: Sequence[str] = (),
     dbc: Path | str | None = None,
+    rate_hz: float | None = None,
 ) -> Recording:
-    """Read a recording; of several files, or sensors of a log, one, joined by their time stamps.
+    """Read a recording; of several files, or sensors of a log, one, joined by their time stamps. Readings in memory are
+    taken as `Recording.from_arrays` has it, and a Recording as it is.
 
-    `rate`, Hz: needed without a `t` column; with one it must agree with it to 10 % and is taken as the true rate.
+    `rate`, or `rate_hz`, Hz: needed without a `t` column; with one it must agree with it to 10 % and is taken as the
+    true rate.
     `columns`: name here -> header in the file. `units`: name here -> unit; it takes the header's place.
     `scale`: size of one LSB, for all LSB columns or by name, with its unit (default deg/s for g*, m/s^2 for a*).
     `sensors`: columns of which at least one must be there. A column that is none of these, nor temperature or supply,
@@ -342,8 +369,16 @@ def load(
     Raises UserError for any file that is not a sound recording, or is larger than `limits.py` says. O(n); about 2 s
     for 10^6 CSV rows of 7 columns.
     """
+    if isinstance(path, Recording):
+        return path
+    rate = rate if rate_hz is None else rate_hz
+    columns, units, table = columns or {}, units or {}, None
     paths = list_of(path)
-    columns, units = columns or {}, units or {}
+    if arrays.in_memory(path):
+        table, units = arrays.table_of(path, units, columns, rate, sensors)
+        paths = [Path("arrays")]
+    elif isinstance(units, str):
+        raise UserError(f"units={units!r}: of a file by the names of its columns, as units={{'gx': {units!r}}}")
     sources = [sources] if isinstance(sources, str) else sources
     by_name: Mapping[str, Scale] = {"": (float(scale), None)} if isinstance(scale, int | float) else scale or {}
     if rate is not None and not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
@@ -357,14 +392,14 @@ def load(
     found = [
         part
         for one, header in zip(paths, headers, strict=True)
-        for part in _load(one, rate, header, skip_bad, sources, hints)
+        for part in _load(one, rate, header, skip_bad, sources, hints, table)
     ]
     recording = found[0] if len(found) == 1 else _joined(paths, found, headers[0])
     _check_gravity(recording, headers[0])
     recording = replace(
         recording,
         notes=tuple(dict.fromkeys((*recording.notes, *_rates(recording)))),
-        options=_options(rate, columns, units, by_name, no_time, skip_bad, sources, dbc),
+        options=() if table else _options(rate, columns, units, by_name, no_time, skip_bad, sources, dbc),
     )
     for text in recording.notes:
         note(f"{recording.path}: {text}")
@@ -394,19 +429,30 @@ def _options(
     return tuple(given)
 
 
-def list_of(paths: Path | str | Sequence[Path | str]) -> list[Path]:
+def list_of(paths: Data) -> list[Path]:
     """The files of a recording."""
+    if isinstance(paths, Recording) or arrays.in_memory(paths):
+        return []
     return [Path(paths)] if isinstance(paths, Path | str) else [Path(one) for one in paths]
 
 
 def _load(
-    path: Path, rate: float | None, header: _Header, skip_bad: bool, wanted: Sequence[str], hints: Hints
+    path: Path,
+    rate: float | None,
+    header: _Header,
+    skip_bad: bool,
+    wanted: Sequence[str],
+    hints: Hints,
+    table: Table | None = None,
 ) -> list[Recording]:
-    """The sensors of one file that are meant, and the temperatures beside them, each by its own clock."""
+    """The sensors of one file that are meant, or of a `table`, and the temperatures beside them, each by its own
+    clock."""
     with reading(path, "not a sound recording"):
-        form = format_of(path, frames="dbc" in hints)
-        tables: list[Table] = []
-        if form is None:
+        form = format_of(path, frames="dbc" in hints) if table is None else None
+        tables: list[Table] = [] if table is None else [table]
+        if table is not None:
+            parts = _table_parts(path, rate, header, table, False)
+        elif form is None:
             parts = _text_parts(path, rate, header, skip_bad)
         else:
             check_library(path, form)

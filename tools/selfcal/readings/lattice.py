@@ -73,9 +73,8 @@ def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | N
     differences is less: a drift has no part in it. Remainders that are carried on have the larger part in differences.
     """
     carried = 0.0
-    unique = np.unique(values)
-    step = _step(unique)
-    if step <= 0.0 or not _throughout(unique, step):
+    step, distinct = step_of(values)
+    if step <= 0.0:
         return None
     size = max(round(rate_hz), CARRIED_READINGS)
     count = values.size // size
@@ -89,7 +88,14 @@ def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | N
         scatter = 0.5 * float((np.diff(sums) ** 2).mean())
         if scatter < CARRIED_SHARE * size / coarseness**2:
             carried = max(CARRIED_LEAST, (scatter - REMAINDERS) * rate_hz / size)
-    return Lattice(step, coarseness, unique.size, carried) if coarseness >= FINE else None
+    return Lattice(step, coarseness, distinct, carried) if coarseness >= FINE else None
+
+
+def step_of(values: NDArray[np.floating[Any]]) -> tuple[float, int]:
+    """The step of the lattice of readings [n], however fine, 0 if they lie on none; distinct readings."""
+    unique = np.unique(values)
+    step = _step(unique)
+    return step if step > 0.0 and _throughout(unique, step) else 0.0, unique.size
 
 
 def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:

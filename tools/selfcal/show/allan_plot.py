@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import chi2
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
@@ -18,11 +19,18 @@ MODEL, OUTSIDE = "tab:blue", "tab:red"
 
 
 def plot_allan(document: Mapping[str, Any], path: Path | str, *, datasheet: bool = False) -> None:
-    """Save the picture of an answer of `identify` made for one; the suffix of `path` chooses the format.
+    """Save the picture of an answer of `identify`; the suffix of `path` chooses the format. Raises UserError if the
+    file cannot be written."""
+    save_picture(figure_of(document, datasheet=datasheet), path, dpi=110)
 
-    Black: the overlapping Allan deviation of the recording's samples with its 90 % interval. In blue: the most
+
+def figure_of(document: Mapping[str, Any], *, datasheet: bool = False) -> Any:
+    """The figure of an answer of `identify`.
+
+    Black: the overlapping Allan deviation of the recording's samples with its 90 % interval, of its bank's means where
+    the answer was not made for a picture. In blue: the most
     probable law at its medians, the band of its posterior (5 to 95 %), and, pale, where the recording may lie.
-    Averaging times outside are red. Raises UserError if the file cannot be written.
+    Averaging times outside are red. Raises UserError where there is none.
     """
     pyplot = plotter()
     from matplotlib.lines import Line2D
@@ -59,13 +67,14 @@ def plot_allan(document: Mapping[str, Any], path: Path | str, *, datasheet: bool
     ]
     # Four in a row are wider than the picture of one axis.
     figure.legend(handles=handles, loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
-    save_picture(figure, path, dpi=110)
+    return figure
 
 
 def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-    allan, samples = axis["allan"], axis["allan"]["samples"]
+    allan = axis["allan"]
+    samples = allan.get("samples") or _of_means(allan)
     unit = units.datasheet_unit("bias", allan["unit"]) if datasheet else allan["unit"]
     factor = units.factor(allan["unit"], unit)
 
@@ -123,6 +132,13 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
     panel.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     panel.yaxis.set_minor_formatter(NullFormatter())
     panel.grid(True, which="major", alpha=0.3)
+
+
+def _of_means(allan: Mapping[str, Any]) -> dict[str, Any]:
+    """The Allan deviation of the bank's means, with its 90 % interval by chi-squared."""
+    freedom, curve = np.array(allan["degrees_of_freedom"]), np.array(allan["recording"])
+    q05, q95 = (curve * np.sqrt(freedom / chi2.ppf(p, freedom)) for p in (0.95, 0.05))
+    return {"tau_s": allan["tau_s"], "deviation": curve, "q05": q05, "q95": q95}
 
 
 def _share_scales(panels: list[Any]) -> None:

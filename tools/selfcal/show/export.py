@@ -22,6 +22,8 @@ from selfcal.base.output import write_text
 
 #: Probability of the overbound where none is asked for.
 OVERBOUND = 0.95
+#: Step of PX4's filter by default (EKF2_PREDICT_US), s.
+PREDICT_S = 0.01
 #: Correlation time that makes a Gauss-Markov drift a walk, s.
 ENDLESS = 1e9
 
@@ -224,15 +226,17 @@ def _rotors(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
 
 
 def _px4(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
-    rate_hz = float(recording["rate_hz"])
-    root = rate_hz**0.5
+    """The filter steps by PREDICT_S, whatever the sensor's rate: it adds (noise dt)^2 to an angle and a velocity, and
+    (bias noise dt)^2 to a bias (predictCovariance() of EKF/covariance.cpp in src/modules/ekf2)."""
+    root, us = PREDICT_S**-0.5, round(1e6 * PREDICT_S)
 
     def line(name: str, kind: Kind, parameter: str, unit: str) -> str:
         return f"param set {name} {kind.number(parameter, root)}  # {unit}; {kind.beside(parameter, root)}\n"
 
     return (
         _head("#", gyro, accel, recording)
-        + f"# discrete, at {rate_hz:g} Hz: noise = N sqrt(rate), bias noise = K sqrt(rate). A floor set by the sensor\n"
+        + f"# discrete, for the filter's own step, EKF2_PREDICT_US {us}, its default: noise N/sqrt(step), bias noise\n"
+        + f"# K/sqrt(step). With another step multiply each by sqrt({us}/EKF2_PREDICT_US). A floor set by the sensor\n"
         + "# alone, not a tuning: vibration and everything else the filter must absorb come on top.\n"
         + line("EKF2_GYR_NOISE", gyro, "N", "rad/s")
         + line("EKF2_ACC_NOISE", accel, "N", "m/s^2")
@@ -257,20 +261,24 @@ def _orbslam3(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
 
 
 def _vins(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
+    """The means of two readings are a step. Each has a noise of its own there, so a step of dt adds (n dt)^2 / 2 to an
+    angle, and (w dt)^2 to a bias (midPointIntegration() of factor/integration_base.h)."""
     rate_hz = float(recording["rate_hz"])
-    root = rate_hz**0.5
-    values = (
-        ("acc_n", accel, "N", root, "m/s^2"),
-        ("gyr_n", gyro, "N", root, "rad/s"),
-        ("acc_w", accel, "K", 1.0 / root, "m/s^2"),
-        ("gyr_w", gyro, "K", 1.0 / root, "rad/s"),
+
+    def line(name: str, kind: Kind, parameter: str, factor: float, unit: str) -> str:
+        number = kind.number(parameter, factor * rate_hz**0.5)
+        return f"{name}: {number}  # {unit}; {kind.beside(parameter, factor * rate_hz**0.5)}\n"
+
+    return (
+        "%YAML:1.0\n"
+        + _head("#", gyro, accel, recording)
+        + f"# per sample, of an IMU at {rate_hz:g} Hz: n = N sqrt(2 rate), w = K sqrt(rate). At another rate multiply\n"
+        + f"# each by sqrt(rate/{rate_hz:g} Hz).\n"
+        + line("acc_n", accel, "N", 2.0**0.5, "m/s^2")
+        + line("gyr_n", gyro, "N", 2.0**0.5, "rad/s")
+        + line("acc_w", accel, "K", 1.0, "m/s^3")
+        + line("gyr_w", gyro, "K", 1.0, "rad/s^2")
     )
-    body = "".join(
-        f"{name}: {kind.number(parameter)}  # continuous; per sample at {rate_hz:g} Hz: "
-        f"{kind.number(parameter, factor)} {unit}; {kind.beside(parameter)}\n"
-        for name, kind, parameter, factor, unit in values
-    )
-    return "%YAML:1.0\n" + _head("#", gyro, accel, recording) + body
 
 
 #: Name on the command line to writer.

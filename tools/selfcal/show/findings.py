@@ -15,17 +15,23 @@ from selfcal.adequacy.document import since
 from selfcal.adequacy.summary import noisier
 from selfcal.base import units
 from selfcal.base.errors import printable
+from selfcal.base.output import console_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import small
 
-#: Characters a line of a table that no terminal shows.
+#: Characters of a line where no terminal shows it.
 WIDTH = 114
 
 
-def show(document: Mapping[str, Any], *, to_stderr: bool = False, details: bool = False) -> None:
+def show(
+    document: Mapping[str, Any], *, to_stderr: bool = False, details: bool = False, console: Console | None = None
+) -> None:
     """What a person reads first. `details`: each finding of each axis, with its evidence and gain, below."""
     recording, findings = document["recording"], document["findings"]
-    console = Console(stderr=to_stderr)
+    if console is None:
+        console = console_of(to_stderr=to_stderr)
+        if not console.is_terminal:  # its cells wrap and lose nothing
+            console.width = WIDTH
 
     def say(line: str, style: str | None = None) -> None:
         console.print(line, style=style, highlight=False, markup=False, soft_wrap=True)
@@ -34,8 +40,6 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, details: bool 
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s{since(recording)}"
     )
-    if not console.is_terminal:
-        console.width = max(console.width, WIDTH)
     less = list(small(findings))
     shown = [one for one in findings if not any(one is each for each in less)]
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}

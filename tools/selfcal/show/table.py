@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from rich import box
@@ -16,11 +17,10 @@ from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.base import units
 from selfcal.base.errors import called, printable
+from selfcal.base.output import TABLE_WIDTH, console_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 
-#: The table never folds its numbers: a narrower terminal wraps its lines.
-TABLE_WIDTH = 140
 #: Laws of smaller probability are not spoken of where the grid does not bear them.
 TOLD_OF = 0.01
 #: Stretches of motion that are listed at most.
@@ -31,15 +31,17 @@ STATISTICS = ("innovation_", "allan_")
 ONE_EVENT_S = 30.0
 
 
-def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False) -> None:
+def show(
+    document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: bool = False, console: Console | None = None
+) -> None:
     """The tables a person reads: per axis the numbers of a data sheet; then the laws, their probabilities and
     parameters, and the bias.
 
-    They go to stderr where stdout is the JSON's. `datasheet`: the laws' numbers in the units of data sheets. In a
-    terminal that is too narrow columns lose their intervals: those of the data sheets' units, then the recording's; of
-    the laws that of 1/alpha, then N's, then K's.
+    They go to stderr where stdout is the JSON's, or to a `console`. `datasheet`: the laws' numbers in the units of data
+    sheets. In a terminal that is too narrow columns lose their intervals: those of the data sheets' units, then the
+    recording's; of the laws that of 1/alpha, then N's, then K's.
     """
-    console = Console(stderr=to_stderr)
+    console = console or console_of(to_stderr=to_stderr, fits=True)
     recording = document["recording"]
     title = (
         f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
@@ -53,8 +55,6 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False, datasheet: boo
     notes = choices[0][1]
     first = summary if numbered else laws
     first.title, first.title_justify = title, "left"
-    if not console.is_terminal:
-        console.width = max(console.width, TABLE_WIDTH)
     if numbered:
         console.print(summary)
     console.print(laws)
@@ -249,7 +249,9 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             told = ", ".join(f"{law} {P:.2g}" for law, P in laws)
             failed.append(f"with the laws of sums.yaml: {name}: {told}")
     if any(line.startswith("not adequate") for line in failed):
-        failed.append(f"why, and what mends it: {called()} diagnose {as_typed(recording)}")
+        there = Path(recording["path"]).exists() or recording.get("paths")
+        typed = f"{called()} diagnose {as_typed(recording)}" if there else "selfcal.diagnose() of the same readings"
+        failed.append(f"why, and what mends it: {typed}")
     N = {name: axis["summary"]["arw"] for name, axis in axes.items() if axis.get("summary")}
     return table, [*kept, *_unidentified(axes), *noisier(N), *_ahead(axes), *failed]
 

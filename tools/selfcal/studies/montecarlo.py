@@ -13,14 +13,13 @@ from typing import Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
+from selfcal.base.output import console_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.tables import bank_block, make_tables
-from selfcal.show.table import TABLE_WIDTH
 
 SCHEMA = "selfcal.montecarlo/1"
 #: Bank samples; fewer say nothing.
@@ -141,8 +140,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
                 f"{p['rms_actual'] / p['rms_calculated']:.3f}",
             )
         table.add_row(law, "bias now", f"{100 * entry['bias_coverage_90']:.1f} %", end_section=True)
-    console = Console(stderr=to_stderr)
-    console.width = max(console.width, TABLE_WIDTH)
+    console = console_of(to_stderr=to_stderr)
     console.print(table)
     f = document["false_identification"]
     console.print(

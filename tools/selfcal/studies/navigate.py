@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from scipy import optimize
 
+from selfcal.base.output import console_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
 from selfcal.model.tables import make_tables
-from selfcal.show.table import TABLE_WIDTH
 from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 
 SCHEMA = "selfcal.navigate/1"
@@ -143,8 +142,7 @@ def summary(rows: Sequence[Row]) -> dict[str, Any]:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table a time; a word on each NEES."""
-    console = Console(stderr=to_stderr)
-    console.width = max(console.width, TABLE_WIDTH)
+    console = console_of(to_stderr=to_stderr)
     low, high = document["nees_band_95"]
     for time, when in TIMES.items():
         title = f"{when}: rms errors, {document['parts']} parts of each law"

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import Any
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from selfcal.base.errors import printable
+from selfcal.base.output import console_of
 from selfcal.show.chart import Figure, draw
 from selfcal.show.page import STYLE
 from selfcal.studies.paper_figures import section4
@@ -78,7 +78,7 @@ def page(told: Sequence[Told], records: int, seed: int) -> str:
 
 def show(told: Sequence[Told], output: Path | str) -> None:
     """A line a figure, and the place of the page."""
-    console = Console()
+    console = console_of()
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("figure", "here", ""):
         table.add_column(heading)

@@ -28,7 +28,7 @@ from selfcal.adequacy.identify import chosen_axes
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
-from selfcal.base.output import check_writable, write_json
+from selfcal.base.output import check_writable, console_of, write_json
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
 from selfcal.logs.recording import Recording, as_float, load
@@ -214,15 +214,13 @@ def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
         return {"title": rival.title, "error": rival.missing}
     try:
         with workers(1) as pool:
-            found = pool.submit(_alone, rival, problem).result()
+            found = pool.submit(_alone, rival, problem, unit).result()
     except BrokenProcessPool:
         found = {"error": "it ended without an answer"}
-    if "answer" in found:
-        found |= entry_of(found.pop("answer"), problem.group.unit, unit)
     return {"title": rival.title, **found}
 
 
-def _alone(rival: Rival, problem: Problem) -> dict[str, Any]:
+def _alone(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
     try:
         function = rival.load()
         before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -230,10 +228,13 @@ def _alone(rival: Rival, problem: Problem) -> dict[str, Any]:
         answer = function(problem)
         seconds = time.process_time() - start
         grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+        if not isinstance(answer, Answer):
+            return {"error": f"it returned {type(answer).__name__}: a rival returns a selfcal.studies.methods.Answer"}
+        entry = entry_of(answer, problem.group.unit, unit)
     except Exception as error:  # whatever another's library raises is the answer for this record
         return {"error": first_line(error)}
     unit_bytes = 1 if sys.platform == "darwin" else 1024
-    return {"answer": answer, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes}
+    return {**entry, "seconds": seconds, "peak_memory_bytes": grown * unit_bytes}
 
 
 def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
@@ -254,7 +255,7 @@ def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table an axis: a row for each method and law."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     brief = console.is_terminal and console.width < WHOLE_WIDTH
     console.width = max(console.width, BRIEF_WIDTH if brief else WHOLE_WIDTH)
     for name, axis in document["axes"].items():
@@ -309,7 +310,7 @@ def _table(name: str, axis: Mapping[str, Any], *, brief: bool) -> Table:
 
 def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table for each number of samples and law, then the choice of a law over all laws."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     console.width = max(console.width, WHOLE_WIDTH)
     cells: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for entry in document["cells"]:

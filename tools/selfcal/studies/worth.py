@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from scipy import signal
 
 from selfcal.base.errors import UserError, printable
+from selfcal.base.output import console_of
 from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
 from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, as_float, load
@@ -250,7 +250,7 @@ def _rms(rows: Sequence[Row], key: str) -> float:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table a case; the least error of each column is bold."""
-    console = Console(stderr=to_stderr)
+    console = console_of(to_stderr=to_stderr)
     console.width = max(console.width, 160)
     cases: dict[str, list[Mapping[str, Any]]] = {}
     for entry in document["cases"]:

@@ -10,14 +10,17 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ
 
+if TYPE_CHECKING:
+    from selfcal.logs.recording import Data
+
 Logs = Annotated[
-    Path | str | Sequence[Path | str],
+    "Data",
     argument(f"Recording: {READ}; several files are joined by their time stamps", "LOG...", kind=list[Path]),
 ]
 ModelFile = Annotated[

@@ -24,11 +24,14 @@ from selfcal.verbs._shared import (
 )
 
 if TYPE_CHECKING:
-    from selfcal.base.results import Comparison
+    from selfcal.logs.recording import Recording
+    from selfcal.show.results import Comparison
 
 
 def compare(
-    logs: Annotated[Sequence[Path | str], argument(f"Recordings of one part: {READ}", "LOG LOG...", kind=list[Path])],
+    logs: Annotated[
+        Sequence[Path | str | Recording], argument(f"Recordings of one part: {READ}", "LOG LOG...", kind=list[Path])
+    ],
     *,
     axes: Axes = (),
     model: ModelFile = None,
@@ -67,11 +70,12 @@ def compare(
 
     from selfcal.base.ending import Held
     from selfcal.base.output import check_writable, write_json
-    from selfcal.base.results import Comparison
     from selfcal.batch.compare import LIMIT, SCHEMA, Compared, changes, incomparable, quantities, verdict
     from selfcal.batch.fail_on import CHANGED, check
     from selfcal.batch.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
+    from selfcal.logs.recording import list_of
     from selfcal.model.file import Model
+    from selfcal.show.results import Comparison
     from selfcal.verbs.diagnose import diagnose
     from selfcal.verbs.identify import identify
 
@@ -79,7 +83,8 @@ def compare(
         raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
     check(fail_on, more=(CHANGED,))
     check_options(limits, junit, verdicts)
-    check_writable(json, report, junit, verdicts, inputs=(*logs, model, limits))
+    files = [file for one in logs for file in list_of(one)]
+    check_writable(json, report, junit, verdicts, inputs=(*files, model, limits))
     bounds = None if limits is None else Limits.load(limits, Model.load(model))
     seen = []
     judged: list[Judged] = []
@@ -87,23 +92,24 @@ def compare(
     curves: dict[str, dict[str, Any]] = {}
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
     part |= reading
-    for log in logs:
+    names = [str(one) if isinstance(one, Path | str) else str(one.path) for one in logs]
+    for log, place in zip(logs, names, strict=True):
         known = identify(log, suspicion=False, **part)
         identified = known["axes"]
         if bounds is not None:
             add_verdicts(known, bounds, None, None)
-            judged.append(("", str(log), [Verdict.of(one) for one in known["limits"]]))
+            judged.append(("", place, [Verdict.of(one) for one in known["limits"]]))
         diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]
         Held().check()
-        by_log[str(log)] = {
+        by_log[place] = {
             name: verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
         }
         for name, axis in identified.items():
             if axis.get("allan"):
-                curves.setdefault(name, {})[str(log)] = axis["allan"]
+                curves.setdefault(name, {})[place] = axis["allan"]
         seen.append({name: quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
     compared = {name: Compared() for name in sorted({name for one in by_log.values() for name in one})}
-    for (first, before), (second, after) in pairwise(zip(map(str, logs), seen, strict=True)):
+    for (first, before), (second, after) in pairwise(zip(names, seen, strict=True)):
         for name, one in compared.items():
             error = incomparable({log: by_log[log].get(name) for log in (first, second)})
             if error is not None:
@@ -114,10 +120,10 @@ def compare(
                 one.changes += [{"from": first, "to": second, **row} for row in rows]
     document = {
         "schema": SCHEMA,
-        "recordings": [str(log) for log in logs],
+        "recordings": names,
         "axes": {name: one.entry() for name, one in compared.items()},
         "verdicts": by_log,
-        "quantities": dict(zip(map(str, logs), seen, strict=True)),
+        "quantities": dict(zip(names, seen, strict=True)),
         "limit_sd": LIMIT,
     }
     if bounds is not None:

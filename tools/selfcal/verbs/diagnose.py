@@ -29,7 +29,7 @@ from selfcal.verbs._shared import (
 )
 
 if TYPE_CHECKING:
-    from selfcal.base.results import Diagnosis
+    from selfcal.show.results import Diagnosis
 
 
 @on_a_line
@@ -86,7 +86,6 @@ def diagnose(
     from selfcal.base.ending import held
     from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.base.progress import Doing
-    from selfcal.base.results import Diagnosis
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.diagnosis import hidden
@@ -116,6 +115,7 @@ def diagnose(
     from selfcal.likelihood import work
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
+    from selfcal.show.results import Diagnosis
 
     check(fail_on)
     check_options(limits, junit, verdicts)
@@ -174,7 +174,8 @@ def diagnose(
                 ending.check()
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
             doing.now("held-out gain")
-            tree = extended(loaded, record, found)
+            sensor = recording.path.name.partition(".")[0] if model is None else None
+            tree, read_out = extended(loaded, record, found, sensor)
             out = left_out(loaded, found)
             doing.now("what the axes share")
             shared = shared_by(found, loaded) if not ending.asked else None
@@ -198,7 +199,8 @@ def diagnose(
             known = add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
             add_findings(document, recording, found, known, quantity)
             if write_model is not None:
-                write_text(write_model, as_text(tree, recording.path))
+                write_text(write_model, as_text(tree, recording.path, read_out))
+                note(f"{write_model}: {read_out}")
                 if out:
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
                     note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")

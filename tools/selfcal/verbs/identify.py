@@ -29,7 +29,7 @@ from selfcal.verbs._shared import (
 )
 
 if TYPE_CHECKING:
-    from selfcal.base.results import Identification
+    from selfcal.show.results import Identification
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
@@ -108,13 +108,13 @@ def identify(
     from selfcal.adequacy.identify import chosen_axes, identify_axis, left_out_together, stretch_of, with_reasons
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.base.results import Identification
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.model.regressors import choices_of, offered
     from selfcal.show.export import FORMS, write_export
+    from selfcal.show.results import Identification
 
     check(fail_on)
     check_options(limits, junit, verdicts)

@@ -12,12 +12,13 @@ from selfcal.logs.loaders import READ, Reading
 from selfcal.verbs._shared import End, Start
 
 if TYPE_CHECKING:
+    from selfcal.logs.recording import Data
     from selfcal.model.file import Model
 
 
 def part(
     log: Annotated[
-        Sequence[Path | str], argument(f"Recording at rest: {READ}; or --datasheet alone", "[LOG...]", kind=list[Path])
+        Data, argument(f"Recording at rest: {READ}; or --datasheet alone", "[LOG...]", kind=list[Path])
     ] = (),
     output: Annotated[
         Path | str,
@@ -43,41 +44,19 @@ def part(
     are axes, where they are not gx to az. The other options are `load`'s.
     Raises UserError for a recording that moved, a text that is none of these, and a file that cannot be written.
     """
-    import yaml
-
-    from selfcal.bank.part import as_text, finish, groups, of_recording, of_sheet, parse
+    from selfcal.adequacy.part import as_text, parse, tree_of
     from selfcal.base.output import check_writable, write_text
     from selfcal.base.units import SENSORS
     from selfcal.logs.recording import list_of, load
-    from selfcal.model.file import DEFAULT, Model
+    from selfcal.model.file import Model
 
-    if not log and not datasheet:
+    given = not isinstance(log, Sequence) or len(log) > 0
+    if not given and not datasheet:
         raise UserError("give a recording at rest, or numbers of a data sheet: --datasheet 'N=0.012deg/sqrt(h)'")
-    check_writable(output, inputs=tuple(list_of(log)) if log else ())
+    check_writable(output, inputs=tuple(list_of(log)))
     stated = [parse(text) for text in datasheet]
-    recording = None
-    if log:
-        recording = load(log, sensors=(*SENSORS, *axes), **reading).between(start_s, end_s)
-        for axis in axes:
-            if axis not in recording.columns:
-                there = ", ".join(recording.columns)
-                raise UserError(f"{recording.path}: there is no column '{axis}' (there are {there})")
-    tree = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
-    base = Model.load()
-    said: list[str] = []
-    if recording is not None:
-        tree["groups"] = groups(tree["groups"], recording, axes)
-        tree["gate"]["N"] = dict.fromkeys(tree["groups"], 1.0)  # until N is known
-        said += of_recording(tree, recording)
-    else:
-        rate = reading.get("rate")
-        if rate is None and not any(one.key == "rate" for one in stated):
-            raise UserError("without a recording the part's rate is needed: --datasheet rate=200Hz")
-        tree["sensor"] = {"name": "", "rate_hz": rate, "filter_taps": 1}
-        for group in tree["groups"].values():
-            group |= {"range": 0.0, "lsb": 0.0}
-    said += of_sheet(tree, stated, recording is not None)
-    finish(tree, name or (recording.path.name.partition(".")[0] if recording is not None else "part"), base)
+    recording = load(log, sensors=(*SENSORS, *axes), **reading).between(start_s, end_s) if given else None
+    tree, said = tree_of(recording, axes, stated, name, reading.get("rate"))
     model = Model.of_tree(tree, Path(output))
     write_text(output, as_text(tree, recording, said))
     return model
@@ -85,7 +64,7 @@ def part(
 
 def show(model: Model, given: Mapping[str, Any]) -> int:
     """Print what was written."""
-    from selfcal.bank.part import show as lines
+    from selfcal.adequacy.part import show as lines
 
     lines(model)
     return 0

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
-from selfcal.verbs._shared import Json, Scheduler, to_stderr
+from selfcal.logs.loaders import Reading
+from selfcal.verbs._shared import End, Json, Scheduler, Start, to_stderr
+
+if TYPE_CHECKING:
+    from selfcal.logs.recording import Data
 
 
 def plan(
-    model: Annotated[Path | str, argument("Model file of the part", "MODEL.yaml")],
+    model: Annotated[
+        Data, argument("Model file of the part, or a recording of it at rest", "MODEL.yaml|LOG", kind=Path)
+    ],
     *,
     want: Annotated[
         Sequence[str],
@@ -30,11 +36,15 @@ def plan(
     plot: Annotated[Path | str | None, option("Save what is reached over the length", metavar="FILE")] = None,
     json: Json = None,
     scheduler: Scheduler = None,
+    start_s: Start = None,
+    end_s: End = None,
+    **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """How long to record the part of a model file, so that SHARE of the records have each of the wishes `want`.
 
-    `axis`: the first that the `simulate` entry states, else the first of all. A wish of a parameter is of the records
-    whose law has it. `plot`: a picture of what is reached over the length.
+    `model`: a model file, or a recording, of which the part is made as `part` makes it; `start_s`, `end_s` and the
+    other options are the recording's. `axis`: the first that the `simulate` entry states, else the first of all. A wish
+    of a parameter is of the records whose law has it. `plot`: a picture of what is reached over the length.
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
     it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
     prior's sd.
@@ -44,13 +54,25 @@ def plan(
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.batch.plan import SCHEMA, SHARE, SWEEP_S, Ensemble, Wish, cycling, picture, rates, refusal
     from selfcal.batch.spread import record_seeds
+    from selfcal.logs.loaders import is_recording
+    from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.model.regressors import coefficient_unit
 
-    check_writable(json, plot, inputs=(model,))
+    check_writable(json, plot, inputs=list_of(model))
     if plot is not None:
         check_picture(plot)
-    loaded = Model.load(model)
+    if not isinstance(model, Path | str) or is_recording(model):
+        from selfcal.adequacy.part import tree_of
+        from selfcal.base.units import SENSORS
+
+        sensors = SENSORS if axis is None else (*SENSORS, axis)
+        recording = load(model, sensors=sensors, **reading).between(start_s, end_s)
+        loaded = Model.of_tree(tree_of(recording, () if axis is None else (axis,))[0], recording.path)
+    elif reading or start_s is not None or end_s is not None:
+        raise UserError(f"{model}: the options of a recording (--rate, --column, --start ...) are for plan LOG")
+    else:
+        loaded = Model.load(model)
     if loaded.half_life_s:
         raise UserError(f"{loaded.path}: plan takes no half_life_s: leave it out of the model")
     name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])

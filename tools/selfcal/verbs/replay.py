@@ -24,7 +24,7 @@ from selfcal.verbs._shared import (
 )
 
 if TYPE_CHECKING:
-    from selfcal.base.results import Identification
+    from selfcal.show.results import Identification
 
 
 def replay(
@@ -69,13 +69,13 @@ def replay(
     from selfcal.adequacy.identify import chosen_axes
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.base.results import Identification
     from selfcal.diagnosis.warm import load as load_start
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.model.regressors import from_time
     from selfcal.readings.gate import table_of as gate_of
     from selfcal.show.plot import plot_run
+    from selfcal.show.results import Identification
     from selfcal.wire.dbc_file import HYPOTHESES
     from selfcal.wire.frames import names_of
     from selfcal.wire.on_wire import places, sent

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, Extension, Key, medians, positive, shown
-from selfcal.diagnosis.model_tree import digits
+from selfcal.diagnosis.cause import Cause, Key, medians, positive, shown
 from selfcal.likelihood.statemodel import Array
 
 
@@ -34,11 +33,6 @@ def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, rand
         row[lost] += lsb * np.where(dice[lost] < keys["misread"], 1.0, -1.0)
 
 
-def _extend(at: Extension) -> None:
-    if "lsb" in at.finding.look.estimate:
-        at.group["lsb"] = digits(at.finding.look.estimate["lsb"]["median"])
-
-
 CAUSE = Cause(
     "quantization",
     "The codes of the converter show in the readings: they are coarse and not stated, or they are not alike.",
@@ -47,7 +41,6 @@ CAUSE = Cause(
     alike=lambda a, b: True,
     pictures=shown("lattice"),
     no_gain="the lattice is in the reading and not in the prediction",
-    extend=_extend,
     of_estimate=lambda look: medians(look) if "misread" in look.estimate else None,
     keys={
         "lsb": positive(lambda s: 2.0 * s.sd, "lsb"),

@@ -76,6 +76,7 @@ class Reading(TypedDict, total=False):
     """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
 
     rate: Annotated[float | None, option("Sampling rate, for recordings without a t column", metavar="HZ")]
+    rate_hz: float | None
     columns: Annotated[
         Mapping[str, str] | None,
         option(
@@ -87,7 +88,7 @@ class Reading(TypedDict, total=False):
         ),
     ]
     units: Annotated[
-        Mapping[str, str] | None,
+        Mapping[str, str] | str | None,
         option(
             "Unit of a column whose header states none (repeat for more)",
             "--unit",
@@ -123,6 +124,12 @@ _ROS_FOLDER = ("metadata.yaml", "*.db3", "*.mcap")
 def is_text(path: Path) -> bool:
     """Whether a file's name is a text recording's."""
     return path.name.lower().removesuffix(".gz").endswith(TEXT)
+
+
+def is_recording(path: Path | str) -> bool:
+    """Whether a name is a recording's: by its suffix, or a folder."""
+    path = Path(path)
+    return path.is_dir() or is_text(path) or path.suffix.lower() in (ZIP, *(s for one in FORMATS for s in one.suffixes))
 
 
 def format_of(path: Path, *, frames: bool = False) -> Format | None:

@@ -1,6 +1,7 @@
 """Other ways to identify the same record, each in a module of its own, and the table that names them all.
 
-A rival is a function of a `Problem`. It returns an `Answer`. No rival sees the truth, and none is tuned to it.
+A rival is a function of a `Problem`. It returns an `Answer`. No rival sees the truth, and none is tuned to it. Another
+package's rival joins by an entry point of the group GROUP: its name, and `package.module:function`.
 """
 
 from __future__ import annotations
@@ -9,26 +10,32 @@ import importlib.util
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import entry_points
 
 from selfcal.base.errors import install
-from selfcal.studies.methods.problem import Answer, Problem
+from selfcal.studies.methods.problem import Answer, Problem, Value
+
+__all__ = ["GROUP", "RIVALS", "Answer", "Problem", "Rival", "Value"]
+#: Entry points of other packages' rivals.
+GROUP = "selfcal.rivals"
 
 
 @dataclass(frozen=True)
 class Rival:
-    """`function` of `module` (in this package). `package`: what it needs beyond selfcal's own dependencies."""
+    """`function` of `module` (in this package, unless it is `foreign`). `package`: what it needs beyond selfcal's own
+    dependencies."""
 
     name: str
     title: str
     module: str
     function: str
     package: str = ""
+    foreign: bool = False
 
     def load(self) -> Callable[[Problem], Answer]:
         """The function. Its import is not part of the time that is measured."""
-        found: Callable[[Problem], Answer] = getattr(
-            import_module(f"selfcal.studies.methods.{self.module}"), self.function
-        )
+        module = import_module(self.module if self.foreign else f"selfcal.studies.methods.{self.module}")
+        found: Callable[[Problem], Answer] = getattr(module, self.function)
         return found
 
     @property
@@ -62,3 +69,5 @@ RIVALS = {
         Rival("mmae", "multiple models (MMAE), filterpy", "multiple_model", "mmae", "filterpy"),
     )
 }
+for _one in entry_points(group=GROUP):
+    RIVALS.setdefault(_one.name, Rival(_one.name, f"{_one.name}, {_one.module}", _one.module, _one.attr, foreign=True))

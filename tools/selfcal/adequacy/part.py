@@ -1,4 +1,8 @@
-"""`selfcal part`: the model file of another part, from a recording at rest, its data sheet, or both."""
+"""`selfcal part`: the model file of another part, from a recording at rest, its data sheet, or both.
+
+`read_out` puts what a recording shows of its own read-out into a model file's tree. `diagnose --write-model` takes it
+as well.
+"""
 
 from __future__ import annotations
 
@@ -12,13 +16,16 @@ from typing import Any
 import numpy as np
 import yaml
 
+from selfcal.adequacy.identify import identify_axis
 from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
+from selfcal.bank.result import in_unit
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError, note, remark, short
 from selfcal.base.units import SENSORS, factor, parameter_unit
 from selfcal.logs.recording import Recording
-from selfcal.model.file import LONGEST_TEXT, Group, Model, Prior
-from selfcal.readings.readings import Readings, look
+from selfcal.model.file import DEFAULT, LONGEST_TEXT, Model, Prior
+from selfcal.readings.lattice import step_of
+from selfcal.readings.readings import ROUNDED, Readings, look
 from selfcal.readings.rest import rest_of
 
 #: What a data sheet may state of a group or an axis, and what it states of the part. `density` is one-sided, as data
@@ -34,8 +41,10 @@ ALIKE = 10.0
 DIFFERENT = 2.0
 #: Equal readings in a row that are stuck, as the default model has it; none on a lattice coarser than the noise.
 STUCK = 1000
-#: Rates of `simulate` at most, Hz.
+#: The default model simulates at this rate, Hz, which a data sheet's part takes.
 SIMULATED_HZ = 10.0
+#: A recording is no faster than its sensor: its rate is above it by no more.
+FASTER = 1.01
 #: A bias prior of an axis of another kind is no narrower than so many times N.
 LEAST_BIAS = 1000.0
 
@@ -107,15 +116,10 @@ def of_recording(tree: dict[str, Any], recording: Recording) -> list[str]:
             longest = f": --start {rest.longest[0]:.10g} --end {rest.longest[1]:.10g}" if rest.longest else ""
             raise UserError(f"{recording.path}: {axis} moved; take a stretch at rest{longest}")
     readings = {axis: look(one, axis, model.group_of(axis)) for axis, one in own.items()}
-    rate_hz = max(one.recording.rate_hz for one in readings.values())
-    tree["sensor"] = {"name": tree["sensor"]["name"], "rate_hz": float(f"{rate_hz:.6g}"), "filter_taps": 1}
-    said = [f"rate: {rate_hz:.6g} Hz"]
+    said = [read_out(tree, model, readings)]
     for group in model.groups:
         seen = {axis: _seen(own[axis], axis, model) for axis in group.axes}
         fields = tree["groups"][group.name]
-        read_out, lines = _read_out(group, [readings[axis] for axis in group.axes])
-        fields |= read_out
-        said += lines
         typical = math.exp(float(np.mean([math.log(one.N) for one in seen.values()])))
         level = max(seen.values(), key=lambda one: abs(one.level)).level
         about_it = group
@@ -151,21 +155,56 @@ def _seen(recording: Recording, axis: str, model: Model) -> Seen:
     return found
 
 
-def _read_out(group: Group, readings: Sequence[Readings]) -> tuple[dict[str, Any], list[str]]:
-    """Lattice, range and stuck limit that the readings of a group's axes show, in its unit."""
-    steps = [one.lattice for one in readings if one.lattice is not None]
-    limits = [abs(one.clipped.limit) for one in readings if one.clipped is not None]
-    found: dict[str, Any] = {}
-    said = []
-    if steps:
-        found["lsb"] = float(f"{min(one.step for one in steps):.6g}")
-        said.append(f"{group.name}: lattice {found['lsb']:.6g} {group.unit}")
-        if any(one.too_coarse for one in steps):
-            found["stuck_limit"] = 0
-    if limits:
-        found["range"] = float(f"{min(limits):.6g}")
-        said.append(f"{group.name}: range {found['range']:.6g} {group.unit}, where its readings end")
-    return found, said
+def read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Readings], *, stated: bool = False) -> str:
+    """Put rate, lattice, range and stuck limit that a recording shows into the `tree` of a model; a line on them.
+
+    `readings`: of the axes that are looked at. `stated`: a user states the model's read-out. Then an entry stays that
+    the readings do not contradict: those of a log that averages its sensor do not show the sensor's.
+    """
+    sensor, rate_hz = tree["sensor"], max(one.recording.rate_hz for one in readings.values())
+    averaged = stated and sensor["rate_hz"] > FASTER * rate_hz
+    if not stated or rate_hz > FASTER * sensor["rate_hz"]:
+        sensor |= {"rate_hz": float(f"{rate_hz:.6g}"), "filter_taps": 1}
+    said = [f"{sensor['rate_hz']:g} Hz"]
+    for group in model.groups:
+        fields = tree["groups"][group.name]
+        own = [readings[axis] for axis in group.axes if axis in readings]
+        if not stated:
+            fields |= {"range": 0.0, "lsb": 0.0}
+        if not own:
+            continue
+        steps = [step for one in own if (step := _step(one)) > 0.0]
+        # Means of a lattice lie on a finer one, which may show or not.
+        if not averaged or (steps and not _divides(min(steps), group.lsb)):
+            fields["lsb"] = float(f"{min(steps, default=0.0):.6g}")
+        if not stated and any(one.lattice is not None and one.lattice.too_coarse for one in own):
+            fields["stuck_limit"] = 0
+        limits = [abs(one.clipped.limit) for one in own if one.clipped is not None]
+        if limits and all(_inside(one, min(limits)) for one in own):
+            fields["range"] = float(f"{min(limits):.6g}")
+        lattice = f"lattice {fields['lsb']:.6g} {group.unit}" if fields.get("lsb") else "no lattice"
+        reach = f"range {fields['range']:.6g} {group.unit}" if fields.get("range") else "no end of its range seen"
+        said.append(f"{group.name} {lattice}, {reach}")
+    return "read-out: " + "; ".join(said)
+
+
+def _step(readings: Readings) -> float:
+    """The lattice of an axis, that of a fine one too; 0 for none."""
+    known = readings.values[np.isfinite(readings.values)]
+    return readings.lattice.step if readings.lattice is not None else step_of(known)[0]
+
+
+def _divides(step: float, lsb: float) -> bool:
+    """Whether a lattice is that of means of readings on a coarser one."""
+    return abs(lsb / step - round(lsb / step)) < 0.002 * lsb / step
+
+
+def _inside(readings: Readings, limit: float) -> bool:
+    """Whether a range of both signs keeps no reading of an axis out; where it clips, its level alone counts."""
+    values = np.abs(readings.values[np.isfinite(readings.values)])
+    if readings.clipped is not None:
+        values = np.abs(np.median(readings.values[np.isfinite(readings.values)]))
+    return bool(np.max(values) <= limit * (1.0 + ROUNDED))
 
 
 def of_sheet(tree: dict[str, Any], stated: Sequence[Stated], measured: bool) -> list[str]:
@@ -236,20 +275,80 @@ def _noise(group: Mapping[str, Any]) -> float:
     return float(min(max(prior["max"] / DECADES, prior["min"]), math.sqrt(prior["min"] * prior["max"])))
 
 
-def finish(tree: dict[str, Any], name: str, base: Model) -> None:
-    """The name, the gate's bounds and `simulate` about each N."""
+def finish(tree: dict[str, Any], name: str, recording: Recording | None) -> list[str]:
+    """The name, the gate's bounds, and `simulate`: about each N, and as a recording has it; a line for each axis."""
     plain = remark(name)[:LONGEST_TEXT]
     tree["name"] = plain
     tree["sensor"]["name"] = plain
     middle = {key: _noise(group) for key, group in tree["groups"].items()}
     tree["gate"]["N"] = {key: rounded(GATE_NOISE * N) for key, N in middle.items()}
-    # The drift is drawn from its priors; the noise is known.
+    # Without a recording the drift is drawn from its priors; the noise is known.
     noise = {axis: {"N": rounded(middle[key])} for key, group in tree["groups"].items() for axis in group["axes"]}
-    tree["simulate"] = {
-        "rate_hz": min(SIMULATED_HZ, tree["sensor"]["rate_hz"]),
-        "duration_s": base.simulate["duration_s"],
-        "axes": noise,
-    }
+    rate_hz = tree["sensor"]["rate_hz"]
+    tree["simulate"] |= {"rate_hz": min(SIMULATED_HZ, rate_hz), "axes": noise}
+    said = []
+    if recording is not None:
+        tree["simulate"] |= {"rate_hz": rate_hz, "duration_s": recording.duration_s}
+        model = Model.of_tree(tree, recording.path)
+        for axis in model.axes:
+            try:
+                noise[axis] = _measured(recording, axis, model)
+            except UserError as error:
+                note(f"{recording.path}: {axis}: {error}; `simulate` draws its drift from the priors")
+                continue
+            numbers = ", ".join(f"{key} {value:.3g}" for key, value in noise[axis].items() if key != "hypothesis")
+            said.append(f"{axis}: {noise[axis]['hypothesis']}, {numbers} (medians)")
+    return said
+
+
+def _measured(recording: Recording, axis: str, model: Model) -> dict[str, Any]:
+    """The `simulate` entry of an axis: its likeliest law and medians. Raises UserError where it has no result."""
+    found, group = identify_axis(recording, axis, model, "library", None), model.group_of(axis)
+    result, law = in_unit(found.result, found.unit, group.unit), found.result.best
+    numbers = {"bias": float(np.nanmedian(recording.in_unit(axis, group.unit)))}
+    numbers |= {key: one.median for key, one in result.parameters[law].items()}
+    numbers["N"] = without(numbers["N"], rounding({"lsb": group.lsb}, model.sensor_rate_hz))
+    return {"hypothesis": law, **{key: float(f"{value:.6g}") for key, value in numbers.items()}}
+
+
+def rounding(group: Mapping[str, Any], rate_hz: float) -> float:
+    """White noise density that a sensor's read-out at this rate adds: lsb^2 / 12 to each reading."""
+    return float(group.get("lsb") or 0.0) / math.sqrt(12.0 * rate_hz)
+
+
+def without(N: float, added: float) -> float:
+    """The density beside which another one makes N."""
+    return math.sqrt(max(N * N - added * added, 1e-4 * N * N))
+
+
+def tree_of(
+    recording: Recording | None,
+    axes: Sequence[str] = (),
+    stated: Sequence[Stated] = (),
+    name: str | None = None,
+    rate: float | None = None,
+) -> tuple[dict[str, Any], list[str]]:
+    """The tree of a part's model file, and a line for each of its numbers. `axes`: columns that are axes beside gx to
+    az; `stated`: numbers of its data sheet; `rate`, Hz: without a recording. Raises UserError."""
+    tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+    said: list[str] = []
+    if recording is not None:
+        for axis in axes:
+            if axis not in recording.columns:
+                there = ", ".join(recording.columns)
+                raise UserError(f"{recording.path}: there is no column '{axis}' (there are {there})")
+        tree["groups"] = groups(tree["groups"], recording, axes)
+        tree["gate"]["N"] = dict.fromkeys(tree["groups"], 1.0)  # until N is known
+        said += of_recording(tree, recording)
+    else:
+        if rate is None and not any(one.key == "rate" for one in stated):
+            raise UserError("without a recording the part's rate is needed: --datasheet rate=200Hz")
+        tree["sensor"] = {"name": "", "rate_hz": rate, "filter_taps": 1}
+        for group in tree["groups"].values():
+            group |= {"range": 0.0, "lsb": 0.0}
+    said += of_sheet(tree, stated, recording is not None)
+    default = "part" if recording is None else recording.path.name.partition(".")[0]
+    return tree, said + finish(tree, name or default, recording)
 
 
 def as_text(tree: Mapping[str, Any], recording: Recording | None, said: Sequence[str]) -> str:

@@ -7,10 +7,15 @@ other absent key raises AttributeError, with the reason of an axis that has no r
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import io
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
+
+from selfcal.base.errors import UserError, install
+from selfcal.base.output import TABLE_WIDTH
 
 
 class Object(dict[str, Any]):
@@ -144,12 +149,91 @@ class IdentifiedAxis(Object):
         return max(self.hypotheses, key=lambda name: self.hypotheses[name])
 
 
-class Identification(Object):
+class Picture:
+    """A picture, which a notebook shows: its PNG."""
+
+    def __init__(self, png: bytes) -> None:
+        self.png = png
+
+    def _repr_png_(self) -> bytes:
+        return self.png
+
+
+class Document(Object):
+    """What a verb answers. Its repr is what the command prints."""
+
+    def _print(self, console: Any) -> None:
+        """Print it as the command does."""
+        raise NotImplementedError
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        """The rows of `to_frame`."""
+        raise NotImplementedError
+
+    def to_frame(self) -> Any:
+        """A pandas data frame of its numbers, a row each. Raises UserError where pandas is not installed."""
+        try:
+            import pandas
+        except ImportError:
+            raise UserError(f"to_frame() takes pandas: {install('pandas')}") from None
+        return pandas.DataFrame(list(self._rows()))
+
+    def _console(self, **more: Any) -> Any:
+        from rich.console import Console
+
+        console = Console(file=io.StringIO(), width=TABLE_WIDTH, **more)
+        self._print(console)
+        return console
+
+    def __repr__(self) -> str:
+        try:
+            return str(self._console().file.getvalue()).rstrip("\n")
+        except (KeyError, NotImplementedError):  # a part of a document, or one that has no table
+            return super().__repr__()
+
+    def _repr_html_(self) -> str:
+        form = '<pre style="white-space:pre;overflow-x:auto;line-height:normal">{code}</pre>'
+        return str(self._console(record=True, force_terminal=True).export_html(inline_styles=True, code_format=form))
+
+
+class Identification(Document):
     """`selfcal.identify/1`."""
 
     schema: str
     recording: Recording
     axes: dict[str, IdentifiedAxis]
+
+    def _print(self, console: Any) -> None:
+        from selfcal.show.table import show
+
+        show(self, console=console)
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        """Axis, law and parameter with the posterior; of an axis without a result the reason."""
+        for name, axis in self["axes"].items():
+            if "error" in axis:
+                yield {"axis": name, "error": axis["error"]}
+            for law, parameters in axis.get("parameters", {}).items():
+                for parameter, one in parameters.items():
+                    yield {
+                        "axis": name,
+                        "law": law,
+                        "probability": axis["hypotheses"][law],
+                        "parameter": parameter,
+                        **one,
+                    }
+
+    def plot(self, path: Path | str | None = None, *, datasheet: bool = False) -> Picture | None:
+        """The Allan deviation of each axis beside the model's, as `identify --plot` has it: a picture, which a notebook
+        shows, or the file `path`. `datasheet`: in the units of data sheets. Raises UserError."""
+        from selfcal.base.output import check_picture, png_of
+        from selfcal.show.allan_plot import figure_of, plot_allan
+
+        if path is None:
+            return Picture(png_of(figure_of(self, datasheet=datasheet), dpi=90))
+        check_picture(path)
+        plot_allan(self, path, datasheet=datasheet)
+        return None
 
 
 class Change(Object):
@@ -237,8 +321,8 @@ class DiagnosedAxis(Object):
     unfinished: str | None
 
 
-class Diagnosis(Object):
-    """`selfcal.diagnose/1`. `model`: the extended model, as a model file has it."""
+class Diagnosis(Document):
+    """`selfcal.diagnose/1`. `model`: the extended model, as a model file has it. Pictures: `diagnose(report=)`."""
 
     schema: str
     recording: Recording
@@ -246,8 +330,24 @@ class Diagnosis(Object):
     axes: dict[str, DiagnosedAxis]
     model: dict[str, Any]
 
+    def _print(self, console: Any) -> None:
+        from selfcal.show.findings import show
 
-class Comparison(Object):
+        show(self, console=console)
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        """Axis, cause and each number of its estimate; of an axis without a finding the verdict, or the reason."""
+        for name, axis in self["axes"].items():
+            head = {"axis": name, **{key: axis[key] for key in ("verdict", "error") if key in axis}}
+            if not axis.get("findings"):
+                yield head
+            for found in axis.get("findings", ()):
+                of = {**head, "cause": found["cause"], "evidence_gain_nats": found["evidence_gain_nats"]}
+                for key, value in found["estimate"].items():
+                    yield {**of, "key": key, **(value if isinstance(value, Mapping) else {"median": value})}
+
+
+class Comparison(Document):
     """`selfcal.compare/1`. By axis the list of its changes, or {"error": ..., "changes": [...]}; `verdicts` by
     recording and axis."""
 
@@ -255,3 +355,10 @@ class Comparison(Object):
     recordings: list[str]
     axes: dict[str, Any]
     verdicts: dict[str, dict[str, Any]]
+
+    def _rows(self) -> Iterator[dict[str, Any]]:
+        """Axis and each of its changes; of an axis that cannot be compared the reason."""
+        for name, axis in self["axes"].items():
+            if isinstance(axis, Mapping):
+                yield {"axis": name, "error": axis["error"]}
+            yield from ({"axis": name, **change} for change in (axis["changes"] if isinstance(axis, Mapping) else axis))

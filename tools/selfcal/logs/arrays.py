@@ -1,0 +1,94 @@
+"""Readings that are in memory: an array, a mapping of arrays, or a data frame becomes a table, as a file does."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.errors import UserError, short
+from selfcal.base.units import SENSORS
+from selfcal.logs.loaders.headings import split
+from selfcal.logs.loaders.table import Table, of_arrays
+
+#: Axes of an array by its columns.
+_COLUMNS = {1: SENSORS[:1], 3: SENSORS[:3], 6: SENSORS}
+#: Names of the three axes of a sensor.
+_THREE = {"gyro": SENSORS[:3], "accel": SENSORS[3:]}
+#: Columns that are no time.
+_SIDES = ("temp", "supply")
+#: Whole numbers of the time stamps of a data frame are so long.
+_STAMP = "datetime64[ns]"
+
+
+def in_memory(data: object) -> bool:
+    """Whether `data` is readings, and not the name of a file or a list of names."""
+    return isinstance(data, Mapping | np.ndarray) or (hasattr(data, "columns") and hasattr(data, "__getitem__"))
+
+
+def table_of(
+    data: Any, units: Mapping[str, str] | str, known: Collection[str], rate_hz: float | None, sensors: Collection[str]
+) -> tuple[Table, dict[str, str]]:
+    """The table of readings in memory, and the units of its columns that `units` states.
+
+    `data`: an array [n], [n, 3] or [n, 6] of gx, gy, gz, ax, ay, az; a mapping of arrays [n] by heading, with `gyro`
+    and `accel` [n, 3]; a data frame, whose index has the time if it is one of dates. `units`: of all axes, or by name,
+    where `gyro` and `accel` are their axes. `known`: names that an option maps to a column. Raises UserError.
+    """
+    arrays: dict[str, NDArray[Any]] = {}
+    for heading, array in _columns(data):
+        if heading in arrays:
+            raise UserError(f"arrays: column '{short(heading)}' appears twice")
+        arrays[heading] = array
+    plain = [heading for heading in arrays if split(heading) == (heading, None)]
+    stated: dict[str, str] = {}
+    for name, unit in ({"": units} if isinstance(units, str) else units).items():
+        meant = sensors if name == "" else _THREE.get(name, ())
+        stated |= dict.fromkeys([axis for axis in meant if axis in plain] or [name], unit)
+    lacking = [heading for heading in plain if heading in sensors and heading not in {*stated, *known}]
+    if lacking:
+        raise UserError(
+            f"arrays: no unit of {', '.join(lacking)}: give units={{'{lacking[0]}': 'deg/s'}}, or its own unit; or "
+            f"name it '{lacking[0]}[deg/s]'"
+        )
+    if rate_hz is None and {split(heading)[0] for heading in arrays} <= {*sensors, *_SIDES} and "t" not in known:
+        raise UserError("arrays: no time column: give rate_hz=100.0, or a column 't[s]'")
+    return of_arrays("", arrays), stated
+
+
+def _columns(data: Any) -> Iterator[tuple[str, NDArray[Any]]]:
+    """Headings and arrays [n]."""
+    if isinstance(data, np.ndarray):
+        yield from _axes("", data)
+        return
+    index = np.asarray(getattr(data, "index", ()))
+    names = [*data] if isinstance(data, Mapping) else list(data.columns)
+    if not isinstance(data, Mapping) and (index.dtype.kind == "M" or type(data.index).__name__ == "DatetimeIndex"):
+        yield "t[ns]", np.asarray(data.index, _STAMP).astype(np.int64)
+    for name in names:
+        values = data[name]
+        array = values.filled(np.nan) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+        if array.dtype.kind in "mM":  # dates, or times since a begin
+            yield (
+                ("t[ns]" if str(name) == "t" else f"{name}[ns]"),
+                array.astype(array.dtype.kind + "8[ns]").view(np.int64),
+            )
+        elif array.ndim == 1:
+            yield str(name), array
+        else:
+            yield from _axes(str(name), array)
+
+
+def _axes(name: str, array: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The columns of a matrix, one row a sample."""
+    own, unit = split(name) if name else ("", None)
+    columns = array.reshape(-1, 1) if array.ndim == 1 else array
+    axes = _THREE.get(own) if own else _COLUMNS.get(columns.shape[1])
+    if columns.ndim != 2 or axes is None or len(axes) != columns.shape[1]:
+        wanted = "takes 'gyro' or 'accel' of three columns" if name else "takes 1, 3 or 6 columns (gx gy gz ax ay az)"
+        what = f"'{short(name)}'" if name else "an array"
+        raise UserError(f"arrays: {what} of shape {array.shape}: {wanted}, a row a sample; name others one by one")
+    for axis, column in zip(axes, columns.T, strict=True):
+        yield (axis if unit is None else f"{axis}[{unit}]"), np.ascontiguousarray(column)
