@@ -87,8 +87,8 @@ def number(value: Any) -> Any:
     return value
 
 
-def shape_of(finding: dict[str, Any]) -> dict[str, Any]:
-    """The parts of a finding's estimate that all its axes have in common."""
+def shape_of(finding: dict[str, Any], axis: str = "") -> dict[str, Any]:
+    """The parts of a finding's estimate that all its axes have in common. `shared` noise is of the pair."""
     estimate = finding.get("estimate") or {}
     keys = ("time_s", "duration_s", "frequency_hz", "tau_s", "lag_s", "form", "other", "channel", "jumps")
     shape = {key: number(estimate[key]) for key in keys if estimate.get(key) is not None}
@@ -97,6 +97,8 @@ def shape_of(finding: dict[str, Any]) -> dict[str, Any]:
             shape[key] = finding[key]
     if "jumps" in shape:
         shape["jumps"] = [float(number(jump["time_s"])) for jump in shape["jumps"]]
+    if finding["cause"] == "shared" and "other" in shape:
+        shape["other"] = " ".join(sorted((axis, shape["other"])))
     return shape
 
 
@@ -131,21 +133,27 @@ def events(document: dict[str, Any], seconds: float) -> list[Event]:
     ]
     while left:
         name, finding = left.pop(0)
-        event = Event(finding["cause"], shape_of(finding), {name}, _nats(finding))
-        shared, grown = set(finding.get("shared_with") or []), True
+        event = Event(finding["cause"], shape_of(finding, name), {name}, _nats(finding))
+        shared, grown = _with(finding), True
         while grown:
             grown = False
             for other in list(left):
                 at, also = other
-                named = at in shared or event.axes & set(also.get("shared_with") or [])
-                if also["cause"] == event.cause and named and agree(event.shape, shape_of(also), seconds):
+                named = at in shared or event.axes & _with(also)
+                if also["cause"] == event.cause and named and agree(event.shape, shape_of(also, at), seconds):
                     event.axes.add(at)
                     event.nats += _nats(also)
-                    shared |= set(also.get("shared_with") or [])
+                    shared |= _with(also)
                     left.remove(other)
                     grown = True
         made.append(event)
     return sorted(made, key=lambda event: -event.nats)
+
+
+def _with(finding: dict[str, Any]) -> set[str]:
+    """Axes that a finding of an axis names as having it as well."""
+    pair = {(finding.get("estimate") or {}).get("other")} if finding["cause"] == "shared" else set()
+    return {*(finding.get("shared_with") or []), *pair} - {None}
 
 
 def _acts_on(axes: Any) -> set[str]:

@@ -233,6 +233,14 @@ def test_findings_of_one_shape_are_one_event() -> None:
     assert sorted(found) == [["ax"], ["gx", "gy"], ["gz"]]
 
 
+def test_noise_that_a_pair_shares_is_one_event() -> None:
+    """Both axes show it. Another pair is another event, and a leak has a direction."""
+    pairs = {"gx": "gy", "gy": "gx", "az": "gx"}
+    for cause, count in (("shared", 2), ("cross_axis", 3)):
+        found = document(**{name: [finding(cause, "", other=other)] for name, other in pairs.items()})
+        assert len(events(found, 10_800.0)) == count
+
+
 def test_finding_of_the_module_is_one_event() -> None:
     """Axes by their probability; a finding of an axis that belongs to it is no further event."""
     axes = {
