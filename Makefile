@@ -7,6 +7,7 @@
 #                               effects hidden in recordings: are they named?
 #   make hidden-physics [KINDS="turn_on tilt"] [SIZES=plain] [RECORDS=n] [SEED=n] [RATE=hz] [SECONDS=s] [OUT=dir]
 #                               effects from physics, by a generator that knows nothing of the detector
+#   make hidden-several [KINDS="step f_walk"] [RECORDS=n] [SEED=n] [OUT=dir]   one cause on several axes: named once?
 #   make false-alarms [RECORDS=n] [SEED=n] [RATE=hz]
 #                               clean axes that diagnose calls inadequate, in the forms of people's logs
 #   make soak                   a record of 10^8 bank samples

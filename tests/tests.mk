@@ -1,5 +1,5 @@
 # Suites and long runs, and the C tests: a part of the Makefile.
-.PHONY: quick test hidden hidden-physics false-alarms c-tests
+.PHONY: quick test hidden hidden-physics hidden-several false-alarms c-tests
 .PHONY: soak tolerances emulate calibration campaigns cases
 
 WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
@@ -37,6 +37,11 @@ hidden-physics: setup-dev
 	nice $(BIN)/python tests/hidden/physics_judge.py --records $(or $(RECORDS),10) $(if $(KINDS),--kinds $(KINDS)) \
 	    $(if $(SIZES),--sizes $(SIZES)) $(SEED:%=--seed %) $(if $(RATE),--rate $(RATE)) $(SECONDS:%=--seconds %) \
 	    $(if $(OUT),--out $(OUT))
+
+# The same.
+hidden-several: setup-dev
+	nice $(BIN)/python tests/hidden/several_judge.py --records $(or $(RECORDS),10) $(if $(KINDS),--kinds $(KINDS)) \
+	    $(SEED:%=--seed %) $(if $(OUT),--out $(OUT))
 
 false-alarms: setup-dev
 	nice $(BIN)/python tests/hidden/false_alarms.py $(RECORDS:%=--records %) $(SEED:%=--seed %) $(RATE:%=--rate %)
