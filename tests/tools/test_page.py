@@ -279,7 +279,7 @@ def test_the_findings_stand_at_the_top(case: Case) -> None:
     top = top[: top.index("GainNot found") if "GainNot found" in top else len(top)]
     assert "Not adequate: gx." in top and "Adequate: gy." in top
     first = top[: top.index("Readings of each axis")]
-    assert "nats" not in first and "round" not in first
+    assert "nats" not in first and "in round" not in first
     heads, *rows = cells_of(case.text, "What matters")
     assert heads == ["row", "from", "what", "size", "changes", "do"] and [row[0] for row in rows] == ["1", "2"]
     for row, finding in zip(rows, case.document["findings"], strict=False):

@@ -86,11 +86,13 @@ class Member:
 
 @dataclass
 class Event:
-    """One event or source: its `members`, the strongest first. `entry`: of a hidden quantity, which its pieces join."""
+    """One event or source: its `members`, the strongest first. `entry`: of a hidden quantity, which its pieces join.
+    `axes`: that it acts on, in the document's order."""
 
     members: list[Member]
     entry: dict[str, Any] | None = None
     id: str = ""
+    axes: list[str] = field(default_factory=list)
     changes: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     @property
@@ -126,8 +128,10 @@ def add_findings(
             members.append(Member(name, finding, entry, factor, _plain(one, finding, recording, factor)))
     events = grouped(members, quantity)
     for event in events:
+        acted = {*(event.entry or {"axes": ()})["axes"], *(member.axis for member in event.members)}
+        event.axes = [axis for axis in document["axes"] if axis in acted]
         event.changes = {
-            axis: _changes(event, axis, document["axes"][axis]["unit"], known.get(axis)) for axis in _axes(event)
+            axis: _changes(event, axis, document["axes"][axis]["unit"], known.get(axis)) for axis in event.axes
         }
     events.sort(key=lambda event: event.order)
     counts: dict[str, int] = {}
@@ -136,7 +140,7 @@ def add_findings(
         event.id = event.cause if counts[event.cause] == 1 else f"{event.cause}_{counts[event.cause]}"
         for member in event.members:
             member.entry["of"] = event.id
-            member.entry["shared_with"] = [axis for axis in _axes(event) if axis != member.axis]
+            member.entry["shared_with"] = [axis for axis in event.axes if axis != member.axis]
     document["findings"] = [_entry(event) for event in events]
     for entry in document["findings"]:
         if "frequency_hz" in entry["estimate"]:
@@ -181,12 +185,6 @@ def _apart(event: Event, member: Member) -> float:
     """Time between an event and a finding, s; 0 where they have none."""
     one, two = event.members[0].finding.look.when, member.finding.look.when
     return 0.0 if one is None or two is None else abs(one[0] - two[0])
-
-
-def _axes(event: Event) -> list[str]:
-    """The axes that it acts on, those of its entry and of its members."""
-    known = {} if event.entry is None else event.entry["axes"]
-    return sorted({*known, *(member.axis for member in event.members)}, key=lambda axis: (axis[0] == "a", axis))
 
 
 def _plain(one: Diagnosed, finding: Finding, recording: Recording, factor: float) -> float:
@@ -284,7 +282,7 @@ def _entry(event: Event) -> dict[str, Any]:
         entry = {
             "cause": event.cause,
             "estimate": _common([row["estimate"] for row in rows]),
-            "axes": {axis: _on(event, axis) for axis in _axes(event)},
+            "axes": {axis: _on(event, axis) for axis in event.axes},
             "evidence_nats": gain,
             "net_nats": min(gain, _worth(counted)),
             "confirmed": _confirmed([row["gain"] for row in rows]),

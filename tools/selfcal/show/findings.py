@@ -48,8 +48,7 @@ def show(
     if axes:
         console.print(_numbers(axes))
         say("without -> with the findings: medians ± half of the 90 % interval; –: looked for, not identified")
-    known = {name: axis["numbers"]["N"] for name, axis in axes.items() if "q05" in axis["numbers"]["N"]["after"]}
-    for line in noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()}):
+    for line in noisier_of(axes):
         say(line)
     if less:
         say(words.small(less) + ("" if details else " (--details)"))
@@ -71,6 +70,13 @@ def verdict(axis: Mapping[str, Any]) -> str:
     """The verdict on an axis, why it is not finished, and what the model file states already."""
     told = words.verdict(axis) + (f": {axis['unfinished']}" if axis.get("unfinished") else "")
     return told + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
+
+
+def noisier_of(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """The axes of a document that are noisier than their siblings, a line each."""
+    known = {name: axis["numbers"]["N"] for name, axis in axes.items() if "numbers" in axis}
+    known = {name: N for name, N in known.items() if "q05" in N["after"]}
+    return noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()})
 
 
 def _events(findings: Sequence[Mapping[str, Any]]) -> Table:

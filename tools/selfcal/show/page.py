@@ -25,7 +25,7 @@ from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.show import pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, number, outside_of, scrolled, strips
-from selfcal.show.findings import before_after
+from selfcal.show.findings import before_after, noisier_of
 
 #: Bytes of the page without its style, at most.
 SIZE_MOST = 990_000
@@ -95,6 +95,8 @@ main>section>.glance td{min-width:0}.matrix caption{white-space:nowrap}
 @media(max-width:600px){h1{font-size:1.3rem;margin:.6rem 0 .2rem}h2{margin:1rem 0 .3rem}.glance table{font-size:.8rem}
 .glance th,.glance td{padding-right:.55rem}
 .matrix th,.matrix td{padding-right:.3rem}.matrix td,.matrix thead th+th{min-width:2.1rem!important}}
+@media(max-width:600px){.events thead{display:none}.events td,.events th,.events tr{display:block;border:0}
+.events tr{border-bottom:1px solid var(--rule);padding:.3rem 0}.events td,.events th{padding:0}}
 summary h3{display:inline}
 pre{overflow-x:auto;background:var(--card);border:1px solid var(--rule);padding:10px;font-size:.85rem}
 code{font-size:.92em;overflow-wrap:anywhere}
@@ -262,6 +264,7 @@ def _summary(
         yield f"{_events('Small findings', 'One row an event or source.', less, axes)}</details>"
     if axes:
         yield _numbers(axes)
+        yield "".join(f"<p>{escape(line)}.</p>" for line in noisier_of(axes))
         yield _readings(shown, axes, found)
         yield _matrix(axes)
         yield _noise(axes, found, allan)
