@@ -123,16 +123,13 @@ def side_looks(state: State, record: Record, cause: str) -> list[Look]:
 
 
 def side_at(state: State, record: Record, cause: str, theta: Sequence[float]) -> Look:
-    """The look at a side channel that is known to act: in the form that shows best, else by the lag `theta`, or as it
-    is."""
-    channel = _side(record, cause)
-    found = look(state, [channel])
-    if found:
-        return found[0]
-    form, number = ("lag", theta[0]) if theta else ("static", math.nan)
-    option = column_of(channel, state, form, number, 0.0 if theta else channel.widths_s[1])
+    """The look at a side channel that is known to act, in the form `theta`: its place in FORMS, and its number or the
+    width of its means, s."""
+    channel, form, number = _side(record, cause), FORMS[int(theta[0])], float(theta[1])
+    means = form not in NUMBER
+    option = column_of(channel, state, form, math.nan if means else number, number if means else 0.0)
     gain, fit = state.with_columns(option.columns)
-    chosen = _Tried(option, gain, net(gain), fit)
+    chosen = _Tried(option, gain, net(gain, len(option.regressors)), fit)
     changes = {"regressors": (*state.regressors, *option.regressors)}
     estimate = _estimate(state, channel, chosen)
     return Look(cause, gain, chosen.net, estimate, changes, measure=partial(_measured, channel, chosen))

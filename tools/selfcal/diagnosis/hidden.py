@@ -20,6 +20,7 @@ from selfcal.likelihood.fit import best
 from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES
 from selfcal.likelihood.joint import (
     LEAST_AXES,
+    Bins,
     Course,
     Joint,
     ahead,
@@ -29,6 +30,7 @@ from selfcal.likelihood.joint import (
     fitted,
     without_each,
     without_lines,
+    without_pair,
 )
 from selfcal.likelihood.state import NET_LEAST, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import Array
@@ -136,6 +138,19 @@ class Hidden:
         ln_odds = math.log(P_ACTS / (1.0 - P_ACTS)) + gain - math.log1p(abs(size) / sd)
         probability = 1.0 / (1.0 + math.exp(-max(-700.0, min(700.0, ln_odds))))
         return On(size, sd, probability, Regressor(ID, ID, column, "1", {}))
+
+    def explains(self, one: str, two: str, upto_hz: float) -> bool:
+        """Whether noise that two axes share below a frequency is the quantity's: beside it their white noise does not
+        go together."""
+        if not {one, two} <= set(self.names) or upto_hz > 0.501 / self.dt:
+            return False
+        at = [self.names.index(name) for name in (one, two)]
+        return without_pair(self.bins, self.model, at[0], at[1]) < NET_LEAST
+
+    @cached_property
+    def bins(self) -> Bins:
+        """Spectra of the records."""
+        return bins_of(bridged_rows(self.y))
 
     def correlation(self, one: str, two: str) -> float:
         """Of the white noise of two axes."""

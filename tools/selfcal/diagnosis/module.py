@@ -15,11 +15,12 @@ from functools import cached_property
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
+from scipy.special import logsumexp
 
 from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
-from selfcal.diagnosis.forms import LN_FORMS, LN_SLOW, LN_SMOOTHINGS, LONGEST_LAG
+from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SLOW, LN_SMOOTHINGS, LONGEST_LAG
 from selfcal.diagnosis.hidden import Hidden, blocks, of_model, weighed
 from selfcal.likelihood.joint import (
     Act,
@@ -45,8 +46,10 @@ LEAST, GAPS = 600, 0.3
 CERTAIN = 25.0
 #: Events of a module at most, those of one axis among them.
 MOST = 16
-#: Own drifts are smaller by exp of these beside a slow column: the drift that was fitted without it has swallowed it.
-STIFFER = (0.0, 1.5, 3.0)
+#: Slow columns whose drift is fitted anew beside them: the one that was fitted without has swallowed a part of them.
+REFITTED = 3
+#: Places beside the best one that share its evidence.
+NEAR = 30
 #: Means at most that slow columns are looked for in.
 COARSE = 2000
 #: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
@@ -63,6 +66,8 @@ WANDERS = 0.02
 PATTERN = 0.7
 #: Causes of those jumps.
 JUMPS = ("step", "pulse")
+#: Causes that the quantity may be, with that pattern: its course has any shape.
+OF_TIME = (*JUMPS, "ramp", "turn_on")
 #: Smoothing of a channel, s, and windows of its rate.
 SMOOTH_S, RATES_S = 30.0, (60.0, 400.0)
 
@@ -125,12 +130,13 @@ class Seen:
         return course(self.model, self.y, smooth=True)
 
     @cached_property
-    def slow(self) -> list[tuple[Joint, Course, float]]:
-        """Models with smaller drifts, of `coarse` means, their filters, and what they are worth less."""
-        models = [self.model.of_means(self.coarse).stiffer(by) for by in STIFFER]
-        y = np.array([blocks(row, self.coarse) for row in self.y])
-        courses = [course(one, y, smooth=True) for one in models]
-        return [(a, b, b.ln_likelihood - courses[0].ln_likelihood) for a, b in zip(models, courses, strict=True)]
+    def slow(self) -> Course:
+        """The filter of `coarse` means."""
+        return self.filtered(self.model, self.y)
+
+    def filtered(self, model: Joint, y: Array) -> Course:
+        """The filter of a model over `coarse` means of records [m, n]."""
+        return course(model.of_means(self.coarse), np.array([blocks(row, self.coarse) for row in y]), smooth=True)
 
     @property
     def edge(self) -> int:
@@ -171,14 +177,21 @@ def _best(score: Array, known: Array, apart: int) -> list[int]:
     return list(dict.fromkeys(found))
 
 
+def _shared(gain: Array, at: int) -> float:
+    """ln of the number of places about the best one that share its evidence, by their gains [n]."""
+    near = gain[max(0, at - NEAR) : at + NEAR + 1] - gain[at]
+    return float(logsumexp(np.minimum(near, 0.0)))
+
+
 def steps(seen: Seen) -> Iterator[Candidate]:
     """A jump of the levels at each sample."""
     score = np.where(seen.passed[:, None], 0.0, seen.course.shock)
     score[: seen.edge] = score[-seen.edge :] = 0.0
+    gain = full(score, seen.course.known)
     for at in _best(score, seen.course.known, EDGE):
         column = (np.arange(seen.n) >= at).astype(float)
         found = act(score[at][None], seen.course.known[at])
-        yield Candidate("step", (at * seen.dt,), found, math.log(seen.n), column[None])
+        yield Candidate("step", (at * seen.dt,), found, math.log(seen.n) - _shared(gain, at), column[None])
 
 
 def pulses(seen: Seen) -> Iterator[Candidate]:
@@ -186,7 +199,7 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
     count = max(1, int(math.log(seen.n / 3.0 / SHORTEST) / math.log(LONGER)))
     lengths = np.unique((SHORTEST * LONGER ** np.arange(count)).astype(int))
     shock = seen.course.shock
-    price = math.log(seen.n) + math.log(lengths.size)
+    octaves = math.log(seen.n / 3.0 / SHORTEST)
     best: list[tuple[float, int, int]] = []
     for length in map(int, lengths):
         score = shock[:-length] - shock[length:]
@@ -198,9 +211,10 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         at = int(np.argmax(gain))
         best.append((float(gain[at]), at, at + length))
     for _, first, last in sorted(best, reverse=True)[:PLACES]:
-        begin, end = _moved(seen, first, last)
+        begin, end, alike = _moved(seen, first, last)
         if end - begin < SHORTEST:
             continue
+        price = math.log(seen.n) + math.log((end - begin) * octaves) - alike
         column = np.zeros(seen.n)
         column[begin:end] = 1.0
         known = information(seen.model, seen.course, column[None])[0]
@@ -208,9 +222,10 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         yield Candidate("pulse", (begin * seen.dt, end * seen.dt), found, price, column[None])
 
 
-def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int]:
-    """Each place of a pulse in turn at its best within a fifth of its length."""
-    shock = seen.course.shock
+def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int, float]:
+    """Each place of a pulse in turn at its best within a fifth of its length, and ln of the number of pairs of places
+    that share its evidence."""
+    shock, alike = seen.course.shock, [0.0, 0.0]
     reach = max(2, (end - begin) // 5)
     for _ in range(2):
         for first in (False, True):
@@ -223,9 +238,11 @@ def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int]:
             other = end if first else begin
             cross = seen.cross[np.minimum(np.abs(places - other), seen.cross.shape[0] - 1)]
             known = seen.course.known[places] + seen.course.known[other] - cross - np.swapaxes(cross, 1, 2)
-            at = int(places[np.argmax(full(shock[places] - shock[other], known))])
+            gain = full(shock[places] - shock[other], known)
+            best = int(np.argmax(gain))
+            at, alike[first] = int(places[best]), _shared(gain, best)
             begin, end = (at, end) if first else (begin, at)
-    return begin, end
+    return begin, end, sum(alike)
 
 
 def lines(seen: Seen) -> Iterator[Candidate]:
@@ -286,39 +303,54 @@ def channels(seen: Seen) -> Iterator[Candidate]:
         about = values - values.mean()
         smooth = uniform_filter1d(about, max(1, round(SMOOTH_S / seen.dt)), mode="nearest")
         price = LN_SMOOTHINGS + LN_SLOW
-        shapes: list[Shape] = [(cause, (), about, price), (cause, (), smooth, price)]
+        static = FORMS.index("static")
+        shapes: list[Shape] = [(cause, (static, 1.0), about, price), (cause, (static, SMOOTH_S), smooth, price)]
         lag = 4.0 * seen.dt * seen.coarse
         while lag < LONGEST_LAG * seen.n * seen.dt:
-            shapes.append((cause, (lag,), formed(about, "lag", lag, 0.0, seen.dt), price + LN_FORMS["lag"]))
+            shapes.append(
+                (cause, (FORMS.index("lag"), lag), formed(about, "lag", lag, 0.0, seen.dt), price + LN_FORMS["lag"])
+            )
             lag *= 2.0
         shapes += [
-            (cause, (), slope(about, window, seen.dt) * window, price + LN_FORMS["rate"])
+            (cause, (FORMS.index("rate"), window), slope(about, window, seen.dt) * window, price + LN_FORMS["rate"])
             for window in RATES_S
             if window < seen.n * seen.dt / 6.0
         ]
-        shapes.append((cause, (), smooth**2 - np.mean(smooth**2), price + LN_FORMS["square"]))
+        shapes.append(
+            (cause, (FORMS.index("square"), SMOOTH_S), smooth**2 - np.mean(smooth**2), price + LN_FORMS["square"])
+        )
         yield from _weighed(seen, [one for one in shapes if np.ptp(one[2]) > 0.0])
 
 
 def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
-    """Slow columns, each at the drift that suits it best."""
+    """Slow columns. Beside the best ones the drifts are fitted anew."""
     columns = np.array([one[2] / max(float(np.std(one[2])), 1e-300) for one in shapes])
     means = np.array([blocks(one, seen.coarse) for one in columns])
-    best: dict[int, Candidate] = {}
-    for model, found, less in seen.slow:
-        known = information(model, found, means)
-        score = means @ found.weights
-        for k, (cause, theta, _, price) in enumerate(shapes):
-            if full(score[k], known[k]) + less < NET_LEAST:
-                continue
-            one = Candidate(cause, theta, act(score[k][None], known[k]), price, columns[k][None], less)
-            if k not in best or best[k].evidence < one.evidence:
-                best[k] = one
-    yield from best.values()
+    score = means @ seen.slow.weights
+    known = information(seen.model.of_means(seen.coarse), seen.slow, means)
+    gain = full(score, known)
+    for k in np.argsort(-gain)[:REFITTED]:
+        if gain[k] < NET_LEAST:
+            return
+        cause, theta, _, price = shapes[k]
+        size = np.linalg.solve(known[k] + 1e-9 * np.trace(known[k]) * np.eye(len(seen.y)), score[k])
+        model = fitted(
+            bins_of(bridged_rows(seen.y - np.outer(size, columns[k]))),
+            seen.dt,
+            bool(seen.model.loading.any()),
+            seen.model,
+        )
+        beside = seen.filtered(model, seen.y)
+        less = min(0.0, beside.ln_likelihood - seen.slow.ln_likelihood)
+        own = information(model.of_means(seen.coarse), beside, means[[k]])[0]
+        again = Candidate(cause, theta, act((means[k] @ beside.weights)[None], own), price, columns[k][None], less)
+        plain = Candidate(cause, theta, act(score[k][None], known[k]), price, columns[k][None])
+        yield max(again, plain, key=lambda one: one.evidence)
 
 
 #: The searches, each with the columns that it looks for.
 FAMILIES: tuple[Callable[[Seen], Iterator[Candidate]], ...] = (steps, pulses, lines, transients, channels)
+OF_JUMPS = (steps, pulses)
 
 
 @dataclass
@@ -340,25 +372,31 @@ class Search:
         """Look until nothing is worth `least`, nats. A candidate with the pattern of the quantity in the model is that
         one's own."""
         passed = np.zeros(self.y.shape[1], bool)
+        seen: Seen | None = None
+        known: dict[int, list[Candidate]] = {}
         for _ in range(MOST - len(self.several) - len(self.single)):
-            seen = Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s, passed)
-            found = max(
-                (one for family in FAMILIES for one in family(seen)), key=lambda one: one.evidence, default=None
-            )
+            if seen is None:
+                seen = Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s, passed)
+                known = {k: list(family(seen)) for k, family in enumerate(FAMILIES)}
+            found = max((one for each in known.values() for one in each), key=lambda one: one.evidence, default=None)
             if found is None or found.evidence < least:
                 return
-            if self._is_own(found):
+            if not self._is_own(found):
+                (self.several if len(found.act.axes) > 1 else self.single).append(found)
+                self.rest = self.rest - found.effect
+                self.refit()
+                seen = None
+            elif found.cause in JUMPS:
                 for time in found.theta:
                     at = round(time / self.dt)
                     passed[max(0, at - 3) : at + 4] = True
-                continue
-            (self.several if len(found.act.axes) > 1 else self.single).append(found)
-            self.rest = self.rest - found.effect
-            self.refit()
+                known |= {k: list(family(seen)) for k, family in enumerate(FAMILIES) if family in OF_JUMPS}
+            else:
+                known = {k: [one for one in each if one is not found] for k, each in known.items()}
 
     def _is_own(self, one: Candidate) -> bool:
-        """Whether an event has the pattern of the quantity in the model."""
-        return one.cause in JUMPS and one.share_of(self.model.loading) > PATTERN
+        """Whether it has the pattern of the quantity in the model, in time and over the axes."""
+        return one.cause in OF_TIME and one.share_of(self.model.loading) > PATTERN
 
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. Events with its pattern are its own."""

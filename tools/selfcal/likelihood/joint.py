@@ -19,7 +19,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Mask
@@ -41,8 +41,8 @@ FASTEST_S = 10.0
 #: Prior standard deviations of ln sizes and ln rates about the middle of their limits: they keep what the record does
 #: not know from running away, and change ln likelihood by a few tenths elsewhere.
 PRIOR_SD = 3.0
-#: Probability that an axis has a jump that is somewhere; widths of its size, in its own standard deviations.
-P_AXIS, WIDTHS = 0.3, (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+#: Probability that an axis has a column that is there; widths of the size of a column, in its own standard deviations.
+P_AXIS, WIDTHS = 0.5, (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 #: A filter has settled when its covariance changes by less than this share a step.
 SETTLED = 1e-7
 #: Numbers of an axis' own drift: ln of white noise, walk a step, Gauss-Markov deviation, rate a sample.
@@ -154,10 +154,6 @@ class Joint:
     def without_f(self) -> Joint:
         """The same model less f."""
         return replace(self, loading=np.zeros_like(self.loading))
-
-    def stiffer(self, by: float) -> Joint:
-        """The same with own drifts smaller by exp(-by)."""
-        return replace(self, own=self.own - by * np.array([0.0, 1.0, 1.0, 0.0]))
 
     def of_means(self, block: int) -> Joint:
         """The same of means of so many samples, for columns that are slow beside them."""
@@ -305,16 +301,26 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
 
 def without_each(bins: Bins, model: Joint) -> Array:
     """What ln likelihood loses [m] where f does not move an axis."""
+    every = range(model.loading.size)
+    none = [replace(model, loading=np.where(np.arange(len(every)) == k, 0.0, model.loading)) for k in every]
+    return _value(bins, model) - np.array([_value(bins, one) for one in none])
+
+
+def without_pair(bins: Bins, model: Joint, one: int, two: int) -> float:
+    """The same where the white noise of two axes does not go together; infinite where the others need it to."""
+    correlation = model.correlation.copy()
+    correlation[one, two] = correlation[two, one] = 0.0
+    if float(np.linalg.eigvalsh(correlation)[0]) < 1e-6:
+        return math.inf
+    return _value(bins, model) - _value(bins, replace(model, correlation=correlation))
+
+
+def _value(bins: Bins, model: Joint) -> float:
+    """ln likelihood by Whittle, with the priors."""
     cost = _Cost(bins, True)
     root = np.linalg.cholesky(model.correlation)
     root = (root / np.diag(root)[:, None])[_lower(cost.m)]
-    relative = model.loading / model.white
-
-    def value(loading: Array) -> float:
-        return cost(np.concatenate([model.own.ravel(), root, loading, [math.log(model.rate)]]))[0]
-
-    found: Array = np.array([value(np.where(np.arange(cost.m) == k, 0.0, relative)) for k in range(cost.m)])
-    return found - value(relative)
+    return -cost(np.concatenate([model.own.ravel(), root, model.loading / model.white, [math.log(model.rate)]]))[0]
 
 
 def _together(bins: Bins, own: Array) -> Array:
@@ -506,13 +512,16 @@ class Act:
 
 
 def act(score: Array, known: Array) -> Act:
-    """Of scores [p, m] of the p parts of a column that share the information `known` [m, m]: a sum over the sets of
-    axes. Sizes are normal about 0 with one width for all axes of a set, in standard deviations of each axis' own."""
+    """Of scores [p, m] of the p parts of a column that share the information `known` [m, m].
+
+    The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. Sizes are
+    normal about 0 with one width for all axes of a set, in standard deviations of each axis' own. The probability of an
+    axis is what its own readings say: before the record it is P_AXIS, whatever the others do."""
     p, m = score.shape
     scale = 1.0 / np.sqrt(np.maximum(np.diag(known), 1e-300))
     z, R = score * scale, known * np.outer(scale, scale)
     widths = np.array(WIDTHS)
-    values, members = [], []
+    values, members, of_count, of_axis = [], [], [], []
     for count in range(1, m + 1):
         sets = np.array(list(combinations(range(m), count)))
         rho = R[sets[:, :, None], sets[:, None, :]][None]
@@ -521,16 +530,18 @@ def act(score: Array, known: Array) -> Act:
         explained = 0.5 * (x * np.linalg.solve(firm, np.broadcast_to(x, (widths.size, *x.shape[1:])))).sum(axis=(2, 3))
         volume = np.linalg.slogdet(firm)[1] + 2.0 * count * np.log(widths)[:, None]
         ln_bf = logsumexp(explained - 0.5 * p * volume, axis=0) - math.log(widths.size)
-        values.append(ln_bf + count * math.log(P_AXIS) + (m - count) * math.log1p(-P_AXIS))
+        values.append(ln_bf)
+        of_count.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
+        of_axis.append(np.full(len(sets), count * math.log(P_AXIS / (1.0 - P_AXIS))))
         one = np.zeros((len(sets), m))
         np.put_along_axis(one, sets, 1.0, axis=1)
         members.append(one)
-    ln_weight = np.concatenate(values)
-    total = float(logsumexp(ln_weight))
-    probability = np.exp(ln_weight - total) @ np.vstack(members)
+    ln_bf = np.concatenate(values)
+    total = float(logsumexp(ln_bf + np.concatenate(of_count)))
+    probability = softmax(ln_bf + np.concatenate(of_axis)) @ np.vstack(members)
     held = np.flatnonzero(probability >= 0.5)
     size, sd = np.zeros((p, m)), np.full(m, math.inf)
     if held.size:
         inverse = np.linalg.inv(known[np.ix_(held, held)])
         size[:, held], sd[held] = score[:, held] @ inverse, np.sqrt(np.diag(inverse))
-    return Act(total - math.log1p(-((1.0 - P_AXIS) ** m)), probability, size, sd)
+    return Act(total, probability, size, sd)

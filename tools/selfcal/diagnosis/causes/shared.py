@@ -244,6 +244,10 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         both = common(pair, math.log(len(pairs)))
         if both is None or both.net < NET_LEAST:
             continue
+        hidden = next((found[name].hidden for name in names if name in found), None)
+        upto = 0.5 / one.dt if both.band is None else both.band[1] / (pair.u.size * one.dt)
+        if hidden is not None and hidden.explains(*names, upto):
+            continue
         for name, other in (names, names[::-1]):
             if name in found:
                 findings = found[name].findings
