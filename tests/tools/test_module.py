@@ -131,11 +131,11 @@ def test_an_event_of_several_axes_has_their_names(cause: str, shape: Any, nats: 
         assert found.hidden is None
         if [event.cause for event in found.events] == [cause]:
             (event,) = found.events
-            close = all(
-                abs(a - b) < (0.5 / n if cause == "periodic" else 5.0) for a, b in zip(event.theta, theta, strict=True)
-            )
-            right += close and event.act.axes == axes
-    # An axis of 16 nats is below the limit of its own prior in 1 of 50; four axes: 8 % of the records.
+            far = 0.5 / n if cause == "periodic" else 5.0
+            close = all(abs(a - b) < far for a, b in zip(event.theta, theta, strict=True))
+            right += close and set(axes) <= set(event.act.axes) and len(event.act.axes) <= 5
+    # One of the other two axes is named where its own readings speak for it by chance: 1 in 10. One of 16 nats is
+    # missed in 1 of 30.
     assert right >= math.floor(0.85 * records)
 
 

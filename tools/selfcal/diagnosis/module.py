@@ -56,6 +56,8 @@ COARSE = 2000
 PLACES = 4
 #: Samples at each end in which no step is looked for, and of a pulse at least.
 EDGE, SHORTEST = 4, 4
+#: Share of the information of a step far from the ends, from which on two of them are taken as there.
+WHOLE = 0.95
 #: Durations of a pulse, a factor apart.
 LONGER = 1.15
 #: Bins about a frequency that tell its noise.
@@ -200,13 +202,15 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
     lengths = np.unique((SHORTEST * LONGER ** np.arange(count)).astype(int))
     shock = seen.course.shock
     octaves = math.log(seen.n / 3.0 / SHORTEST)
+    every = np.diagonal(seen.course.known, axis1=1, axis2=2)
+    near_end = np.any(every < WHOLE * np.diag(seen.cross[0]), axis=1)
     best: list[tuple[float, int, int]] = []
     for length in map(int, lengths):
         score = shock[:-length] - shock[length:]
         cross = seen.cross[length]
         known = seen.course.known[:-length] + seen.course.known[length:] - cross - cross.T
         score[: seen.edge] = score[-seen.edge :] = 0.0
-        score[seen.passed[:-length] & seen.passed[length:]] = 0.0
+        score[near_end[:-length] | near_end[length:] | (seen.passed[:-length] & seen.passed[length:])] = 0.0
         gain = full(score, known)
         at = int(np.argmax(gain))
         best.append((float(gain[at]), at, at + length))
