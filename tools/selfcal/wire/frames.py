@@ -99,6 +99,7 @@ REASONS = {
     "not_identified": "not yet identified: leave it at rest for longer",
     "bad_sample": "bad sample, not finite or saturated on some axis: look at the sensor",
     "stuck": "stuck at one reading: exchange the sensor",
+    "overtaken": "no report yet, samples overtook each: call selfcal_imu_work() more often, or codegen --hold",
 }
 
 
