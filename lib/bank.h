@@ -276,6 +276,9 @@ static inline bool is_state_node(const selfcal_t *self, const selfcal_node_t *no
     return self->terms != NULL && !node->level && node->gains.moving.c == R(0.0);
 }
 
+/* adequacy.c: what all epochs have gathered of an axis has been told. */
+void selfcal_adequacy_forget(selfcal_adequacy_t *self, uint8_t axis);
+
 /* --- converged nodes --- */
 
 /* 1/(1 + p_inf) to twice the digits: one Newton step on the residual of the quotient. */

@@ -171,8 +171,8 @@ typedef enum {
     SELFCAL_SUSPECT_FLICKER = 6, /* or another drift than the law's */
     SELFCAL_SUSPECT_VARIANCE_CHANGE = 7,
     SELFCAL_SUSPECT_OUTLIERS = 8,
-    SELFCAL_SUSPECT_STEP = 9, /* this and motion: of a selfcal_change_t alone */
-    SELFCAL_SUSPECT_MOTION = 10
+    SELFCAL_SUSPECT_STEP = 9,
+    SELFCAL_SUSPECT_MOTION = 10 /* several axes step at once */
 } selfcal_suspect_t;
 
 /* Why an axis is not judged, has no corrected sample, or has a calibration that is not to be relied on. */

@@ -490,7 +490,20 @@ typedef struct {
 typedef struct {
     selfcal_real_t n, lag, slow, along[SELFCAL_ADEQUACY_COLUMNS], weight[SELFCAL_ADEQUACY_COLUMNS];
     selfcal_real_t product[SELFCAL_AXES_MAX]; /* with each other axis */
+    selfcal_real_t power;                     /* of z */
 } selfcal_sums_t;
+
+/* Sums of z, and of the w of each column, over a window and the two before it; of the epoch the greatest rise of z from
+ * one window to the next but one, and how far the columns rise there. */
+enum { SELFCAL_RISE_WINDOWS = 3 };
+typedef struct {
+    selfcal_real_t sum[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_RISE_WINDOWS];
+    selfcal_real_t most, along[SELFCAL_ADEQUACY_COLUMNS];
+    uint32_t at; /* bank samples of the epoch before it */
+    /* the last step of an epoch before: its score, times the root of the bank samples then */
+    selfcal_real_t told;
+    selfcal_suspect_t cause;
+} selfcal_rise_t;
 
 typedef struct {
     bool known, running, begun;
@@ -501,6 +514,7 @@ typedef struct {
     selfcal_real_t state[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_FILTER_STATES];
     selfcal_real_t covariance[SELFCAL_FILTER_STATES * (SELFCAL_FILTER_STATES + 1) / 2];
     selfcal_real_t last, slow, fourth, square[2];
+    selfcal_rise_t rise;
     selfcal_sums_t epoch, all;
 } selfcal_watch_t;
 
