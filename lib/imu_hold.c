@@ -30,11 +30,11 @@ static selfcal_t *hold(const selfcal_t *self, uint8_t axis, selfcal_t *held) {
     return held;
 }
 
-static void follow(selfcal_imu_t *imu) {
+static void take_copy(selfcal_imu_t *imu) {
     selfcal_work_t *work = &imu->work;
     if (work->bank == &imu->bank && work->stage > GATHER) {
         work->bank = hold(&imu->bank, work->axis, imu->held);
     }
 }
 
-const selfcal_holding_code_t selfcal_holding_code = {follow};
+const selfcal_holding_code_t selfcal_holding_code = {take_copy};
