@@ -22,6 +22,7 @@
  *   variance    sum (z^2 - 1) / sqrt(2 n), and its difference between the second half and the first
  *   kurtosis    sum (z^4 - 6 z^2 + 3) / sqrt(24 n)
  *
+ * A coarse bank (coarse.c) looks for channels, a ramp and a warm-up as well, by no law of a report.
  * All but the step and the last two are also summed over all epochs, which finds an effect that is small and lasts.
  * A step pulls at the channels as well, so it goes before them, unless a channel itself has such a step at that time.
  * Steps of several axes at one time are motion.
@@ -420,6 +421,8 @@ void selfcal_adequacy_forget(selfcal_adequacy_t *self, uint8_t axis) {
     for (uint8_t other = 0; other < SELFCAL_AXES_MAX; other++) {
         self->watch[other].all.product[axis] = R(0.0);
     }
+    selfcal_coarse_restart(&self->coarse);
+    self->coarse.before[axis].score = R(0.0);
 }
 
 /* A step of this epoch; with it another of `others`, all of them have moved. What went before it has been told then.
@@ -463,6 +466,9 @@ static void judge_axis(selfcal_adequacy_t *self, uint8_t axis, uint32_t others) 
     if (!weigh_step(&found, self, axis, others)) {
         weigh_causes(&found, &watch->epoch, now, known);
         weigh_causes(&found, &watch->all, ever, R(1.0));
+        selfcal_suspect_t cause = SELFCAL_SUSPECT_NONE;
+        const selfcal_real_t score = selfcal_coarse_score(&self->coarse, axis, &cause);
+        suspect(&found, cause, score, (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT);
     }
     if (found.most <= R(1.0)) {
         const selfcal_real_t limit = (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT_VARIANCE;
@@ -480,10 +486,14 @@ static void judge_axis(selfcal_adequacy_t *self, uint8_t axis, uint32_t others) 
 
 /* --- bank samples --- */
 
+static selfcal_real_t mean_of(const selfcal_adequacy_t *self, size_t k) {
+    return self->used > 0U ? self->sum[k] / (selfcal_real_t)self->used : R(0.0);
+}
+
 /* The means of the interval's inputs less their values at the start of the epoch. */
 static void inputs_of(selfcal_adequacy_t *self, size_t inputs, selfcal_real_t mean[]) {
     for (size_t k = 0; k < inputs; k++) {
-        mean[k] = self->used > 0U ? self->sum[k] / (selfcal_real_t)self->used : R(0.0);
+        mean[k] = mean_of(self, k);
         if (self->count == 0U) {
             self->base[k] = mean[k];
         }
@@ -583,6 +593,10 @@ void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, cons
         const selfcal_batch_t *batch = &bank->batch[bank->gathering];
         if (batch->count == 0U) {
             batch = &bank->batch[1U - bank->gathering];
+        }
+        if (batch->count > 0U && bank->model->regressors == NULL) {
+            const selfcal_real_t channel[SELFCAL_ADEQUACY_CHANNELS] = {mean_of(self, 0), mean_of(self, 1)};
+            selfcal_coarse_take(&self->coarse, batch, batch->count - 1U, channel, bank->model);
         }
         if (any && batch->count > 0U) {
             take(self, bank, batch, batch->count - 1U);

@@ -279,6 +279,13 @@ static inline bool is_state_node(const selfcal_t *self, const selfcal_node_t *no
 /* adequacy.c: what all epochs have gathered of an axis has been told. */
 void selfcal_adequacy_forget(selfcal_adequacy_t *self, uint8_t axis);
 
+/* coarse.c: a bank sample, with the channels' means; the score of the strongest column of an axis, and which it is; the
+ * bank begins anew. */
+void selfcal_coarse_take(selfcal_coarse_t *self, const selfcal_batch_t *batch, uint32_t at,
+                         const selfcal_real_t channel[], const selfcal_model_t *model);
+selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, selfcal_suspect_t *suspect);
+void selfcal_coarse_restart(selfcal_coarse_t *self);
+
 /* --- converged nodes --- */
 
 /* 1/(1 + p_inf) to twice the digits: one Newton step on the residual of the quotient. */

@@ -172,7 +172,8 @@ typedef enum {
     SELFCAL_SUSPECT_VARIANCE_CHANGE = 7,
     SELFCAL_SUSPECT_OUTLIERS = 8,
     SELFCAL_SUSPECT_STEP = 9,
-    SELFCAL_SUSPECT_MOTION = 10 /* several axes step at once */
+    SELFCAL_SUSPECT_MOTION = 10, /* several axes step at once */
+    SELFCAL_SUSPECT_TURN_ON = 11
 } selfcal_suspect_t;
 
 /* Why an axis is not judged, has no corrected sample, or has a calibration that is not to be relied on. */

@@ -546,6 +546,28 @@ struct selfcal_changes {
     selfcal_change_watch_t watch[SELFCAL_AXES_MAX];
 };
 
+/* coarse.c: filters, shared by the axes; an axis's part of one; what was said before the last restart. */
+enum { SELFCAL_COARSE_FILTERS = 16, SELFCAL_COARSE_COLUMNS = 3 + SELFCAL_ADEQUACY_CHANNELS };
+typedef struct {
+    selfcal_real_t variance, ln_s;                                                 /* of the level; sum D */
+    selfcal_real_t column[SELFCAL_COARSE_COLUMNS], weight[SELFCAL_COARSE_COLUMNS]; /* level and sum A of each */
+} selfcal_coarse_filter_t;
+typedef struct {
+    selfcal_real_t level, square, along[SELFCAL_COARSE_COLUMNS]; /* of the readings; sums C and B */
+} selfcal_coarse_cell_t;
+typedef struct {
+    selfcal_real_t score;
+    selfcal_suspect_t suspect;
+} selfcal_coarse_told_t;
+typedef struct {
+    uint32_t n;                                              /* bank samples */
+    selfcal_real_t elapsed;                                  /* intervals since the first */
+    selfcal_real_t first[SELFCAL_ADEQUACY_CHANNELS], lagged; /* channels at the first; the temperature's low pass */
+    selfcal_coarse_filter_t filter[SELFCAL_COARSE_FILTERS];
+    selfcal_coarse_cell_t cell[SELFCAL_AXES_MAX][SELFCAL_COARSE_FILTERS];
+    selfcal_coarse_told_t before[SELFCAL_AXES_MAX];
+} selfcal_coarse_t;
+
 struct selfcal_adequacy {
     selfcal_changes_t *changes; /* NULL: they are not looked for */
     void (*look)(selfcal_adequacy_t *self, const selfcal_t *bank, const selfcal_real_t z[], uint32_t gap);
@@ -554,6 +576,7 @@ struct selfcal_adequacy {
     selfcal_real_t first[SELFCAL_ADEQUACY_INPUTS], held[SELFCAL_ADEQUACY_INPUTS];
     selfcal_real_t base[SELFCAL_ADEQUACY_INPUTS], sum[SELFCAL_ADEQUACY_INPUTS];
     float coldest, warmest; /* of the bank intervals' temperatures; NAN: there has been none */
+    selfcal_coarse_t coarse;
     selfcal_watch_t watch[SELFCAL_AXES_MAX];
     selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
 };
