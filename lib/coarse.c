@@ -5,9 +5,9 @@
  * Filter f has the level as its state, with the walk rho_f sigma_v an interval. It runs from the first bank sample on,
  * over the readings (innovation nu) and over each column (innovation w), with s as in bank.c. With
  *     C = sum nu^2 / s,   D = sum ln s,   A = sum w^2 / s,   B = sum w nu / s
- * and sigma_v at its likeliest, -2 ln p = n ln C + D without a column, n ln(C - B^2/A) + D with it. The gain of a column
- * is the likeliest filter with it over the likeliest without it. So a walk and the column compete for the readings.
- * Gains, D and A are the same for all axes. The score is sqrt(2 gain), with the sign of B.
+ * and sigma_v at its likeliest, -2 ln p = n ln C + D without a column, n ln(C - B^2/A) + D with it. The gain of a
+ * column is the likeliest filter with it over the likeliest without it. So a walk and the column compete for the
+ * readings. K, D and A are the same for all axes. The score is sqrt(2 gain), with the sign of B.
  *
  * Each rho is half of the one before: at twice the true one, or half of it, what a slow column gains by chance grows by
  * a half. Columns: the time; each channel; the temperature behind a low pass; exp(-t / tau) of a warm-up.
