@@ -113,7 +113,7 @@ selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, 
     if (self->n < SELFCAL_EPOCH_MIN || !(self->cell[axis][0].square > R(0.0))) {
         return most;
     }
-    selfcal_wide_t without = INFINITY;
+    selfcal_wide_t without = (selfcal_wide_t)INFINITY;
     for (size_t f = 0; f < SELFCAL_COARSE_FILTERS; f++) {
         without = fmin(without, cost(self, f, axis, 0.0));
     }

@@ -686,7 +686,7 @@ struct selfcal_telemetry {
     ((uint32_t)(sizeof(selfcal_imu_t) + 3U * sizeof(selfcal_t) + 7U * sizeof(selfcal_work_t) +                         \
                 31U * sizeof(selfcal_report_t) + 127U * sizeof(selfcal_kept_t) + 8191U * sizeof(selfcal_adequacy_t) +  \
                 131071U * sizeof(selfcal_former_t) + 524287U * sizeof(selfcal_gate_t) +                                \
-                16777213U * sizeof(selfcal_node_t) + 67108859U * SELFCAL_ARITHMETIC))
+                16777213U * sizeof(selfcal_node_t) + 67108859U * (size_t)SELFCAL_ARITHMETIC))
 
 static inline selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory,
                                                 size_t size) {
