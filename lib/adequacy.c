@@ -15,13 +15,17 @@
  * With n samples in the epoch:
  *
  *   channel     sum z w / sqrt(sum w^2)                       temperature, supply, time
- *   other axis  sum z z' / sqrt(n)
+ *   other axis  sum z z' / sqrt(sum z'^2)                    so what the other one did accuses this one of nothing
+ *   step        (S_k - S_(k-2)) / sqrt(2 RISE), S_k the sum of z, held at 4, over the k-th window of RISE: the greatest
  *   lag 1       sum z_t z_(t-1) / sqrt(n)
  *   slow        sum z_t e_(t-1) / sqrt(n v), e the mean of past z with weights (1 - l)^k l, v = l / (2 - l)
  *   variance    sum (z^2 - 1) / sqrt(2 n), and its difference between the second half and the first
  *   kurtosis    sum (z^4 - 6 z^2 + 3) / sqrt(24 n)
  *
- * All but the last two are also summed over all epochs, which finds an effect that is small and lasts.
+ * A coarse bank (coarse.c) looks for channels, a ramp and a warm-up as well, by no law of a report.
+ * All but the step and the last two are also summed over all epochs, which finds an effect that is small and lasts.
+ * A step pulls at the channels as well, so it goes before them, unless a channel itself has such a step at that time.
+ * Steps of several axes at one time are motion.
  * Each is normal with variance 1 for large n. The doubt about the parameters widens it by sqrt(1 + n / n_before), which
  * is taken off. Limits: SELFCAL_ADEQUACY_LIMIT; for the skewed ones what simulation gives (tests/ACCURACY.md). */
 #include "bank.h"
@@ -29,6 +33,9 @@
 #define SLOW R(0.0625)          /* l: a mean over some 16 bank samples */
 #define ALL_KNOWN R(0.70710678) /* over all epochs the doubt about the parameters adds as much as the noise, at most */
 #define LARGEST R(30.0)         /* |z| is held there: one wild sample says all that it can, and z^4 stays a float */
+#define RISE 32U                /* bank samples of a window that a step is looked for in */
+#define RISE_HELD R(4.0)        /* |z| is held there: an outlier is no step */
+#define RISE_LIMIT R(6.0)       /* 2e-9 of a normal number, of which 1000 h of six axes at 1 Hz have 7e5 */
 
 selfcal_status_t selfcal_adequacy_init(selfcal_adequacy_t *self, const selfcal_t *bank) {
     if (self == NULL || bank == NULL) {
@@ -178,6 +185,8 @@ static void begin_epoch(selfcal_adequacy_t *self, const selfcal_t *bank) {
         }
         watch->law = watch->next;
         memset(&watch->epoch, 0, sizeof watch->epoch);
+        memset(watch->rise.sum, 0, sizeof watch->rise.sum);
+        watch->rise.most = R(0.0);
         watch->last = watch->slow = watch->fourth = watch->square[0] = watch->square[1] = R(0.0);
     }
 }
@@ -279,6 +288,30 @@ static selfcal_real_t filter(selfcal_watch_t *watch, selfcal_real_t y, selfcal_r
     return r_fmin(r_fmax(z, -LARGEST), LARGEST);
 }
 
+/* One bank sample, the `count`-th of the epoch from 0. */
+static void follow_rise(selfcal_rise_t *rise, selfcal_real_t z, const selfcal_real_t w[], uint32_t count) {
+    rise->sum[0][0] += r_fmin(r_fmax(z, -RISE_HELD), RISE_HELD);
+    for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
+        rise->sum[1U + k][0] += w[k];
+    }
+    if ((count + 1U) % RISE != 0U) {
+        return;
+    }
+    const selfcal_real_t found = rise->sum[0][0] - rise->sum[0][2];
+    if (count + 1U >= SELFCAL_RISE_WINDOWS * RISE && r_fabs(found) > r_fabs(rise->most)) {
+        rise->most = found;
+        rise->at = count;
+        for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
+            rise->along[k] = rise->sum[1U + k][0] - rise->sum[1U + k][2];
+        }
+    }
+    for (size_t k = 0; k <= SELFCAL_ADEQUACY_COLUMNS; k++) {
+        rise->sum[k][2] = rise->sum[k][1];
+        rise->sum[k][1] = rise->sum[k][0];
+        rise->sum[k][0] = R(0.0);
+    }
+}
+
 /* z of all axes into the sums of one. */
 static void add(selfcal_watch_t *watch, const selfcal_real_t z[], size_t axis, uint8_t axes, uint32_t gap,
                 const selfcal_real_t w[], bool second_half) {
@@ -294,6 +327,7 @@ static void add(selfcal_watch_t *watch, const selfcal_real_t z[], size_t axis, u
     for (size_t other = 0; other < axes; other++) {
         sums->product[other] = r_fma(own, z[other], sums->product[other]);
     }
+    sums->power += square;
     watch->square[second_half] += square - R(1.0);
     watch->fourth += r_fma(square, square - R(6.0), R(3.0));
     watch->last = own;
@@ -304,6 +338,7 @@ static void add_epoch(selfcal_sums_t *all, const selfcal_sums_t *epoch) {
     all->n += epoch->n;
     all->lag += epoch->lag;
     all->slow += epoch->slow;
+    all->power += epoch->power;
     for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
         all->along[k] += epoch->along[k];
         all->weight[k] += epoch->weight[k];
@@ -335,11 +370,12 @@ static selfcal_real_t limit_of_drift(const selfcal_sums_t *sums) {
     return (selfcal_real_t)(early ? SELFCAL_ADEQUACY_LIMIT_EARLY : SELFCAL_ADEQUACY_LIMIT);
 }
 
-/* What names a cause: a channel, another axis. `known`: 1 / sqrt(1 + n / n_before). */
-static void weigh_causes(finding_t *found, const selfcal_sums_t *sums, uint32_t others, selfcal_real_t known) {
+/* What names a cause: a channel, another axis. `known`: 1 / sqrt(1 + n / n_before). `power`: of the other axes. */
+static void weigh_causes(finding_t *found, const selfcal_sums_t *sums, const selfcal_real_t power[],
+                         selfcal_real_t known) {
     static const selfcal_suspect_t of_column[SELFCAL_ADEQUACY_COLUMNS] = {
         SELFCAL_SUSPECT_RAMP, SELFCAL_SUSPECT_TEMPERATURE, SELFCAL_SUSPECT_SUPPLY};
-    const selfcal_real_t limit = (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT, root = known / r_sqrt(sums->n);
+    const selfcal_real_t limit = (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT;
     for (size_t k = 0; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
         if (sums->weight[k] > R(0.0)) {
             suspect(found, of_column[k], known * sums->along[k] / r_sqrt(sums->weight[k]),
@@ -347,8 +383,8 @@ static void weigh_causes(finding_t *found, const selfcal_sums_t *sums, uint32_t 
         }
     }
     for (size_t other = 0; other < SELFCAL_AXES_MAX; other++) {
-        if ((others >> other & 1U) != 0U) {
-            suspect(found, SELFCAL_SUSPECT_CROSS_AXIS, root * sums->product[other], limit);
+        if (power[other] > R(0.0)) {
+            suspect(found, SELFCAL_SUSPECT_CROSS_AXIS, known * sums->product[other] / r_sqrt(power[other]), limit);
         }
     }
 }
@@ -359,17 +395,81 @@ static void weigh_memory(finding_t *found, const selfcal_sums_t *sums, selfcal_r
     suspect(found, SELFCAL_SUSPECT_FLICKER, r_fmax(sums->slow * root / r_sqrt(SLOW / (R(2.0) - SLOW)), R(0.0)), limit);
 }
 
+static selfcal_real_t known_of(const selfcal_adequacy_t *self, const selfcal_watch_t *watch) {
+    return R(1.0) / r_sqrt(R(1.0) + watch->epoch.n / (selfcal_real_t)self->before);
+}
+
+/* Of the greatest rise; 0 if the channel that bends the readings most brings half of it, held as it is. */
+static selfcal_real_t step_score(const selfcal_adequacy_t *self, const selfcal_watch_t *watch) {
+    const selfcal_rise_t *rise = &watch->rise;
+    const selfcal_sums_t *sums = &watch->epoch;
+    selfcal_real_t most = R(0.0), brought = R(0.0);
+    for (size_t k = 1; k < SELFCAL_ADEQUACY_COLUMNS; k++) {
+        const selfcal_real_t weight = sums->weight[k], along = sums->along[k];
+        if (weight > R(0.0) && along * along > most * weight) {
+            most = along * along / weight;
+            brought = along / weight * rise->along[k];
+        }
+    }
+    const bool explained = R(2.0) * brought * rise->most > rise->most * rise->most;
+    return explained ? R(0.0) : known_of(self, watch) * rise->most / r_sqrt((selfcal_real_t)(2U * RISE));
+}
+
+void selfcal_adequacy_forget(selfcal_adequacy_t *self, uint8_t axis) {
+    memset(&self->watch[axis].all, 0, sizeof self->watch[axis].all);
+    self->watch[axis].rise.told = R(0.0);
+    for (uint8_t other = 0; other < SELFCAL_AXES_MAX; other++) {
+        self->watch[other].all.product[axis] = R(0.0);
+    }
+    selfcal_coarse_restart(&self->coarse);
+    self->coarse.before[axis].score = R(0.0);
+}
+
+/* A step of this epoch; with it another of `others`, all of them have moved. What went before it has been told then.
+ * Else one of an epoch before: it is still in the report, among ever more samples. */
+static bool weigh_step(finding_t *found, selfcal_adequacy_t *self, uint8_t axis, uint32_t others) {
+    selfcal_watch_t *watch = &self->watch[axis];
+    selfcal_rise_t *rise = &watch->rise;
+    const selfcal_real_t score = step_score(self, watch), root = r_sqrt((selfcal_real_t)self->before);
+    if (r_fabs(score) <= RISE_LIMIT) {
+        suspect(found, SELFCAL_SUSPECT_STEP, score, RISE_LIMIT);
+        suspect(found, rise->cause, rise->told / root, RISE_LIMIT);
+        return false;
+    }
+    rise->cause = SELFCAL_SUSPECT_STEP;
+    for (uint8_t other = 0; other < SELFCAL_AXES_MAX; other++) {
+        const bool looks = (others >> other & 1U) != 0U && self->watch[other].rise.at == rise->at;
+        if (looks && r_fabs(step_score(self, &self->watch[other])) > RISE_LIMIT) {
+            rise->cause = SELFCAL_SUSPECT_MOTION;
+        }
+    }
+    selfcal_adequacy_forget(self, axis);
+    rise->told = score * root;
+    suspect(found, rise->cause, score, RISE_LIMIT);
+    return true;
+}
+
 /* A statistic of the innovations alone is told where no cause is beyond its limit, for each cause bends it too. */
 static void judge_axis(selfcal_adequacy_t *self, uint8_t axis, uint32_t others) {
     selfcal_watch_t *watch = &self->watch[axis];
     selfcal_judgement_t *told = &self->judgement[axis];
-    const selfcal_real_t n = watch->epoch.n;
-    const selfcal_real_t known = R(1.0) / r_sqrt(R(1.0) + n / (selfcal_real_t)self->before);
+    const selfcal_real_t n = watch->epoch.n, known = known_of(self, watch);
+    selfcal_real_t now[SELFCAL_AXES_MAX] = {R(0.0)}, ever[SELFCAL_AXES_MAX] = {R(0.0)};
     finding_t found = {told, R(0.0)};
     told->samples = self->count;
-    add_epoch(&watch->all, &watch->epoch);
-    weigh_causes(&found, &watch->epoch, others, known);
-    weigh_causes(&found, &watch->all, others, R(1.0));
+    for (uint8_t other = 0; other < SELFCAL_AXES_MAX; other++) {
+        if ((others >> other & 1U) != 0U) {
+            now[other] = self->watch[other].epoch.power;
+            ever[other] = self->watch[other].all.power;
+        }
+    }
+    if (!weigh_step(&found, self, axis, others)) {
+        weigh_causes(&found, &watch->epoch, now, known);
+        weigh_causes(&found, &watch->all, ever, R(1.0));
+        selfcal_suspect_t cause = SELFCAL_SUSPECT_NONE;
+        const selfcal_real_t score = selfcal_coarse_score(&self->coarse, axis, &cause);
+        suspect(&found, cause, score, (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT);
+    }
     if (found.most <= R(1.0)) {
         const selfcal_real_t limit = (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT_VARIANCE;
         const selfcal_real_t change = watch->square[1] - watch->square[0];
@@ -386,10 +486,14 @@ static void judge_axis(selfcal_adequacy_t *self, uint8_t axis, uint32_t others) 
 
 /* --- bank samples --- */
 
+static selfcal_real_t mean_of(const selfcal_adequacy_t *self, size_t k) {
+    return self->used > 0U ? self->sum[k] / (selfcal_real_t)self->used : R(0.0);
+}
+
 /* The means of the interval's inputs less their values at the start of the epoch. */
 static void inputs_of(selfcal_adequacy_t *self, size_t inputs, selfcal_real_t mean[]) {
     for (size_t k = 0; k < inputs; k++) {
-        mean[k] = self->used > 0U ? self->sum[k] / (selfcal_real_t)self->used : R(0.0);
+        mean[k] = mean_of(self, k);
         if (self->count == 0U) {
             self->base[k] = mean[k];
         }
@@ -404,6 +508,9 @@ static void judge_axes(selfcal_adequacy_t *self, const selfcal_t *bank) {
     }
     for (uint8_t axis = 0; axis < bank->model->axes; axis++) {
         self->judgement[axis].state = SELFCAL_NOT_JUDGED;
+        add_epoch(&self->watch[axis].all, &self->watch[axis].epoch);
+    }
+    for (uint8_t axis = 0; axis < bank->model->axes; axis++) {
         if ((judged >> axis & 1U) != 0U) {
             judge_axis(self, axis, judged & ~(1U << axis));
         }
@@ -438,6 +545,7 @@ static void take(selfcal_adequacy_t *self, const selfcal_t *bank, const selfcal_
     for (uint8_t axis = 0; axis < axes && self->count > 0U; axis++) {
         if (self->watch[axis].running) {
             add(&self->watch[axis], z, axis, axes, gap, w[axis], self->count >= self->length / 2U);
+            follow_rise(&self->watch[axis].rise, z[axis], w[axis], self->count);
         }
     }
     if (self->look != NULL) {
@@ -485,6 +593,10 @@ void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, cons
         const selfcal_batch_t *batch = &bank->batch[bank->gathering];
         if (batch->count == 0U) {
             batch = &bank->batch[1U - bank->gathering];
+        }
+        if (batch->count > 0U && bank->model->regressors == NULL) {
+            const selfcal_real_t channel[SELFCAL_ADEQUACY_CHANNELS] = {mean_of(self, 0), mean_of(self, 1)};
+            selfcal_coarse_take(&self->coarse, batch, batch->count - 1U, channel, bank->model);
         }
         if (any && batch->count > 0U) {
             take(self, bank, batch, batch->count - 1U);

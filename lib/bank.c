@@ -282,21 +282,40 @@ void selfcal_bank_pace(selfcal_t *self, uint32_t block) {
     self->push_nodes = (uint16_t)(needed > SELFCAL_PUSH_NODES ? needed : SELFCAL_PUSH_NODES);
 }
 
-selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size) {
+void selfcal_bank_lay_out(selfcal_t *self, void *memory) {
+    const selfcal_model_t *model = self->model;
+    const size_t axes = axes_in(self), cells = (size_t)model->nodes * axes, regressors = regressors_of(model);
+    unsigned char *behind = (unsigned char *)memory + SELFCAL_SIZE(model->nodes, axes);
+    self->b = memory; /* first, since they may need 8-byte alignment */
+    self->c = self->b + cells;
+    self->node = (selfcal_node_t *)(void *)(self->c + cells);
+    self->x = (selfcal_drift_t *)(void *)(self->node + model->nodes);
+    if (regressors > 0U) {
+        model->regressors->code->init(self, behind);
+    }
+    if (sum_nodes(model) > 0U) {
+        model->states->init(self, behind + SELFCAL_REGRESSORS_SIZE(model->nodes, axes, regressors));
+    }
+}
+
+selfcal_status_t selfcal_init_as(uint32_t layout, selfcal_t *self, const selfcal_model_t *model, void *memory,
+                                 size_t size) {
+    if (layout != SELFCAL_LAYOUT) {
+        return SELFCAL_BAD_BUILD;
+    }
     if (self == NULL || model == NULL || memory == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
     if (!valid_model(model)) {
         return SELFCAL_BAD_MODEL;
     }
-    const size_t used = SELFCAL_SIZE(model->nodes, model->axes);
-    const size_t regressors = regressors_of(model), terms = sum_nodes(model);
-    const size_t needed = used + SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors) +
-                          SELFCAL_TERMS_SIZE(terms, model->axes, regressors);
+    const size_t regressors = regressors_of(model);
+    const size_t needed = SELFCAL_SIZE(model->nodes, model->axes) +
+                          SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors) +
+                          SELFCAL_TERMS_SIZE(sum_nodes(model), model->axes, regressors);
     if (size < needed || ((uintptr_t)memory & 7U) != 0U) {
         return SELFCAL_BAD_MEMORY;
     }
-    const size_t cells = (size_t)model->nodes * model->axes;
     memset(self, 0, sizeof *self);
     memset(memory, 0, needed);
     self->model = model;
@@ -306,17 +325,7 @@ selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, voi
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         self->prior_sd[axis] = model->axis[axis].bias_sd;
     }
-    self->b = memory; /* first, since they may need 8-byte alignment */
-    self->c = self->b + cells;
-    self->node = (selfcal_node_t *)(void *)(self->c + cells);
-    self->x = (selfcal_drift_t *)(void *)(self->node + model->nodes);
-    if (regressors > 0U) {
-        model->regressors->code->init(self, (unsigned char *)memory + used);
-    }
-    if (terms > 0U) {
-        model->states->init(self, (unsigned char *)memory + used +
-                                      SELFCAL_REGRESSORS_SIZE(model->nodes, model->axes, regressors));
-    }
+    selfcal_bank_lay_out(self, memory);
     selfcal_bank_pace(self, model->block);
     return SELFCAL_OK;
 }
@@ -625,13 +634,12 @@ selfcal_wide_t selfcal_bank_from_prior(const selfcal_t *self, uint8_t axis) {
 
 void selfcal_bank_sums(const selfcal_t *self, uint8_t axis, uint16_t index, selfcal_node_view_t *view) {
     const selfcal_node_t *node = &self->node[index];
-    const size_t k = (size_t)index * self->model->axes + axis;
     if (is_state_node(self, node)) {
         self->model->states->view(self, axis, index, view);
         return;
     }
     view->a = sum_value(node->a) + level_a(node);
-    selfcal_kernel_view(self, k, &view->b, &view->c, &view->drift);
+    selfcal_kernel_view(self, index, axis, &view->b, &view->c, &view->drift);
 }
 
 /* ln x to 1e-11, in a third of the time that log() takes in software: x = 2^k m, and m q/64 is so near 1 that its ln

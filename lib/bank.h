@@ -27,6 +27,9 @@ bool selfcal_bank_hand_over(selfcal_t *self);
 /* Both, to the end. */
 void selfcal_bank_flush(selfcal_t *self);
 
+/* Lays the bank's nodes, sums, regressors and states over the memory. */
+void selfcal_bank_lay_out(selfcal_t *self, void *memory);
+
 /* A node at the instant of its first sample. */
 void selfcal_bank_start_node(selfcal_t *self, uint16_t index);
 /* A level node is no longer so. What its constant u added to A comes due. */
@@ -154,8 +157,9 @@ void selfcal_kernel_unsettle(selfcal_t *self, size_t j);
 bool selfcal_kernel_sound(const selfcal_t *self);
 bool selfcal_kernel_node_sound(const selfcal_t *self, size_t j);
 
-/* Sums B and C of `k` = node * axes + axis, and its predicted drift. */
-void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x);
+/* Sums B and C of an axis at node `j`, and its predicted drift. */
+void selfcal_kernel_view(const selfcal_t *self, size_t j, uint8_t axis, selfcal_wide_t *b, selfcal_wide_t *c,
+                         selfcal_wide_t *x);
 
 /* --- innovations of several series --- */
 
@@ -217,6 +221,8 @@ struct selfcal_regressors_code {
     /* Node k of the hypothesis at sigma_v^2 = variance; the coefficients' moments are gathered. */
     void (*now)(const selfcal_work_t *work, uint16_t k, selfcal_wide_t variance, selfcal_now_t *now);
     void (*finish)(const selfcal_work_t *work);
+    /* Copies its part for one axis into a bank that is held. */
+    void (*hold)(selfcal_t *held, const selfcal_t *self, uint8_t axis);
 };
 
 /* bank_states.c: does for the nodes of laws that are sums as bank.c does for the others. */
@@ -243,17 +249,42 @@ struct selfcal_states_code {
     void (*drift)(const selfcal_t *self, size_t j, size_t series, selfcal_wide_t drift[SELFCAL_TERMS_MAX]);
     /* Of the two states of an oscillation from `first` on: 1 - what is read of each after a time. */
     void (*fall)(const selfcal_term_t *first, selfcal_real_t elapsed_s, selfcal_real_t psi[2]);
+    /* Copies its part for one axis into a bank that is held. */
+    void (*hold)(selfcal_t *held, const selfcal_t *self, uint8_t axis);
 };
+
+/* Axes that the bank has cells of, and where an axis lies among them: a bank that is held has one. */
+static inline size_t axes_in(const selfcal_t *self) {
+    return self->held ? 1U : self->model->axes;
+}
+static inline size_t axis_in(const selfcal_t *self, size_t axis) {
+    return self->held ? 0U : axis;
+}
+
+/* Index of an axis's sums and drift at node `j`. */
+static inline size_t cell_of(const selfcal_t *self, size_t j, size_t axis) {
+    return j * axes_in(self) + axis_in(self, axis);
+}
 
 /* Series of such a node: "1" is 0, regressor k is 1 + k, and the readings of an axis. */
 static inline size_t series_of_readings(const selfcal_t *self, uint8_t axis) {
-    return 1U + regressors_of(self->model) + axis;
+    return 1U + regressors_of(self->model) + axis_in(self, axis);
 }
 
 /* Whether the node belongs to a sum. Never of another law. */
 static inline bool is_state_node(const selfcal_t *self, const selfcal_node_t *node) {
     return self->terms != NULL && !node->level && node->gains.moving.c == R(0.0);
 }
+
+/* adequacy.c: what all epochs have gathered of an axis has been told. */
+void selfcal_adequacy_forget(selfcal_adequacy_t *self, uint8_t axis);
+
+/* coarse.c: a bank sample, with the channels' means; the score of the strongest column of an axis, and which it is; the
+ * bank begins anew. */
+void selfcal_coarse_take(selfcal_coarse_t *self, const selfcal_batch_t *batch, uint32_t at,
+                         const selfcal_real_t channel[], const selfcal_model_t *model);
+selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, selfcal_suspect_t *suspect);
+void selfcal_coarse_restart(selfcal_coarse_t *self);
 
 /* --- converged nodes --- */
 

@@ -47,7 +47,7 @@ static bool valid_regressors(const selfcal_model_t *model) {
 
 /* `memory` follows the bank's own; what SELFCAL_REGRESSORS_SIZE() adds includes the room to align it. */
 static void init_columns(selfcal_t *self, unsigned char *memory) {
-    const size_t p = columns_of(self), nodes = self->model->nodes, axes = self->model->axes;
+    const size_t p = columns_of(self), nodes = self->model->nodes, axes = axes_in(self);
     memory += (8U - ((uintptr_t)memory & 7U)) & 7U;
     self->columns = (selfcal_columns_t *)(void *)memory;
     self->columns->column = (selfcal_column_t *)(void *)(self->columns + 1);
@@ -300,7 +300,7 @@ static void make_normal(const selfcal_t *self, uint8_t axis, uint16_t index, uin
             const size_t of = l == 0U ? 0U : normal->regressor[l] + 1U;
             normal->a[row][l] = sum_value(a[SELFCAL_REGRESSORS_ROWS(k + 1U) + of]);
         }
-        const size_t at = (size_t)index * self->model->axes + axis;
+        const size_t at = cell_of(self, index, axis);
         normal->b[row] = sum_value(self->columns->b[at * p + k]);
         normal->last[row] = (selfcal_wide_t)column->last;
         normal->lost[row][0] = sum_value(self->columns->x[index * (p + 1U) + k + 1U]) * per_prediction;
@@ -539,8 +539,21 @@ static void fade_columns(selfcal_t *self, size_t j, selfcal_wide_t part, selfcal
     }
 }
 
+static void hold_columns(selfcal_t *held, const selfcal_t *self, uint8_t axis) {
+    const size_t p = columns_of(self), nodes = self->model->nodes;
+    const selfcal_columns_t *from = self->columns, *to = held->columns;
+    memcpy(to->column, from->column, p * sizeof to->column[0]);
+    memcpy(to->a, from->a, nodes * SELFCAL_REGRESSORS_ROWS(p + 1U) * sizeof to->a[0]);
+    memcpy(to->x, from->x, nodes * (p + 1U) * sizeof to->x[0]);
+    for (size_t j = 0; j < nodes; j++) {
+        const size_t at = cell_of(self, j, axis);
+        memcpy(&to->b[j * p], &from->b[at * p], p * sizeof to->b[0]);
+        to->reading[j] = from->reading[at];
+    }
+}
+
 const selfcal_regressors_code_t selfcal_regressors_code = {
     valid_regressors,   init_columns,      columns_sound,       usable_values, add_values,
     close_columns,      hand_over_columns, run_columns,         gap_columns,   fade_columns,
-    field_with_columns, now_with_columns,  finish_coefficients,
+    field_with_columns, now_with_columns,  finish_coefficients, hold_columns,
 };

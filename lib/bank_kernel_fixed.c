@@ -394,7 +394,9 @@ void selfcal_kernel_restart(selfcal_t *self, size_t k, selfcal_wide_t c) {
     self->c[k] = (selfcal_total_t)ldexp(c, -2 * exponent - 16);
 }
 
-void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
+void selfcal_kernel_view(const selfcal_t *self, size_t j, uint8_t axis, selfcal_wide_t *b, selfcal_wide_t *c,
+                         selfcal_wide_t *x) {
+    const size_t k = cell_of(self, j, axis);
     if (self->columns != NULL) {
         const selfcal_reading_t *reading = &self->columns->reading[k];
         *b = sum_value(reading->b);
@@ -402,8 +404,8 @@ void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, sel
         *x = sum_value(reading->x);
         return;
     }
-    const int exponent = self->integers.scale[k % self->model->axes].exponent;
-    *b = ldexp((selfcal_wide_t)self->b[k], exponent - 6 - b_bits(&self->node[k / self->model->axes]));
+    const int exponent = self->integers.scale[axis].exponent;
+    *b = ldexp((selfcal_wide_t)self->b[k], exponent - 6 - b_bits(&self->node[j]));
     *c = ldexp((selfcal_wide_t)self->c[k], 2 * exponent + 16);
     *x = ldexp((selfcal_wide_t)self->x[k], exponent);
 }
@@ -423,7 +425,7 @@ void selfcal_kernel_set_reading_drift(selfcal_t *self, size_t at, selfcal_sum_t 
 
 reading_sums_t selfcal_kernel_state_sums(const selfcal_t *self, size_t j, size_t index, size_t axis) {
     (void)j;
-    selfcal_sum_t *bc = &self->terms->bc[(index * self->model->axes + axis) * SELFCAL_STATE_SUMS];
+    selfcal_sum_t *bc = &self->terms->bc[cell_of(self, index, axis) * SELFCAL_STATE_SUMS];
     const reading_sums_t sums = {bc, bc + 1};
     return sums;
 }

@@ -140,8 +140,10 @@ void selfcal_kernel_restart(selfcal_t *self, size_t k, selfcal_wide_t c) {
     self->c[k] = make_sum(c);
 }
 
-void selfcal_kernel_view(const selfcal_t *self, size_t k, selfcal_wide_t *b, selfcal_wide_t *c, selfcal_wide_t *x) {
-    const selfcal_node_t *node = &self->node[k / self->model->axes];
+void selfcal_kernel_view(const selfcal_t *self, size_t j, uint8_t axis, selfcal_wide_t *b, selfcal_wide_t *c,
+                         selfcal_wide_t *x) {
+    const selfcal_node_t *node = &self->node[j];
+    const size_t k = cell_of(self, j, axis);
     selfcal_sum_t of_b = self->b[k], of_c = self->c[k];
     if (node->level) {
         const selfcal_sum_t per_s = one_over_1_and(node->p_inf), u = {node->u_inf, R(0.0)};
@@ -180,7 +182,7 @@ bool selfcal_kernel_readings_sound(const selfcal_t *self) {
 
 reading_sums_t selfcal_kernel_state_sums(const selfcal_t *self, size_t j, size_t index, size_t axis) {
     (void)index;
-    return selfcal_kernel_reading(self, j * self->model->axes + axis);
+    return selfcal_kernel_reading(self, cell_of(self, j, axis));
 }
 
 void selfcal_kernel_start(selfcal_t *self, uint8_t axis, selfcal_real_t ln_sigma) {

@@ -30,7 +30,7 @@ static size_t order_of(const selfcal_law_t *law) {
 }
 
 static size_t series_of(const selfcal_t *self) {
-    return 1U + regressors_of(self->model) + self->model->axes;
+    return 1U + regressors_of(self->model) + axes_in(self);
 }
 
 /* Node `j` among those of sums, and its law. */
@@ -716,7 +716,21 @@ static void fall_of(const selfcal_term_t *first, selfcal_real_t elapsed_s, selfc
     psi[1] = (selfcal_real_t)(1.0 - swing.m - swing.up);
 }
 
+/* Float kernels have the sums B and C among those of the bank. */
+static void hold_states(selfcal_t *held, const selfcal_t *self, uint8_t axis) {
+    const size_t nodes = sum_nodes(self->model), shared = 1U + regressors_of(self->model);
+    const selfcal_terms_t *from = self->terms, *to = held->terms;
+    memcpy(to->node, from->node, nodes * sizeof to->node[0]);
+    for (size_t index = 0; index < nodes; index++) {
+        const size_t bc = SELFCAL_STATE_SUMS * sizeof to->bc[0], one = SELFCAL_TERMS_MAX * sizeof to->x[0];
+        memcpy(states(held, index, 0), states(self, index, 0), shared * one);
+        memcpy(states(held, index, shared), states(self, index, series_of_readings(self, axis)), one);
+        memcpy((unsigned char *)to->bc + index * bc, (const unsigned char *)from->bc + cell_of(self, index, axis) * bc,
+               bc);
+    }
+}
+
 const selfcal_states_code_t selfcal_states_code = {
     valid_sum,   init_states,    states_sound, start_node, run_states, run_states_gap, settle_node,
-    fade_states, restart_states, view_states,  spread_of,  drift_of,   fall_of,
+    fade_states, restart_states, view_states,  spread_of,  drift_of,   fall_of,        hold_states,
 };

@@ -304,10 +304,7 @@ uint32_t selfcal_changes_handle(selfcal_adequacy_t *adequacy, selfcal_t *bank) {
             adequacy->judgement[axis].changes++;
             adequacy->judgement[axis].change = self->change[axis];
             adequacy->watch[axis].known = adequacy->watch[axis].known && step;
-            memset(&adequacy->watch[axis].all, 0, sizeof adequacy->watch[axis].all); /* that has been told */
-            for (uint8_t other = 0; other < bank->model->axes; other++) {
-                adequacy->watch[other].all.product[axis] = R(0.0);
-            }
+            selfcal_adequacy_forget(adequacy, axis);
             self->found_at[axis] = selfcal_count(bank) + bank->counters.blocks_lost;
         }
     }

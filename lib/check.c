@@ -67,7 +67,7 @@ static bool memory_is_laid_out(const selfcal_t *self) {
         return false;
     }
     const size_t cells = (size_t)model->nodes * model->axes;
-    return self->b != NULL && self->c == self->b + cells &&
+    return self->b != NULL && is_bool(&self->held) && !self->held && self->c == self->b + cells &&
            (const void *)self->node == (const void *)(self->c + cells) &&
            (const void *)self->x == (const void *)(self->node + model->nodes);
 }

@@ -25,6 +25,7 @@ static void *carve(room_t *room, size_t bytes) {
 /* Makes the parts that the pipe names. */
 static void carve_all(selfcal_imu_t *imu, room_t *room) {
     const selfcal_pipe_t *pipe = imu->pipe;
+    const selfcal_model_t *model = pipe->model;
     if (pipe->gate_code != NULL) {
         imu->gate = carve(room, SELFCAL_PART(sizeof *imu->gate));
     }
@@ -35,7 +36,10 @@ static void carve_all(selfcal_imu_t *imu, room_t *room) {
         imu->judge = carve(room, SELFCAL_PART(sizeof *imu->judge));
     }
     if (pipe->changes != NULL) {
-        imu->changes = carve(room, SELFCAL_CHANGES_SIZE(pipe->model->nodes, pipe->model->axes));
+        imu->changes = carve(room, SELFCAL_CHANGES_SIZE(model->nodes, model->axes));
+    }
+    if (pipe->holding != NULL) {
+        imu->held = carve(room, SELFCAL_HELD_SIZE(model->nodes, sum_nodes(model), regressors_of(model)));
     }
 }
 
@@ -44,7 +48,8 @@ static selfcal_status_t begin_all(selfcal_imu_t *imu) {
     const selfcal_pipe_t *pipe = imu->pipe;
     selfcal_status_t status = SELFCAL_OK;
     imu->computing = false;
-    imu->due = 0U;
+    imu->due = imu->reported = 0U;
+    imu->turn = 0U;
     if (imu->columns != NULL) {
         status = pipe->columns->begin(imu);
     }
@@ -67,7 +72,11 @@ static bool goes_together(const selfcal_pipe_t *pipe) {
            (pipe->gate_code == NULL || pipe->gate != NULL) && (pipe->changes == NULL || pipe->judging != NULL);
 }
 
-selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory, size_t size) {
+selfcal_status_t selfcal_imu_init_as(uint32_t layout, selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory,
+                                     size_t size) {
+    if (layout != SELFCAL_LAYOUT) {
+        return SELFCAL_BAD_BUILD;
+    }
     if (imu == NULL || pipe == NULL || pipe->model == NULL || memory == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }
@@ -117,14 +126,18 @@ void selfcal_imu_skip(selfcal_imu_t *imu, uint64_t count) {
     }
 }
 
-/* Something has changed: the last reports of such an axis are of the past. */
+/* Something has changed: the last reports of such an axis are of the past, and so is one under way. */
 static uint32_t handle_changes(selfcal_imu_t *imu) {
     const uint32_t changed = imu->pipe->changes->handle(imu);
+    if (imu->held != NULL && (changed >> imu->report.axis & 1U) != 0U) {
+        imu->held->batches++;
+    }
     for (uint8_t axis = 0; changed != 0U && axis < imu->bank.model->axes; axis++) {
         if ((changed >> axis & 1U) != 0U) {
             imu->reason[axis] = SELFCAL_REASON_NO_REPORT;
         }
     }
+    imu->reported &= (uint16_t)~changed;
     return changed;
 }
 
@@ -160,13 +173,15 @@ uint32_t selfcal_imu_sample(selfcal_imu_t *imu, const float reading[], const flo
  * then. */
 bool selfcal_imu_room(const selfcal_imu_t *imu) {
     const uint32_t block = imu->bank.block, used = imu->bank.used + 1U;
-    return !imu->computing || selfcal_room(&imu->bank) > 0U || used < block - used;
+    return !imu->computing || imu->held != NULL || selfcal_room(&imu->bank) > 0U || used < block - used;
 }
 
-/* Begins the first of the reports that are due and can be made. */
+/* Begins the next of the reports that are due and can be made, each axis in its turn. */
 static selfcal_status_t begin_report(selfcal_imu_t *imu) {
     selfcal_status_t status = SELFCAL_OK;
-    for (uint8_t axis = 0; !imu->computing && imu->due != 0U; axis++) {
+    while (!imu->computing && imu->due != 0U) {
+        const uint8_t axis = imu->turn;
+        imu->turn = (uint8_t)(axis + 1U < imu->bank.model->axes ? axis + 1U : 0U);
         if (((uint32_t)imu->due >> axis & 1U) != 0U) {
             imu->due &= (uint16_t)~(1U << axis);
             imu->whole = false;
@@ -192,10 +207,18 @@ static void take_report(selfcal_imu_t *imu) {
     imu->reason[axis] = selfcal_reason(imu->bank.model, &imu->report, state);
     imu->bias[axis] = imu->report.bias_mean;
     imu->whole = true;
+    imu->reported |= (uint16_t)(1U << axis);
     if (imu->kept != NULL) {
         imu->kept->report[axis] = imu->report;
         imu->kept->rests_on[axis] = imu->kept->gathered_at;
     }
+}
+
+/* A report that is identified stays the one to rely on. */
+static void take_overtaken(selfcal_imu_t *imu, selfcal_reason_t *reason) {
+    const bool rough = *reason == SELFCAL_REASON_NO_REPORT || *reason == SELFCAL_REASON_NOT_IDENTIFIED;
+    *reason = rough ? SELFCAL_REASON_OVERTAKEN : *reason;
+    imu->bank.counters.overtaken += imu->held != NULL ? 1U : 0U; /* else the bank has counted it */
 }
 
 selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu) {
@@ -208,18 +231,23 @@ selfcal_status_t selfcal_imu_work(selfcal_imu_t *imu) {
     const selfcal_status_t status =
         imu->columns != NULL ? imu->pipe->columns->step(imu) : selfcal_report_step(&imu->work, &imu->report);
     if (status == SELFCAL_BUSY) {
+        if (imu->held != NULL) {
+            imu->pipe->holding->follow(imu);
+        }
         return status;
     }
     imu->computing = false;
     if (status == SELFCAL_OK) {
         take_report(imu);
+    } else if (status == SELFCAL_OVERTAKEN) {
+        take_overtaken(imu, &imu->reason[imu->report.axis]);
     }
     return imu->due != 0U ? SELFCAL_BUSY : status;
 }
 
 const selfcal_report_t *selfcal_imu_report(const selfcal_imu_t *imu, uint8_t axis) {
     SELFCAL_ASSERT(axis < imu->bank.model->axes);
-    if (imu->reason[axis] == SELFCAL_REASON_NO_REPORT) {
+    if (!has_report(imu, axis)) {
         return NULL;
     }
     if (imu->kept != NULL) {

@@ -44,4 +44,15 @@ struct selfcal_changes_code {
     uint32_t (*handle)(selfcal_imu_t *imu);
 };
 
+/* imu_hold.c: keeps samples from overtaking a report. */
+struct selfcal_holding_code {
+    /* A step of a report has been taken. */
+    void (*follow)(selfcal_imu_t *imu);
+};
+
+/* Whether an axis has a report that is not of the past. */
+static inline bool has_report(const selfcal_imu_t *imu, uint8_t axis) {
+    return (imu->reported >> axis & 1U) != 0U;
+}
+
 #endif

@@ -2,6 +2,8 @@
  * has. The likelier of both stands. */
 #include "imu.h"
 
+#include "report.h"
+
 static selfcal_status_t begin_columns(selfcal_imu_t *imu) {
     selfcal_imu_columns_t *self = imu->columns;
     memset(self, 0, sizeof *self);
@@ -42,13 +44,17 @@ static bool is_used(const selfcal_sent_coefficient_t *sent) {
     return sent->probability > 0.5F && isfinite(sent->mean);
 }
 
-/* The report without regressors is whole; whether the one with them has begun. */
-static bool begin_with(selfcal_imu_t *imu, uint8_t mask) {
+/* The report without regressors is whole; whether the one with them has begun, on the same sums. */
+static bool begin_with(selfcal_imu_t *imu, selfcal_t *bank, uint8_t mask) {
     selfcal_imu_columns_t *self = imu->columns;
     const uint8_t axis = imu->report.axis;
+    const uint32_t batches = imu->work.batches;
     self->ln_without = ln_evidence(imu->bank.model, &imu->report);
-    self->with = mask != 0U && selfcal_report_begin_subset(&imu->work, &imu->bank, axis, mask, self->coefficients,
+    self->with = mask != 0U && selfcal_report_begin_subset(&imu->work, bank, axis, mask, self->coefficients,
                                                            &self->report_with) == SELFCAL_OK;
+    if (self->with) {
+        selfcal_again(&imu->work, batches);
+    }
     for (size_t k = 0; k < SELFCAL_REGRESSORS_MAX; k++) {
         self->sent[axis][k].mean = NAN;
     }
@@ -75,6 +81,7 @@ static selfcal_status_t step_columns(selfcal_imu_t *imu) {
     selfcal_imu_columns_t *self = imu->columns;
     const selfcal_regressors_t *regressors = imu->bank.model->regressors;
     const bool with = self->with;
+    selfcal_t *bank = imu->work.bank;
     const selfcal_status_t status = selfcal_report_step(&imu->work, with ? &self->report_with : &imu->report);
     if (status == SELFCAL_BUSY) {
         return status;
@@ -93,7 +100,7 @@ static selfcal_status_t step_columns(selfcal_imu_t *imu) {
         }
     }
     if (!with) {
-        return begin_with(imu, mask) ? SELFCAL_BUSY : SELFCAL_OK;
+        return begin_with(imu, bank, mask) ? SELFCAL_BUSY : SELFCAL_OK;
     }
     weigh_columns(imu, odds);
     return SELFCAL_OK;

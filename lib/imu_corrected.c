@@ -38,7 +38,8 @@ bool selfcal_imu_corrected(selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
     for (uint8_t axis = 0; axis < model->axes; axis++) {
         const selfcal_reason_t reason = reason_of(imu, axis, is_faulty);
         float bias = NAN, sd = NAN;
-        if (reason == SELFCAL_REASON_NONE || reason == SELFCAL_REASON_INADEQUATE ||
+        const bool rough = reason == SELFCAL_REASON_OVERTAKEN && has_report(imu, axis);
+        if (reason == SELFCAL_REASON_NONE || rough || reason == SELFCAL_REASON_INADEQUATE ||
             reason == SELFCAL_REASON_NOT_IDENTIFIED) {
             const float elapsed_s = (float)(kept->passed - kept->rests_on[axis]) / imu->pipe->rate_hz;
             (void)selfcal_predict(&kept->report[axis], model, elapsed_s, &bias, &sd);

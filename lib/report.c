@@ -149,7 +149,7 @@ static bool gathered(selfcal_work_t *work) {
 
 /* Of a bank that forgets too little may be left. */
 static selfcal_status_t step_gather(selfcal_work_t *work, selfcal_report_t *report) {
-    if (!gathered(work)) {
+    if (work->batches == 0U && !gathered(work)) {
         return SELFCAL_BUSY;
     }
     report->n = work->bank->n;
@@ -318,6 +318,7 @@ selfcal_status_t selfcal_report_step(selfcal_work_t *work, selfcal_report_t *rep
     }
     const bool overtaken = work->stage > GATHER && work->batches != work->bank->batches;
     const selfcal_status_t status = overtaken ? SELFCAL_OVERTAKEN : stages[work->stage](work, report);
+    work->bank->counters.overtaken += overtaken ? 1U : 0U;
     if (status != SELFCAL_BUSY) {
         work->bank = NULL; /* no report is under way */
     }

@@ -35,6 +35,13 @@ enum {
     WHOLE
 };
 
+/* The report that has just begun rests on the same sums as one before it, whose work->batches these are. If they have
+ * moved since, it is overtaken. */
+static inline void selfcal_again(selfcal_work_t *work, uint32_t batches) {
+    work->batches = batches;
+    work->gathered = true;
+}
+
 /* --- the hypothesis in hand --- */
 
 static inline const selfcal_hypothesis_t *hypothesis_of(const selfcal_work_t *work) {

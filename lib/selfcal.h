@@ -16,7 +16,9 @@
  *   3. Give selfcal_imu_init() the model and SELFCAL_MODEL_IMU_BYTES of memory. The memory stays yours; nothing is
  *      allocated.
  *   4. selfcal_imu_sample() every sample, selfcal_imu_skip() every missing one. The cost of a sample is even.
- *   5. selfcal_imu_ask() for reports, and selfcal_imu_work() while the processor is idle. Samples may come in between.
+ *   5. selfcal_imu_ask() for reports, and selfcal_imu_work() while the processor is idle. Samples may come in between:
+ *      with fewer than SELFCAL_MODEL_REPORT_STEPS calls of it in a bank interval they may overtake the report. With
+ *      `selfcal codegen --hold` none can.
  *   exp, expm1, log, log1p and sqrt of <math.h> must be within 2 units in the last place (newlib and glibc: 1.3).
  *
  * HEADERS
@@ -77,7 +79,9 @@ typedef enum {
     SELFCAL_SNAPSHOT_DAMAGED = -7,   /* its checksum does not fit */
     SELFCAL_SNAPSHOT_FOREIGN = -8,   /* not a snapshot, or of another model or build */
     SELFCAL_SNAPSHOT_VERSION = -9,   /* of another format version */
-    SELFCAL_CORRUPT = -10            /* an invariant is broken */
+    SELFCAL_CORRUPT = -10,           /* an invariant is broken */
+    SELFCAL_BAD_BUILD = -11          /* the caller was compiled with another selfcal_config.h than the library, or with
+                                        other macros: nothing has been written */
 } selfcal_status_t;
 
 /* Monotonic since selfcal_init(). */
@@ -94,6 +98,7 @@ typedef struct {
     uint16_t outliers[SELFCAL_AXES_MAX]; /* see selfcal_handling_t; held at 65535 */
     /* samples kept out because a regressor's value was not finite or SELFCAL_SAMPLE_MAX */
     uint32_t regressor_not_finite;
+    uint32_t overtaken; /* reports that were given up: SELFCAL_OVERTAKEN */
 } selfcal_counters_t;
 
 /* --- report --- */
@@ -166,8 +171,9 @@ typedef enum {
     SELFCAL_SUSPECT_FLICKER = 6, /* or another drift than the law's */
     SELFCAL_SUSPECT_VARIANCE_CHANGE = 7,
     SELFCAL_SUSPECT_OUTLIERS = 8,
-    SELFCAL_SUSPECT_STEP = 9, /* this and motion: of a selfcal_change_t alone */
-    SELFCAL_SUSPECT_MOTION = 10
+    SELFCAL_SUSPECT_STEP = 9,
+    SELFCAL_SUSPECT_MOTION = 10, /* several axes step at once */
+    SELFCAL_SUSPECT_TURN_ON = 11
 } selfcal_suspect_t;
 
 /* Why an axis is not judged, has no corrected sample, or has a calibration that is not to be relied on. */
@@ -182,7 +188,10 @@ typedef enum {
     SELFCAL_REASON_INADEQUATE = 7,     /* the model does not explain the readings */
     SELFCAL_REASON_NOT_IDENTIFIED = 8, /* half of the probability has an N or a drift that is not */
     SELFCAL_REASON_BAD_SAMPLE = 9,     /* on some axis it is not finite or saturated */
-    SELFCAL_REASON_STUCK = 10          /* the axis repeats one reading */
+    SELFCAL_REASON_STUCK = 10,         /* the axis repeats one reading */
+    /* samples have overtaken the last report, and there is none before it, or a rough one: see
+     * SELFCAL_MODEL_REPORT_STEPS */
+    SELFCAL_REASON_OVERTAKEN = 11
 } selfcal_reason_t;
 
 /* A change that was found while the samples came. */
@@ -235,9 +244,12 @@ typedef struct selfcal_imu selfcal_imu_t; /* of its members, `bank`, `computing`
 
 /* Begin over `memory`, aligned to 8 bytes. `size`: SELFCAL_MODEL_IMU_BYTES of the generated header. Tables and memory
  * must outlive the use. A gate that the model has watches from the first sample on. Fails with SELFCAL_BAD_ARGUMENT,
- * SELFCAL_BAD_MODEL (also if the parts that the pipe names do not go together) or SELFCAL_BAD_MEMORY; then `imu` is
- * unusable. */
-selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory, size_t size);
+ * SELFCAL_BAD_MODEL (also if the parts that the pipe names do not go together), SELFCAL_BAD_MEMORY or
+ * SELFCAL_BAD_BUILD; then `imu` is unusable. */
+static inline selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory,
+                                                size_t size);
+selfcal_status_t selfcal_imu_init_as(uint32_t layout, selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory,
+                                     size_t size);
 
 /* From here on the last report of each axis is kept, for selfcal_imu_report() and selfcal_imu_corrected(). Without it
  * the last report of all. `kept` must outlive the use. */
@@ -257,11 +269,12 @@ uint32_t selfcal_imu_sample(selfcal_imu_t *imu, const float reading[], const flo
 /* `count` samples are missing before the next one. */
 void selfcal_imu_skip(selfcal_imu_t *imu, uint64_t count);
 
-/* False while a report is worked out and one more sample might overtake it. Let the samples wait then. */
+/* False while a report is worked out and one more sample might overtake it. Let the samples wait then. Always true
+ * where the model holds reports. */
 bool selfcal_imu_room(const selfcal_imu_t *imu);
 
-/* Reports of these axes are due, a bit each. SELFCAL_BUSY: one of them has begun. Else why the last of them cannot be
- * made. */
+/* Reports of these axes are due, a bit each; the axes take turns. SELFCAL_BUSY: one of them has begun. Else why the
+ * last of them cannot be made. */
 #define SELFCAL_ALL_AXES 0xFFFFU
 selfcal_status_t selfcal_imu_ask(selfcal_imu_t *imu, uint32_t axes);
 

@@ -195,6 +195,7 @@ struct selfcal {
     selfcal_node_t *node;       /* [nodes] */
     selfcal_total_t *b, *c;     /* [nodes][axes]: sums u nu / s and nu^2 / s */
     selfcal_drift_t *x;         /* [nodes][axes]: predicted drift of the zero-bias filter */
+    bool held;                  /* a copy for a report, bank_hold.c: of all that has [axes] it has one */
     uint32_t n;                 /* bank samples in all sums */
     selfcal_wide_t weight;      /* of these samples: n without forgetting */
     selfcal_wide_t keep;        /* part of the sums that is kept as the waiting batch comes, 1 without forgetting */
@@ -292,6 +293,14 @@ typedef struct {
     selfcal_real_t power[SELFCAL_FITTED];
 } selfcal_truth_t;
 
+/* Steps of an axis's reports, from the last samples that they rest on to their end: of 99 in 100 records drawn from the
+ * default priors, of those at their limits too, no more; of most about half. With regressors an axis has two. */
+#define SELFCAL_REPORT_STEPS(nodes, hypotheses, regressors)                                                            \
+    (((regressors) > 0U ? 2U : 1U) * (3U * (nodes) + SELFCAL_BY_QUALITY(350U, 500U, 700U, 1500U) * (hypotheses)))
+/* Calls in a bank interval that bring them to their end before the next batch is full. */
+#define SELFCAL_REPORT_CALLS(nodes, hypotheses, regressors)                                                            \
+    ((SELFCAL_REPORT_STEPS(nodes, hypotheses, regressors) + SELFCAL_BATCH - 2U) / (SELFCAL_BATCH - 1U))
+
 /* Least squares for them by rotations: a triangle, row by row, its right side behind each. */
 #define SELFCAL_TRIANGLE (SELFCAL_FITTED * (SELFCAL_FITTED + 3) / 2)
 typedef struct {
@@ -373,8 +382,9 @@ struct selfcal_work {
     selfcal_t *bank;
     uint8_t axis, hypothesis, stage;
     uint16_t first_node;
-    uint16_t row, at;       /* in the stage: row of cells; node, cell of the row, or parameter that is next */
-    uint32_t batches;       /* of the bank, when the sums came to rest */
+    uint16_t row, at; /* in the stage: row of cells; node, cell of the row, or parameter that is next */
+    /* of the bank, when the sums came to rest. Given, the report rests on those of an earlier one: selfcal_again() */
+    uint32_t batches;
     bool lost;              /* a law that the priors allow has ended without an evidence */
     bool gathered;          /* the nodes run over the last batch: samples from now on come later than the report */
     uint8_t mask, unknowns; /* regressors in use; those and the bias */
@@ -480,7 +490,20 @@ typedef struct {
 typedef struct {
     selfcal_real_t n, lag, slow, along[SELFCAL_ADEQUACY_COLUMNS], weight[SELFCAL_ADEQUACY_COLUMNS];
     selfcal_real_t product[SELFCAL_AXES_MAX]; /* with each other axis */
+    selfcal_real_t power;                     /* of z */
 } selfcal_sums_t;
+
+/* Sums of z, and of the w of each column, over a window and the two before it; of the epoch the greatest rise of z from
+ * one window to the next but one, and how far the columns rise there. */
+enum { SELFCAL_RISE_WINDOWS = 3 };
+typedef struct {
+    selfcal_real_t sum[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_RISE_WINDOWS];
+    selfcal_real_t most, along[SELFCAL_ADEQUACY_COLUMNS];
+    uint32_t at; /* bank samples of the epoch before it */
+    /* the last step of an epoch before: its score, times the root of the bank samples then */
+    selfcal_real_t told;
+    selfcal_suspect_t cause;
+} selfcal_rise_t;
 
 typedef struct {
     bool known, running, begun;
@@ -491,6 +514,7 @@ typedef struct {
     selfcal_real_t state[1 + SELFCAL_ADEQUACY_COLUMNS][SELFCAL_FILTER_STATES];
     selfcal_real_t covariance[SELFCAL_FILTER_STATES * (SELFCAL_FILTER_STATES + 1) / 2];
     selfcal_real_t last, slow, fourth, square[2];
+    selfcal_rise_t rise;
     selfcal_sums_t epoch, all;
 } selfcal_watch_t;
 
@@ -522,6 +546,28 @@ struct selfcal_changes {
     selfcal_change_watch_t watch[SELFCAL_AXES_MAX];
 };
 
+/* coarse.c: filters, shared by the axes; an axis's part of one; what was said before the last restart. */
+enum { SELFCAL_COARSE_FILTERS = 16, SELFCAL_COARSE_COLUMNS = 3 + SELFCAL_ADEQUACY_CHANNELS };
+typedef struct {
+    selfcal_real_t variance, ln_s;                                                 /* of the level; sum D */
+    selfcal_real_t column[SELFCAL_COARSE_COLUMNS], weight[SELFCAL_COARSE_COLUMNS]; /* level and sum A of each */
+} selfcal_coarse_filter_t;
+typedef struct {
+    selfcal_real_t level, square, along[SELFCAL_COARSE_COLUMNS]; /* of the readings; sums C and B */
+} selfcal_coarse_cell_t;
+typedef struct {
+    selfcal_real_t score;
+    selfcal_suspect_t suspect;
+} selfcal_coarse_told_t;
+typedef struct {
+    uint32_t n;                                              /* bank samples */
+    selfcal_real_t elapsed;                                  /* intervals since the first */
+    selfcal_real_t first[SELFCAL_ADEQUACY_CHANNELS], lagged; /* channels at the first; the temperature's low pass */
+    selfcal_coarse_filter_t filter[SELFCAL_COARSE_FILTERS];
+    selfcal_coarse_cell_t cell[SELFCAL_AXES_MAX][SELFCAL_COARSE_FILTERS];
+    selfcal_coarse_told_t before[SELFCAL_AXES_MAX];
+} selfcal_coarse_t;
+
 struct selfcal_adequacy {
     selfcal_changes_t *changes; /* NULL: they are not looked for */
     void (*look)(selfcal_adequacy_t *self, const selfcal_t *bank, const selfcal_real_t z[], uint32_t gap);
@@ -530,6 +576,7 @@ struct selfcal_adequacy {
     selfcal_real_t first[SELFCAL_ADEQUACY_INPUTS], held[SELFCAL_ADEQUACY_INPUTS];
     selfcal_real_t base[SELFCAL_ADEQUACY_INPUTS], sum[SELFCAL_ADEQUACY_INPUTS];
     float coldest, warmest; /* of the bank intervals' temperatures; NAN: there has been none */
+    selfcal_coarse_t coarse;
     selfcal_watch_t watch[SELFCAL_AXES_MAX];
     selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
 };
@@ -577,7 +624,10 @@ struct selfcal_imu {
     selfcal_kept_t *kept;       /* or NULL */
     const selfcal_pipe_t *pipe;
     void *memory;                              /* of the bank */
+    selfcal_t *held;                           /* of the report under way, its sums behind it; or NULL */
     uint16_t due;                              /* reports, a bit for each axis */
+    uint16_t reported;                         /* axes with a report that is not of the past */
+    uint8_t turn;                              /* the axis whose report is looked for first */
     bool watching;                             /* the gate is on */
     bool computing;                            /* a report is worked out */
     bool whole;                                /* it is whole */
@@ -588,10 +638,15 @@ struct selfcal_imu {
     selfcal_report_t report; /* under way, or the last */
 };
 
-/* Bytes of a part, of all that is learned before a change, and of the parts that a model names. */
+/* Bytes of a part, of all that is learned before a change, of the copy for a report, and of the other parts that a
+ * model names. */
 #define SELFCAL_PART(bytes) (((size_t)(bytes) + 7U) / 8U * 8U)
 #define SELFCAL_CHANGES_SIZE(nodes, axes)                                                                              \
     SELFCAL_PART(sizeof(selfcal_changes_t) + (size_t)(nodes) * (axes) * sizeof(float))
+#define SELFCAL_HELD_SIZE(nodes, sum_nodes, columns)                                                                   \
+    (SELFCAL_PART(sizeof(selfcal_t)) +                                                                                 \
+     SELFCAL_PART(SELFCAL_SIZE(nodes, 1) + SELFCAL_REGRESSORS_SIZE(nodes, 1, columns) +                                \
+                  SELFCAL_TERMS_SIZE(sum_nodes, 1, columns)))
 #define SELFCAL_PARTS_SIZE(nodes, axes, gate, columns, judged, changes)                                                \
     (((gate) ? SELFCAL_PART(sizeof(selfcal_watched_t)) : 0U) +                                                         \
      ((columns) ? SELFCAL_PART(sizeof(selfcal_imu_columns_t)) : 0U) +                                                  \
@@ -624,5 +679,27 @@ struct selfcal_telemetry {
     uint8_t made;    /* frames of this report or status */
     uint32_t frames; /* made since selfcal_telemetry_init() */
 };
+
+/* --- one build ---
+ * Who calls and who was compiled must mean the same structs: their sizes tell, before any of them is written. */
+#define SELFCAL_LAYOUT                                                                                                 \
+    ((uint32_t)(sizeof(selfcal_imu_t) + 3U * sizeof(selfcal_t) + 7U * sizeof(selfcal_work_t) +                         \
+                31U * sizeof(selfcal_report_t) + 127U * sizeof(selfcal_kept_t) + 8191U * sizeof(selfcal_adequacy_t) +  \
+                131071U * sizeof(selfcal_former_t) + 524287U * sizeof(selfcal_gate_t) +                                \
+                16777213U * sizeof(selfcal_node_t) + 67108859U * (size_t)SELFCAL_ARITHMETIC))
+
+static inline selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory,
+                                                size_t size) {
+    return selfcal_imu_init_as(SELFCAL_LAYOUT, imu, pipe, memory, size);
+}
+
+static inline selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size) {
+    return selfcal_init_as(SELFCAL_LAYOUT, self, model, memory, size);
+}
+
+static inline selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size,
+                                               const void *snapshot, size_t length) {
+    return selfcal_restore_as(SELFCAL_LAYOUT, self, model, memory, size, snapshot, length);
+}
 
 #endif

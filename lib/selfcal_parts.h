@@ -20,8 +20,11 @@ typedef struct selfcal selfcal_t; /* of its members, `position` and `used` may b
 
 /* Prepare `self` over `memory`, aligned to 8 bytes. `size`: SELFCAL_MODEL_BYTES of the generated header, or the sum of
  * SELFCAL_SIZE, SELFCAL_REGRESSORS_SIZE and SELFCAL_TERMS_SIZE of selfcal_layout.h. Model and memory must outlive the
- * use. Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL or SELFCAL_BAD_MEMORY; then `self` is unusable. */
-selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
+ * use. Fails with SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL, SELFCAL_BAD_MEMORY or SELFCAL_BAD_BUILD; then `self` is
+ * unusable. `layout`: SELFCAL_LAYOUT as the caller has it. */
+static inline selfcal_status_t selfcal_init(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size);
+selfcal_status_t selfcal_init_as(uint32_t layout, selfcal_t *self, const selfcal_model_t *model, void *memory,
+                                 size_t size);
 
 /* A sample of this size counts as saturated whatever the range, 2^40. Below it no sum can overflow (intake.c). */
 #define SELFCAL_SAMPLE_MAX 1.099511627776e12F
@@ -177,11 +180,13 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
 
 /* selfcal_init(), then the state that `snapshot` holds: `length` bytes, aligned or not, all of them and no more.
  * `model` must be the saved bank's, known by its id, axes and nodes; the build must have the same configuration.
- * Refused with one of SELFCAL_SNAPSHOT_..., SELFCAL_BAD_ARGUMENT, SELFCAL_BAD_MODEL or SELFCAL_BAD_MEMORY: `self` and
- * `memory` are as they were. SELFCAL_CORRUPT (the checksum fits contents that no bank can have): `self` is as
- * selfcal_init() leaves it, without a sample. O(nodes axes). */
-selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size,
-                                 const void *snapshot, size_t length);
+ * Refused with one of SELFCAL_SNAPSHOT_..., or as by selfcal_init(): `self` and `memory` are as they were.
+ * SELFCAL_CORRUPT (the checksum fits contents that no bank can have): `self` is as selfcal_init() leaves it, without a
+ * sample. O(nodes axes). */
+static inline selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size,
+                                               const void *snapshot, size_t length);
+selfcal_status_t selfcal_restore_as(uint32_t layout, selfcal_t *self, const selfcal_model_t *model, void *memory,
+                                    size_t size, const void *snapshot, size_t length);
 
 /* --- report --- */
 

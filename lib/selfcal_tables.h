@@ -237,6 +237,8 @@ typedef struct selfcal_judging_code selfcal_judging_code_t;
 extern const selfcal_judging_code_t selfcal_judging_code;
 typedef struct selfcal_changes_code selfcal_changes_code_t;
 extern const selfcal_changes_code_t selfcal_changes_code;
+typedef struct selfcal_holding_code selfcal_holding_code_t;
+extern const selfcal_holding_code_t selfcal_holding_code;
 typedef struct selfcal_gate_config selfcal_gate_config_t;
 typedef struct {
     const selfcal_model_t *model;
@@ -246,6 +248,7 @@ typedef struct {
     const selfcal_columns_code_t *columns; /* forms the values of the regressors: with them, and only then */
     const selfcal_judging_code_t *judging; /* judges the model */
     const selfcal_changes_code_t *changes; /* handles steps and changes of the noise; with judging */
+    const selfcal_holding_code_t *holding; /* a report rests on a copy of its axis's sums: no sample overtakes it */
 } selfcal_pipe_t;
 
 #ifdef __cplusplus

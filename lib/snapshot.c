@@ -79,7 +79,7 @@ static uint32_t number_at(const uint8_t *bytes, size_t size) {
 }
 
 /* Facts of the build. An image of other facts is refused. */
-static uint32_t layout(void) {
+static uint32_t facts_of_build(void) {
     const uint32_t facts[] = {
         sizeof(void *),
         sizeof(selfcal_t),
@@ -160,7 +160,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     put_number(&sink, 2, model->nodes);
     put_number(&sink, 2, 0);
     put_number(&sink, 4, model->id);
-    put_number(&sink, 4, layout());
+    put_number(&sink, 4, facts_of_build());
     for (size_t p = 0; p < PARTS; p++) {
         put(&sink, part[p].from, part[p].bytes);
     }
@@ -193,14 +193,17 @@ static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *byt
     }
     if (bytes[10] != SELFCAL_ARITHMETIC || bytes[11] != model->axes || number_at(bytes + 12, 2) != model->nodes ||
         number_at(bytes + 14, 2) != 0U || number_at(bytes + 16, 4) != model->id ||
-        number_at(bytes + 20, 4) != layout() || length != size_of(model)) {
+        number_at(bytes + 20, 4) != facts_of_build() || length != size_of(model)) {
         return SELFCAL_SNAPSHOT_FOREIGN;
     }
     return SELFCAL_OK;
 }
 
-selfcal_status_t selfcal_restore(selfcal_t *self, const selfcal_model_t *model, void *memory, size_t size,
-                                 const void *snapshot, size_t length) {
+selfcal_status_t selfcal_restore_as(uint32_t layout, selfcal_t *self, const selfcal_model_t *model, void *memory,
+                                    size_t size, const void *snapshot, size_t length) {
+    if (layout != SELFCAL_LAYOUT) {
+        return SELFCAL_BAD_BUILD;
+    }
     if (self == NULL || model == NULL || memory == NULL || snapshot == NULL) {
         return SELFCAL_BAD_ARGUMENT;
     }

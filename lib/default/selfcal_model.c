@@ -91,4 +91,5 @@ const selfcal_pipe_t selfcal_model_pipe = {
     NULL,
     SELFCAL_MODEL_JUDGED ? &selfcal_judging_code : NULL,
     SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES ? &selfcal_changes_code : NULL,
+    SELFCAL_MODEL_HELD ? &selfcal_holding_code : NULL,
 };

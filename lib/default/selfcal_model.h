@@ -27,8 +27,15 @@
 #ifndef SELFCAL_MODEL_JUDGED
 #define SELFCAL_MODEL_JUDGED 1
 #endif
+/* 1: a report rests on a copy of its axis's sums, so that no sample overtakes it (lib/imu_hold.c). */
+#define SELFCAL_MODEL_HELD 0
+#define SELFCAL_MODEL_HELD_BYTES     (SELFCAL_MODEL_HELD          ? SELFCAL_HELD_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_REGRESSORS)          : 0U)
+/* Calls of selfcal_imu_work() in a bank interval that keep every report ahead of the samples; held, any number does. A
+ * program that makes so many with every sample says #if !SELFCAL_MODEL_KEEPS_UP(calls), and #error. */
+#define SELFCAL_MODEL_REPORT_STEPS     (SELFCAL_MODEL_HELD          ? 1U          : SELFCAL_REPORT_CALLS(SELFCAL_MODEL_NODES, SELFCAL_MODEL_HYPOTHESES, SELFCAL_MODEL_REGRESSORS))
+#define SELFCAL_MODEL_KEEPS_UP(calls_a_sample) ((calls_a_sample) * 819U >= SELFCAL_MODEL_REPORT_STEPS)
 /* What selfcal_imu_init() wants. */
-#define SELFCAL_MODEL_IMU_BYTES     (SELFCAL_MODEL_BYTES +      SELFCAL_PARTS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_GATE, SELFCAL_MODEL_REGRESSORS,                         SELFCAL_MODEL_JUDGED, SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES))
+#define SELFCAL_MODEL_IMU_BYTES     (SELFCAL_MODEL_BYTES + SELFCAL_MODEL_HELD_BYTES +      SELFCAL_PARTS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_GATE, SELFCAL_MODEL_REGRESSORS,                         SELFCAL_MODEL_JUDGED, SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES))
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ 819.2F
 /* The same in 1/1000 Hz, for the preprocessor: a program whose samples come at another rate must not compile. */

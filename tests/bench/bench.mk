@@ -6,8 +6,8 @@ BENCH_C := $(wildcard lib/*.c tests/bench/*.c) $(wildcard port/app/app*.c)
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
 ARM_FAST += tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
-# 4 KB more than the part has: the measuring and its records take some of it.
-MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0x9000
+# 8 KB more than the part has: the measuring, its records and the judgement take some of it.
+MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0xA000
 
 bench: setup-dev bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
 	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)
@@ -16,6 +16,8 @@ bench: setup-dev bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/ho
 bench-counts: bench-images firmware-images
 	@$(BIN)/python tests/bench/bench.py
 
+# As the core's image has it.
+BENCH_FLAGS_cortex-m0 := -DSELFCAL_MODEL_JUDGED=0
 BENCH_LINK := arm-none-eabi-gcc -nostartfiles -T tests/bench/image.ld -Wl,--gc-sections
 define BENCH_IMAGE
 bench-images: $(BENCH)/$(1)/image.elf $(BENCH)/$(1)/module.elf
@@ -25,7 +27,7 @@ $(BENCH)/$(1)/objects.stamp: $(BENCH_C) $(BENCH_H) $(ARM_SOURCES_$(1)) $(BENCH)/
                              port/library.mk
 	@rm -rf $$(@D)/objects
 	@$$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(1) MODEL_DIR=$$(@D) OUT=$$(@D)/objects
-	$$(call arm_objects,$(ARM_$(1)) -Ilib -Iport -Iport/app -I$$(@D),\
+	$$(call arm_objects,$(ARM_$(1)) $(BENCH_FLAGS_$(1)) -Ilib -Iport -Iport/app -I$$(@D),\
 	    $(filter-out lib/%,$(BENCH_C)) $(ARM_SOURCES_$(1)) $$(@D)/selfcal_model.c,$$(@D)/objects)
 	@touch $$@
 # Either main: the library's in bench.c, the application's in module.c.

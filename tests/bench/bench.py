@@ -11,6 +11,7 @@ import json
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from fractions import Fraction
@@ -22,10 +23,10 @@ import image_sizes
 ROOT = Path(__file__).resolve().parents[2]
 BUILD = ROOT / "build" / "bench"
 REFERENCE = Path(__file__).with_name("counts.json")
-DOCUMENT = ROOT / "tests" / "COST.md"
-#: Where the document has the table, whose lines are as long as its others.
+DOCUMENT, PAGE = ROOT / "tests" / "COST.md", ROOT / "lib" / "README.md"
+#: Where a document has its table. The lines of the long one are as long as its others.
 LINE = 120
-TABLE = re.compile(r"(<!-- python tests/bench/bench.py --table -->\n).*(\n<!-- end of the table -->)", re.DOTALL)
+TABLE = re.compile(r"(<!-- python tests/bench/bench.py --\w+ -->\n).*?(\n<!-- end of the table -->)", re.DOTALL)
 GROWTH = Fraction(2, 100)
 #: s; an image that takes longer hangs.
 TIMEOUT = 120
@@ -77,14 +78,21 @@ def _board(core: str, *, image: bool = True) -> tuple[int, str, int]:
 MACHINES = {
     "cortex-m4f": Machine("netduinoplus2", (), *_board("cortex-m4f")),
     # The nRF51822 with 32 KB of RAM, since the bank and a report of six axes do not fit the 16 KB of the board's own.
-    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0x9000"), *_board("cortex-m0")),
+    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0xA000"), *_board("cortex-m0")),
 }
 
 #: Files by the beginnings of their names: what a bank that reports and sends cannot be without.
 ALWAYS = ("intake", "bank", "report", "telemetry")
 #: ... but for what a model has to name.
 NAMED = ("bank_columns", "bank_forget", "bank_states")
-SMALL_GRID = 12 * 12 + 12 + 1
+#: What a product with a pipe places, by the names that module.c prints.
+PLACED = {
+    "imu": "`selfcal_imu_t`",
+    "kept": "`selfcal_kept_t`",
+    "memory": "memory of `SELFCAL_MODEL_IMU_BYTES`",
+}
+#: Calls whose stack the image of the firmware shows.
+CALLS = ("selfcal_imu_sample", "selfcal_imu_work", "selfcal_imu_save", "selfcal_imu_restore")
 
 
 class BenchError(Exception):
@@ -171,7 +179,7 @@ def measure(target: str) -> Figures:
     module_counts, module_values = run_image(target, "module")
     counts |= module_counts
     values |= module_values
-    sizes = {name: value for name, value in values.items() if name.startswith("ram.")}
+    sizes = {name: value for name, value in values.items() if name.startswith(("ram.", "place."))}
     facts = {name: value for name, value in values.items() if name not in sizes}
     if "paper" in counts:
         difference, heaviest = facts["paper.worst_weight_difference_1e9"], facts["paper.heaviest_weight_1e9"]
@@ -184,6 +192,7 @@ def measure(target: str) -> Figures:
         counts |= measure_more(target)
         try:
             image, _ = image_sizes.measure(MACHINES[target].image)
+            image |= image_sizes.stacks(MACHINES[target].image, CALLS)
         except image_sizes.FirmwareError as error:
             raise BenchError(f"{MACHINES[target].image}: {error}") from error
         sizes |= {f"firmware.{kind}": size for kind, size in image.items()}
@@ -360,26 +369,26 @@ def table(bench: Bench) -> str:
     number("… of that intake, bank, kernel, report, telemetry", "sizes", "linked.always")
     number("… and what it draws from libm, libc, libgcc", "sizes", "linked.runtime")
     number("flash, tables of the model", "sizes", "linked.tables")
+    row("**what a product places**, bytes, reports of all axes kept; M4F: judged", {})
+    placed = {t: {n: f["sizes"].get(f"place.{n}", 0) for n in PLACED} for t, f in targets.items()}
+    for name, title in PLACED.items():
+        row(title, {t: f"{of[name]:,}" for t, of in placed.items()})
+    row("… all three", {t: f"{sum(of.values()):,}" for t, of in placed.items()})
+    number("… and with `codegen --hold` so much more", "sizes", "place.held")
+    for name in CALLS:
+        number(f"stack of `{name}()`", "sizes", f"firmware.stack.{name}")
+    row("**parts for a pipe of one's own**, bytes", {})
     number("RAM, `SELFCAL_SIZE`, six axes", "sizes", "ram.SELFCAL_SIZE")
     for name in ("selfcal_t", "selfcal_work_t", "selfcal_report_t", "selfcal_telemetry_t"):
         number(f"RAM, `{name}`", "sizes", f"ram.{name}")
     rams = {t: {name: size for name, size in f["sizes"].items() if name.startswith("ram.")} for t, f in targets.items()}
     a_node = {t: ram["ram.SELFCAL_SIZE"] // targets[t]["facts"]["nodes"] for t, ram in rams.items()}
-    row("RAM, all of these", {t: f"{sum(ram.values()):,}" for t, ram in rams.items()})
     row("… of which one node", {t: f"{size:,}" for t, size in a_node.items()})
-    row(
-        f"… with {SMALL_GRID} nodes (12 x 12 Gauss-Markov, 12 random walk, 1 constant)",
-        {
-            t: f"{sum(ram.values()) - (targets[t]['facts']['nodes'] - SMALL_GRID) * a_node[t]:,}"
-            for t, ram in rams.items()
-            if targets[t]["facts"]["nodes"] > SMALL_GRID
-        },
-    )
     row("**whole image**, bytes", {t: MACHINES[t].image for t in targets})
     number("flash", "sizes", "firmware.flash")
     number("RAM of the variables", "sizes", "firmware.ram")
     number("stack, worst case by the call graph, interrupts upon it", "sizes", "firmware.stack")
-    heading = ["", *(target.removeprefix("cortex-").replace("m4f", "M4F").replace("m0", "M0") for target in targets)]
+    heading = ["", *map(_core, targets)]
     width = LINE - 14 * len(targets) - 4
 
     def line(title: str, cells: list[str]) -> str:
@@ -389,6 +398,46 @@ def table(bench: Bench) -> str:
 
     lines = [line(heading[0], heading[1:]), f"|{'-' * (width + 2)}|" + f"{'-' * 12}:|" * len(targets)]
     lines += [line(title, cells) for title, cells in rows]
+    return "\n".join(lines)
+
+
+def _core(target: str) -> str:
+    return target.removeprefix("cortex-").replace("m4f", "M4F").replace("m0", "M0")
+
+
+def product_table(bench: Bench) -> str:
+    """What a product with the default model pays, as a markdown table for the library's page."""
+    targets = bench["targets"]
+    lines = [
+        f"| default model, six axes; on the M4F judged | {' | '.join(_core(t) for t in targets)} |",
+        "|---|" + "---:|" * len(targets),
+    ]
+
+    def row(title: str, value: Callable[[Figures], float | Fraction]) -> None:
+        lines.append(f"| {title} | {' | '.join(f'{round(value(figures)):,}' for figures in targets.values())} |")
+
+    def count(name: str) -> Callable[[Figures], Fraction]:
+        return lambda figures: Fraction(*figures["counts"][name])
+
+    def longest_step(figures: Figures) -> int:
+        return max(n for name, (n, _) in figures["counts"].items() if name.endswith(".worst_step"))
+
+    row(
+        "RAM that you place, bytes: the three objects of the example",
+        lambda f: sum(f["sizes"][f"place.{n}"] for n in PLACED),
+    )
+    row("… with `codegen --hold` so much more", lambda f: f["sizes"]["place.held"])
+    row("stack of `selfcal_imu_sample()`, bytes", lambda f: f["sizes"]["firmware.stack.selfcal_imu_sample"])
+    row("… of `selfcal_imu_work()`", lambda f: f["sizes"]["firmware.stack.selfcal_imu_work"])
+    row(
+        "flash, linked, bytes: library and `libm`",
+        lambda f: f["sizes"]["linked.library"] + f["sizes"]["linked.runtime"],
+    )
+    row("… tables", lambda f: f["sizes"]["linked.tables"])
+    row("instructions of a sample at 819.2 Hz, on average", count("sample"))
+    row("… of the longest turn with one", count("sample.worst"))
+    row("instructions of a report of one axis", count("report"))
+    row("… of its longest call", longest_step)
     return "\n".join(lines)
 
 
@@ -413,15 +462,24 @@ def read_reference() -> Bench:
     return reference
 
 
+def put_table(page: Path, rows: str) -> None:
+    """The rows in the place of those that the page has. Raises BenchError if it has no place."""
+    text, found = TABLE.subn(lambda match: match[1] + rows + match[2], page.read_text(encoding="utf-8"))
+    if found != 1:
+        raise BenchError(f"{page}: no place for the table")
+    page.write_text(text, encoding="utf-8")
+
+
 def main() -> int:
     """Measure, print, compare."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0] if __doc__ else None)
     parser.add_argument("--table", action="store_true", help="print counts.json as markdown; measure nothing")
+    parser.add_argument("--product", action="store_true", help="print that of lib/README.md alike")
     parser.add_argument("--host", action="store_true", help="measure ns on this machine as well")
     parser.add_argument("--accept", action="store_true", help="write counts.json and the table of tests/COST.md anew")
     arguments = parser.parse_args()
-    if arguments.table:
-        print(table(read_reference()))
+    if arguments.table or arguments.product:
+        print((table if arguments.table else product_table)(read_reference()))
         return 0
     with ThreadPoolExecutor() as pool:
         figures = dict(zip(MACHINES, pool.map(measure, MACHINES), strict=True))
@@ -434,10 +492,8 @@ def main() -> int:
         print(f"\n{host_table(host)}")
     if arguments.accept:
         REFERENCE.write_text(json.dumps(now, indent=1) + "\n", encoding="utf-8")
-        text, found = TABLE.subn(lambda match: match[1] + table(now) + match[2], DOCUMENT.read_text(encoding="utf-8"))
-        if found != 1:
-            raise BenchError(f"{DOCUMENT}: no place for the table")
-        DOCUMENT.write_text(text, encoding="utf-8")
+        put_table(DOCUMENT, table(now))
+        put_table(PAGE, product_table(now))
         return 0
     before = read_reference()
     if before["compiler"] not in ("", now["compiler"]):

@@ -24,7 +24,7 @@ import struct
 import subprocess
 import sys
 from bisect import bisect_right
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypedDict
@@ -293,6 +293,14 @@ def measure(target: str, sensor: str = SENSOR) -> tuple[dict[str, int], str]:
     if stack > room:
         raise FirmwareError(f"the stack may take {stack} bytes, port/{target}/link.ld keeps {room}")
     return {"flash": image.flash(), "ram": image.ram(), "stack": stack}, path
+
+
+def stacks(target: str, names: Iterable[str]) -> dict[str, int]:
+    """Bytes of stack of each function of a target's image that is in it, by `stack.NAME`. Raises FirmwareError."""
+    image = Image(BUILD / target / "selfcal.elf")
+    calls = read_budget(target, SENSOR)["calls"]
+    found = ((name, address) for name in names for address in image.functions_in(name) if name in image.symbols)
+    return {f"stack.{name}": image.deepest(address, calls)[0] for name, address in found}
 
 
 def read_budget(target: str, sensor: str = SENSOR) -> Budget:

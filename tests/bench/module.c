@@ -165,6 +165,10 @@ int main(void) {
     count_print_value("report.samples", samples - before);
     count_print_value("report.most_waiting", most_waiting);
     print_gate();
+    count_print_value("place.imu", sizeof app.imu);
+    count_print_value("place.kept", sizeof(selfcal_kept_t));
+    count_print_value("place.memory", SELFCAL_MODEL_IMU_BYTES);
+    count_print_value("place.held", SELFCAL_HELD_SIZE(SELFCAL_MODEL_NODES, 0U, 0U));
     count_print_value("report.ms", (now_ticks - begun) * 1250U / 1024U / PERIOD_TICKS);
     return 0;
 }

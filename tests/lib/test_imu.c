@@ -420,6 +420,193 @@ static void test_getters_after_all_is_lost(void) {
     }
 }
 
+/* --- samples that come while a report is worked out --- */
+
+static void feed(uint32_t samples) {
+    for (uint32_t at = 0; at < samples; at++) {
+        float reading[AXES];
+        (void)draw_sample(0U, reading);
+        (void)selfcal_imu_sample(&imu, reading, NULL, NULL);
+    }
+}
+
+/* `calls` of work with every sample, and all reports asked for every ten intervals. */
+static void superloop(uint32_t samples, unsigned calls) {
+    for (uint32_t at = 0; at < samples; at++) {
+        feed(1U);
+        if (at % (10U * BLOCK) == 0U) {
+            (void)selfcal_imu_ask(&imu, SELFCAL_ALL_AXES);
+        }
+        for (unsigned k = 0; k < calls; k++) {
+            (void)selfcal_imu_work(&imu);
+        }
+    }
+}
+
+static void begin_alone(void) {
+    pipe = (selfcal_pipe_t){.model = &model, .rate_hz = (float)BLOCK, .holding = pipe.holding};
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
+    selfcal_imu_keep(&imu, &kept);
+    feed(200U * BLOCK);
+}
+
+/* So few calls that no report can be done in a batch: the axes say so, and it is counted. */
+static void test_a_report_that_samples_overtake_says_so(void) {
+    begin_alone();
+    superloop(400U * BLOCK, 1U);
+    for (uint8_t axis = 0; axis < AXES; axis++) {
+        TEST_ASSERT_NULL(selfcal_imu_report(&imu, axis));
+        TEST_ASSERT_EQUAL(SELFCAL_REASON_OVERTAKEN, selfcal_imu_reason(&imu, axis));
+    }
+    TEST_ASSERT_GREATER_OR_EQUAL(AXES, selfcal_counters(&imu.bank)->overtaken);
+}
+
+/* One that is overtaken leaves the last one in force. */
+static void test_an_older_report_stays(void) {
+    begin_alone();
+    feed(2000U * BLOCK); /* so that it is identified */
+    (void)selfcal_imu_ask(&imu, 1U);
+    while (selfcal_imu_work(&imu) == SELFCAL_BUSY) {
+    }
+    const uint32_t n = selfcal_imu_report(&imu, 0)->n;
+    const selfcal_reason_t reason = selfcal_imu_reason(&imu, 0);
+    superloop(100U * BLOCK, 1U);
+    TEST_ASSERT_GREATER_THAN(0U, selfcal_counters(&imu.bank)->overtaken);
+    TEST_ASSERT_EQUAL(n, selfcal_imu_report(&imu, 0)->n);
+    TEST_ASSERT_EQUAL(SELFCAL_REASON_NONE, reason);
+    TEST_ASSERT_EQUAL(SELFCAL_REASON_NONE, selfcal_imu_reason(&imu, 0));
+    selfcal_corrected_t corrected;
+    TEST_ASSERT_TRUE(selfcal_imu_corrected(&imu, &corrected));
+    TEST_ASSERT_TRUE(isfinite(corrected.sd[0]) && isnan(corrected.sd[1]));
+}
+
+/* As many calls as the macro wants: each axis in its turn, though all are asked for before they can be done. */
+static void test_each_axis_has_its_turn(void) {
+    begin_alone();
+    const unsigned wanted = SELFCAL_REPORT_CALLS(SELFCAL_MODEL_NODES, SELFCAL_MODEL_HYPOTHESES, 0U);
+    superloop(500U * BLOCK, (wanted + BLOCK - 1U) / BLOCK);
+    TEST_ASSERT_EQUAL(0U, selfcal_counters(&imu.bank)->overtaken);
+    for (uint8_t axis = 0; axis < AXES; axis++) {
+        TEST_ASSERT_NOT_NULL(selfcal_imu_report(&imu, axis));
+        TEST_ASSERT_GREATER_THAN(600U, selfcal_imu_report(&imu, axis)->n);
+    }
+}
+
+/* Bit for bit the report that the bank gives when the copy is taken, whatever comes then. */
+static void assert_held(const char *what) {
+    while (imu.work.bank != imu.held) {
+        TEST_ASSERT_EQUAL_MESSAGE(SELFCAL_BUSY, selfcal_imu_work(&imu), what);
+    }
+    selfcal_report_t *truth = &parts.report;
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_report(&parts.work, &imu.bank, imu.report.axis, truth));
+    selfcal_status_t status = SELFCAL_BUSY;
+    for (unsigned k = 0; status == SELFCAL_BUSY; k++) {
+        feed(k < 300U ? BLOCK : 0U);
+        status = selfcal_imu_work(&imu);
+    }
+    TEST_ASSERT_EQUAL_MESSAGE(SELFCAL_OK, status, what);
+    const selfcal_report_t *got = selfcal_imu_report(&imu, truth->axis);
+    TEST_ASSERT_EQUAL_MESSAGE(truth->n, got->n, what);
+    TEST_ASSERT_EQUAL_MEMORY(truth->hypothesis, got->hypothesis, model.hypotheses * sizeof truth->hypothesis[0]);
+    TEST_ASSERT_TRUE_MESSAGE(truth->bias_mean == got->bias_mean && truth->bias_sd == got->bias_sd, what);
+    TEST_ASSERT_GREATER_THAN_MESSAGE(truth->n + 250U, selfcal_count(&imu.bank), what);
+}
+
+static void test_no_sample_overtakes_a_report_that_is_held(void) {
+    pipe.holding = &selfcal_holding_code;
+    begin_alone();
+    for (uint8_t axis = 0; axis < AXES; axis += 2U) {
+        TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_ask(&imu, 1U << axis));
+        assert_held("plain laws");
+    }
+    superloop(2500U * BLOCK, 1U); /* as little work as above: now every axis has its report */
+    TEST_ASSERT_EQUAL(0U, selfcal_counters(&imu.bank)->overtaken);
+    for (uint8_t axis = 0; axis < AXES; axis++) {
+        TEST_ASSERT_GREATER_THAN(selfcal_count(&imu.bank) - 1000U, selfcal_imu_report(&imu, axis)->n);
+    }
+}
+
+/* Both reports of an axis with regressors rest on the same sums, though samples come between them. */
+static void test_the_two_reports_of_an_axis_rest_on_the_same_sums(void) {
+    model.regressors = &regressors;
+    pipe.columns = &selfcal_columns_code;
+    for (unsigned held = 0; held < 2U; held++) {
+        float probability[2];
+        for (unsigned between = 0; between < 2U; between++) {
+            state = 77U;
+            pipe = (selfcal_pipe_t){.model = &model,
+                                    .rate_hz = (float)BLOCK,
+                                    .columns = &selfcal_columns_code,
+                                    .holding = held != 0U ? &selfcal_holding_code : NULL};
+            TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
+            feed(300U * BLOCK);
+            TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_ask(&imu, 1U));
+            while (!imu.columns->with) {
+                TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_work(&imu));
+            }
+            feed(between * 5U * BLOCK); /* each is worth some nats */
+            while (selfcal_imu_work(&imu) == SELFCAL_BUSY) {
+            }
+            TEST_ASSERT_NOT_NULL(selfcal_imu_report(&imu, 0));
+            probability[between] = selfcal_imu_coefficients(&imu, 0)->probability;
+        }
+        TEST_ASSERT_TRUE(probability[0] == probability[1]);
+    }
+}
+
+/* A copy outlives samples, but not a change of its own axis. */
+static void test_a_change_ends_a_report_that_is_held(void) {
+    static const selfcal_handling_t steps = {0.0F, true, false};
+    model.handling = &steps;
+    for (uint8_t asked = 0; asked < 2U; asked++) {
+        state = 20261127U;
+        pipe = (selfcal_pipe_t){.model = &model,
+                                .rate_hz = (float)BLOCK,
+                                .judging = &selfcal_judging_code,
+                                .changes = &selfcal_changes_code,
+                                .holding = &selfcal_holding_code};
+        TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], sizeof memory[0]));
+        selfcal_imu_keep(&imu, &kept);
+        feed(300U * BLOCK);
+        (void)selfcal_imu_ask(&imu, SELFCAL_ALL_AXES);
+        while (selfcal_imu_work(&imu) == SELFCAL_BUSY) {
+        }
+        feed(600U * BLOCK);
+        (void)selfcal_imu_ask(&imu, 1U << asked);
+        while (imu.work.bank != imu.held) {
+            TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_work(&imu));
+        }
+        uint32_t changed = 0;
+        for (uint32_t at = 0; changed == 0U && at < 200U * BLOCK; at++) {
+            float reading[AXES];
+            (void)draw_sample(0U, reading);
+            reading[1] += 2.0F; /* 20 deviations of a bank sample */
+            changed = selfcal_imu_sample(&imu, reading, NULL, NULL) & SELFCAL_ALL_AXES;
+        }
+        TEST_ASSERT_EQUAL(1U << 1, changed);
+        selfcal_status_t status = SELFCAL_BUSY;
+        while (status == SELFCAL_BUSY) {
+            status = selfcal_imu_work(&imu);
+        }
+        TEST_ASSERT_EQUAL(asked == 1U ? SELFCAL_OVERTAKEN : SELFCAL_OK, status);
+        TEST_ASSERT_NULL(selfcal_imu_report(&imu, 1));
+        TEST_ASSERT_NOT_NULL(selfcal_imu_report(&imu, 0));
+    }
+}
+
+/* Compiled with other sizes than the library: nothing is written. */
+static void test_another_build_is_refused(void) {
+    static unsigned char before[sizeof imu];
+    fill(&imu, sizeof imu);
+    memcpy(before, &imu, sizeof imu);
+    const uint32_t other = SELFCAL_LAYOUT + (uint32_t)sizeof(float);
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_BUILD, selfcal_imu_init_as(other, &imu, &pipe, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_BUILD, selfcal_init_as(other, &imu.bank, &model, memory[0], sizeof memory[0]));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_BUILD,
+                      selfcal_restore_as(other, &imu.bank, &model, memory[0], sizeof memory[0], saved, 64U));
+    TEST_ASSERT_EQUAL_MEMORY(before, &imu, sizeof imu);
+}
+
 int main(void) {
     UNITY_BEGIN();
     RUN_TEST(test_it_is_what_its_parts_are);
@@ -431,5 +618,12 @@ int main(void) {
     RUN_TEST(test_a_pipe_without_parts_is_a_bank);
     RUN_TEST(test_getters_before_any_report);
     RUN_TEST(test_getters_after_all_is_lost);
+    RUN_TEST(test_a_report_that_samples_overtake_says_so);
+    RUN_TEST(test_an_older_report_stays);
+    RUN_TEST(test_each_axis_has_its_turn);
+    RUN_TEST(test_no_sample_overtakes_a_report_that_is_held);
+    RUN_TEST(test_the_two_reports_of_an_axis_rest_on_the_same_sums);
+    RUN_TEST(test_a_change_ends_a_report_that_is_held);
+    RUN_TEST(test_another_build_is_refused);
     return UNITY_END();
 }

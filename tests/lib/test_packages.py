@@ -24,8 +24,10 @@ import yaml
 from selfcal.model.file import Model
 from selfcal.verbs.codegen import codegen
 from selfcal.wire import package_codegen
+from selfcal.wire.frames import AxisReport, Decoder
 
 from conftest import ROOT
+from wire_stream import message
 
 LIBRARY, CONSUMER = ROOT / "lib", ROOT / "tests" / "consumer"
 PROGRAM = LIBRARY / "examples" / "rest_c" / "rest.c"
@@ -65,6 +67,43 @@ def cmake(source: Path, build: Path, *options: str) -> None:
     """Configure and build; any warning of CMake is an error."""
     call("cmake", "-Werror=dev", "-GNinja", "-S", source, "-B", build, *options)
     call("cmake", "--build", build)
+
+
+LOOP = LIBRARY / "examples" / "loop_c" / "loop.c"
+LOOP_WARNINGS = ["-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Wdouble-promotion", "-Werror"]
+
+
+@pytest.mark.parametrize(
+    "compiler",
+    ["gcc -std=c99", "g++ -std=c++17 -x c++", "arm-none-eabi-gcc -std=c99 -mcpu=cortex-m4 -mthumb -Os"],
+)
+def test_the_loop_compiles(compiler: str) -> None:
+    if shutil.which(compiler.split()[0]) is None:
+        pytest.skip(f"{compiler.split()[0]} is missing: make setup-dev")
+    folders = [f"-I{LIBRARY}", f"-I{LIBRARY / 'default'}"]
+    call(*compiler.split(), *LOOP_WARNINGS, *folders, "-c", LOOP, "-o", os.devnull)
+
+
+def test_the_loop_reports_sends_and_goes_on_after_a_power_cut(tables: Path, tmp_path: Path) -> None:
+    """Twenty minutes with a report each, but for the first after power-on. Biases are those that it draws, 0.5: 4 sd.
+    After the cut the bank goes on from the last save, at most 4 minutes old."""
+    sources = [LOOP, tables / "selfcal_model.c", *sorted(LIBRARY.glob("*.c"))]
+    compiler = ["cc", "-std=c99", "-O1", "-ffp-contract=off", f"-I{LIBRARY}", f"-I{tables}"]
+    call(*compiler, *sources, "-lm", "-o", tmp_path / "loop")
+    decoder = Decoder(from_start=True)
+    reports: list[AxisReport] = []
+    for line in call(tmp_path / "loop").split():
+        reports += decoder.feed(message(line))
+    assert all(report.complete for report in reports)
+    assert decoder.statistics.refused + decoder.statistics.damaged == 0
+    for axis in OWN_AXES:
+        mine = [report for report in reports if report.axis == axis]
+        assert len(mine) >= 16
+        last = mine[-1]
+        assert abs(last.value("bias_mean") - 0.5) < 4.0 * last.value("bias_sd")
+        cut = next(k for k in range(1, len(mine)) if mine[k].time_s < mine[k - 1].time_s)
+        before, after = mine[cut - 1].value("count"), mine[cut].value("count")
+        assert 500.0 <= before < 600.0 and 420.0 <= after <= before + 70.0
 
 
 def biases(printed: str) -> list[str]:

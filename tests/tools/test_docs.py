@@ -235,10 +235,11 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
     assert (tmp_path / "my.csv").exists() and (tmp_path / "tables" / "selfcal_model.c").exists()
 
 
-def test_the_cost_table_is_the_one_of_the_bench() -> None:
-    bench = [sys.executable, str(ROOT / "tests" / "bench" / "bench.py"), "--table"]
+@pytest.mark.parametrize(("option", "page"), [("--table", "tests/COST.md"), ("--product", "lib/README.md")])
+def test_the_cost_tables_are_those_of_the_bench(option: str, page: str) -> None:
+    bench = [sys.executable, str(ROOT / "tests" / "bench" / "bench.py"), option]
     table = subprocess.run(bench, capture_output=True, text=True, check=True).stdout.strip()
-    assert table in (ROOT / "tests" / "COST.md").read_text(encoding="utf-8")
+    assert table in (ROOT / page).read_text(encoding="utf-8")
 
 
 def blocks(document: Path, language: str) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 
 from selfcal import _library32
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
@@ -265,6 +266,25 @@ def test_equal_readings_are_said(tmp_path: Path) -> None:
 def test_the_model_allows_what_the_library_holds() -> None:
     assert NODES[1] == _library32.GRID_MAX
     assert REPORT_MIN == _library32.REPORT_MIN
+
+
+def test_a_model_states_the_priors_of_its_laws_alone(tmp_path: Path) -> None:
+    """Two laws without sigma_m and alpha. Truth: the same file with priors of them, which no law takes. The answers are
+    the same to the last digit. A parameter of one of its laws must be there."""
+    tree = yaml.safe_load(MODEL.path.read_text(encoding="utf-8"))
+    tree["hypotheses"] = {"constant": 0.5, "random_walk": 0.5}
+    told, y = [], simulate_bank_samples("random_walk", {"N": 0.03, "K": 2e-3}, 1.0, 1500, seed=8)[0]
+    save(tmp_path / "log.csv", {"gx": ("deg/s", y)}, 1.0, {})
+    for left_out in ((), ("sigma_m", "alpha"), ("K",)):
+        for group in tree["groups"].values():
+            group["priors"] = {key: prior for key, prior in group["priors"].items() if key not in left_out}
+        (tmp_path / "model.yaml").write_text(yaml.safe_dump(tree))
+        if "K" not in left_out:
+            told.append(identify(tmp_path / "log.csv", model=tmp_path / "model.yaml")["axes"]["gx"])
+    assert told[0]["log_evidence"] == told[1]["log_evidence"]
+    assert told[0]["parameters"] == told[1]["parameters"]
+    with pytest.raises(UserError, match=r"groups\.\w+\.priors: 'K' is missing"):
+        Model.load(tmp_path / "model.yaml")
 
 
 def test_a_model_key_given_twice_is_refused(tmp_path: Path) -> None:

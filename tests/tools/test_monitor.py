@@ -26,6 +26,7 @@ from selfcal.wire.dbc_file import PLACE_NAMES
 from selfcal.wire.frames import REASONS, AxisReport, Decoder, Link, names_of, open_bus
 from selfcal.wire.live import View
 
+from conftest import run
 from wire_stream import lines, message, serial_line, stream
 
 #: What an axis's report has no number for where the record lies outside the priors.
@@ -66,6 +67,63 @@ def test_its_document_has_all_keys_of_a_recording_s(tmp_path: Path) -> None:
         assert set(document["axes"]["gx"]) >= set(of_samples["axes"]["gx"]) - host
         assert document["recording"]["since_power_on_s"] is None  # no message of a module has it
     assert document["recording"]["path"] == str(tmp_path / "frames.log")
+
+
+def test_its_document_has_the_judgement_and_the_age_of_each_axis(tmp_path: Path) -> None:
+    """Of the last report of each axis, where that of one is lost. Truth: what the C code sent."""
+    sent = stream(26, 4)
+    lost = [one for one in sent if one.message != "STATUS"][-1]
+    cut = [one for one in sent if one is not lost]
+    write_log(tmp_path / "frames.log", [line for one in cut for line in one.lines])
+    monitor(read=tmp_path / "frames.log", json=tmp_path / "told.json")
+    axes = json.loads((tmp_path / "told.json").read_text())["axes"]
+    words = {0: "not_judged", 1: "adequate", 2: "inadequate"}
+    for name, entry in axes.items():
+        reports = [one.truth for one in cut if one.message == name.upper()]
+        truth = reports[-1]
+        assert entry["time_s"] == truth["time_ms"] / 1000.0
+        assert entry["averages"] == truth["count"]
+        if "adequacy" in truth:
+            assert entry["adequacy"]["state"] == words[int(truth["adequacy"])]
+            assert entry["adequacy"]["score"] == pytest.approx(truth["suspicion_score"], rel=1e-6)
+        else:
+            assert entry["adequacy"] is None
+    old = axes.pop(lost.message.lower())
+    assert len(axes) == 5 and old["time_s"] < min(entry["time_s"] for entry in axes.values())
+
+
+def write_log(path: Path, rows: list[str]) -> None:
+    with can.CanutilsLogWriter(path) as writer:
+        for k, line in enumerate(rows):
+            frame = message(line)
+            frame.timestamp = 0.01 * k
+            writer.on_message_received(frame)
+
+
+def by_turns(one: list[str], other: list[str]) -> list[str]:
+    return [line for pair in zip(one, other, strict=False) for line in pair]
+
+
+@pytest.mark.parametrize("ahead", [0, 7, 900])
+def test_two_modules_on_one_node_are_named(ahead: int, tmp_path: Path) -> None:
+    """Of one age, or one so many frames older."""
+    write_log(tmp_path / "two.log", by_turns(lines(stream(31, 12))[ahead:], lines(stream(32, 12))))
+    done = run("monitor", "--read", tmp_path / "two.log")
+    assert done.returncode == 1
+    assert "two modules send as node 0: build one with another NODE" in done.stderr
+
+
+def test_one_module_is_not_taken_for_two() -> None:
+    """It restarts three times, loses three frames in ten, or sends as another node."""
+    sent = lines(stream(33, 8))
+    lossy = [line for k, line in enumerate(sent) if (7 * k) % 10 > 2]
+    other = by_turns(sent, lines(stream(34, 8, node=1)))
+    for rows in (sent[:700] + sent[:300] + sent[:900] + sent, lossy, [line for line in other if line in set(sent)]):
+        decoder = Decoder()
+        for line in rows:
+            decoder.feed(message(line))
+        assert decoder.statistics.received > len(rows) // 2
+        assert not decoder.twins
 
 
 def test_a_channel_that_falls_silent_is_opened_again() -> None:

@@ -39,6 +39,9 @@ DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 PARTS = DEFAULT.parent / "parts"
 DEFAULT_PART = "adis16405"
 
+#: Prior limits of what no law of the file has, so that it need not state them: as in the default model, by whether they
+#: are times the limits of N.
+ABOUT_N = {"K": (0.02, 0.04, True), "sigma_m": (0.5, 1.0, True), "alpha": (2e-4, 0.2, False)}
 #: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
 NODES = (6, 24)
 #: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
@@ -529,7 +532,8 @@ class _Reader:
             *PARAMETERS,
             *(key for law in laws.values() for key in law.parameters if key not in PARAMETERS),
         )
-        priors = self.priors(self.entry(fields, "priors", where), f"{where}.priors", names)
+        of_laws = {"bias", "N", *(key for law in laws.values() for key in law.parameters)}
+        priors = self.priors(self.entry(fields, "priors", where), f"{where}.priors", names, of_laws=of_laws)
         owns = fields.get("own_priors") or {}
         self.only(owns, tuple(axes), f"{where}.own_priors")
         return Group(
@@ -547,13 +551,23 @@ class _Reader:
         )
 
     def priors(
-        self, tree: Any, where: str, names: Collection[str], group: Mapping[str, Prior] | None = None
+        self,
+        tree: Any,
+        where: str,
+        names: Collection[str],
+        group: Mapping[str, Prior] | None = None,
+        of_laws: Collection[str] = (),
     ) -> dict[str, Prior]:
-        """Priors of the parameters `names`; those that are not there are the `group`'s, if there is one."""
+        """Priors of the parameters `names`; those that are not there are the `group`'s, if there is one. Else those
+        `of_laws` must be there, and another one lies about N as in the default model."""
         trees = self.only(tree, ("bias", *PLACES), where)
         priors = dict(group or {})
         for key in names:
-            if group is None or key in trees:
+            if group is None and key not in trees and key not in of_laws:
+                low, high, per_n = ABOUT_N[key]
+                n = priors["N"]
+                priors[key] = Prior("log_uniform", low * (n.min if per_n else 1.0), high * (n.max if per_n else 1.0))
+            elif group is None or key in trees:
                 priors[key] = self.prior(self.entry(trees, key, where), f"{where}.{key}", bias=key == "bias")
         if not priors["bias"].sd <= WIDEST_BIAS * priors["N"].min:
             most = f"{WIDEST_BIAS:.0e} times the least N"

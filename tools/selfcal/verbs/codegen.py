@@ -23,12 +23,16 @@ def codegen(
     ] = None,
     axes: Sequence[str] | None = None,
     start: From = None,
+    hold: Annotated[
+        bool, option("No sample overtakes a report: it rests on a copy, which takes RAM", "--hold")
+    ] = False,
 ) -> Tables:
     """Write `selfcal_model.h`, `selfcal_model.c` and `selfcal_config.h` into the folder `output`; return the tables.
 
     `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
     is a subset of the model's. `start`: the file that `diagnose --json` wrote with the model; its posteriors become the
-    priors (warm.py). Says on stderr what of the model is left out.
+    priors (warm.py). `hold`: a report rests on a copy of its axis's sums, so that no sample overtakes it. Says on
+    stderr what of the model is left out.
     Raises UserError for a bad model file, one that the target has no RAM for, or a folder that cannot be written.
     """
     from rich.console import Console
@@ -42,8 +46,8 @@ def codegen(
     known = None if start is None else load(start, loaded)
     tables = make_tables(loaded, loaded.sensor_rate_hz if rate is None else rate, tuple(axes) if axes else None, target)
     tables = warmed(tables, known)
-    check_room(loaded, tables, target)
-    write_tables(loaded, tables, Path(output), target, known.of if known is not None else "")
+    check_room(loaded, tables, target, hold)
+    write_tables(loaded, tables, Path(output), target, known.of if known is not None else "", hold)
     for said in left_out(loaded, tables, target):
         Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
     return tables

@@ -9,6 +9,7 @@ from typing import Annotated, Any, Literal
 from selfcal.base.errors import UserError, called
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ
+from selfcal.verbs._shared import ModelFile
 
 
 def demo(
@@ -18,14 +19,16 @@ def demo(
     transport: Annotated[Literal["slcan", "can"], option("How its frames travel")] = "slcan",
     channel: Annotated[str, option("With --transport can: a CAN device; default: UDP", metavar="NAME")] = "",
     node: Annotated[int, option("The module's number on its bus, 0 to 11", metavar="N")] = 0,
+    model: ModelFile = None,
 ) -> None:
     """Play a recording through the firmware, `speed` times as fast as it was taken, until its end or Ctrl-C; prints
     how to watch.
 
     On a pseudo-terminal the module's time stands still while nobody has its channel open, and hosts may come and go.
-    `node`: its number on its bus.
+    `node`: its number on its bus. `model`: file of the module's model.
     With `transport` can it goes on by itself, on the CAN device `channel` or over UDP within this machine.
     """
+    import shlex
     import tempfile
 
     from rich.console import Console
@@ -35,7 +38,7 @@ def demo(
     from selfcal.model.file import Model
     from selfcal.wire.dbc_file import NODES
     from selfcal.wire.demo import FASTEST, FOREVER_S, GROUP, PORT, REPORT_S, SHIPPED, wait
-    from selfcal.wire.replay import build, running, write_rows
+    from selfcal.wire.replay import build, check_sent, running, write_rows
 
     if not 0.0 < speed <= FASTEST:
         raise UserError(f"--speed must be above 0 and at most {FASTEST:g}, not {speed:g}")
@@ -44,12 +47,13 @@ def demo(
     if not 0 <= node < NODES:
         raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     path = Path(log or SHIPPED)
-    model = Model.load()
+    loaded = Model.load(model)
+    check_sent(loaded)
     recording = load(path)
-    names = chosen_axes(recording, model, ())
+    names = chosen_axes(recording, loaded, ())
     recording = recording.along(*names)
     with Console(stderr=True).status("building the firmware"):
-        firmware = build(model, recording.rate_hz, names)
+        firmware = build(loaded, recording.rate_hz, names)
     more = ["--realtime", f"{speed:g}", "--timeout", f"{FOREVER_S:g}", "--node", str(node)]
     if transport == "can":
         more += ["--can", channel or f"{GROUP}:{PORT}"]
@@ -59,14 +63,15 @@ def demo(
     else:
         more += ["--stay"]
         watch = "--channel {}"
+    names_by = "" if model is None else f" --model {shlex.quote(str(model))}"
     with tempfile.TemporaryDirectory(prefix="selfcal-") as folder:
         rows = Path(folder) / "rows.bin"
-        write_rows(recording, model, names, rows)
+        write_rows(recording, loaded, names, rows)
         with running(firmware, rows, max(REPORT_S, speed), "host", more=more) as (module, wire, said):
             if wire:
                 print(
                     f"{recording.path}: {recording.duration_s:g} s, {speed:g} times real time\n"
-                    f"watch it by:  {called()} monitor {watch.format(wire)}\nCtrl-C ends it",
+                    f"watch it by:  {called()} monitor {watch.format(wire)}{names_by}\nCtrl-C ends it",
                     flush=True,
                 )
             try:

@@ -1,4 +1,4 @@
-"""Live view of modules' telemetry; exit code 1 if a module was out of reach when the time was up."""
+"""Live view of modules' telemetry; exit code 1 if one was out of reach at the end, or two send as one node."""
 
 from __future__ import annotations
 
@@ -175,6 +175,10 @@ def monitor(
         for line in farewell(source, contact, contacts, streams, name):
             outcome.contact_lost = not wanted
             console.print(line, highlight=False, markup=False, soft_wrap=True)
+        for decoder in streams.known.values():
+            if decoder.twins:
+                outcome.twins = True
+                console.print(f"{name}: {decoder.twins}", highlight=False, markup=False, soft_wrap=True)
     known = streams.known
     foreign = {number: decoder.foreign for number, decoder in known.items() if decoder.foreign}
     if foreign and len(foreign) == len(known):
@@ -206,5 +210,5 @@ def monitor(
 
 
 def show(outcome: Outcome, given: Mapping[str, Any]) -> int:
-    """Exit code 1 if a module was out of reach when the time was up."""
-    return 1 if outcome.contact_lost else 0
+    """Exit code 1 if a module was out of reach when the time was up, or two send as one node."""
+    return 1 if outcome.contact_lost or outcome.twins else 0

@@ -76,10 +76,9 @@ def replay(
     from selfcal.readings.gate import table_of as gate_of
     from selfcal.show.plot import plot_run
     from selfcal.show.results import Identification
-    from selfcal.wire.dbc_file import HYPOTHESES
     from selfcal.wire.frames import names_of
     from selfcal.wire.on_wire import places, sent
-    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, document_of, run, run_here
+    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, check_sent, document_of, run, run_here
 
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
@@ -97,11 +96,7 @@ def replay(
     loaded_model = Model.load(model)
     say_once(loaded_model.left_out)
     known = None if start is None else load_start(start, loaded_model)
-    if len(loaded_model.hypotheses) > HYPOTHESES:
-        raise UserError(
-            f"{loaded_model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
-            f"{len(loaded_model.hypotheses)}; take `identify`"
-        )
+    check_sent(loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = recording.later(since_power_on_s).between(start_s, end_s)
     known_s = recording.start_s

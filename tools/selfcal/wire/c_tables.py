@@ -51,9 +51,9 @@ WITHOUT_FPU = ("cortex-m0",)
 ROOM = {"cortex-m0": 21_000}
 
 
-def check_room(model: Model, tables: Tables, target: str) -> None:
-    """Raise UserError for tables that the target has no RAM for."""
-    core, needed = core_of(target), bank_bytes(tables)
+def check_room(model: Model, tables: Tables, target: str, hold: bool = False) -> None:
+    """Raise UserError for tables that the target has no RAM for. `hold`: with a copy of an axis for its report."""
+    core, needed = core_of(target), bank_bytes(tables) + (bank_bytes(tables, 1) if hold else 0)
     if needed > ROOM.get(core, needed):
         counts = {"axes": len(tables.axes), "regressors": len(tables.regressors), "nodes": tables.nodes}
         said = ", ".join(f"{count} {name}" for name, count in counts.items() if count)
@@ -64,9 +64,10 @@ def check_room(model: Model, tables: Tables, target: str) -> None:
         )
 
 
-def bank_bytes(tables: Tables) -> int:
-    """SELFCAL_MODEL_BYTES of the integer build for a core of 32 bits but for alignment (lib/selfcal_layout.h)."""
-    axes, p = len(tables.axes), len(tables.regressors)
+def bank_bytes(tables: Tables, axes: int = 0) -> int:
+    """SELFCAL_MODEL_BYTES of the integer build for a core of 32 bits but for alignment (lib/selfcal_layout.h). `axes`:
+    of so many in place of all."""
+    axes, p = axes or len(tables.axes), len(tables.regressors)
     regressors = 4 * (p + 1) * (p + 4) + axes * (8 * p + 24) if p else 0
     return tables.nodes * (56 + 20 * axes + regressors) + tables.term_nodes * (104 + 24 * p + 40 * axes)
 
@@ -92,9 +93,11 @@ def assumption(tables: Tables) -> str:
     return f"{samples} at {tables.rate_hz:.7g} Hz {make} a bank sample of {tables.dt_s:.7g} s"
 
 
-def write_tables(model: Model, tables: Tables, folder: Path, target: str, start: str = "") -> None:
-    """Write the files into `folder`, the sizes as for a core. `start`: where measured priors come from. Raises
-    UserError if it cannot be written, or if a regressor has a form that the library does not make."""
+def write_tables(model: Model, tables: Tables, folder: Path, target: str, start: str = "", hold: bool = False) -> None:
+    """Write the files into `folder`, the sizes as for a core.
+
+    `start`: where measured priors come from. `hold`: a report rests on a copy of its axis's sums. Raises UserError if
+    it cannot be written, or if a regressor has a form that the library does not make."""
     check_forms(model)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -102,7 +105,7 @@ def write_tables(model: Model, tables: Tables, folder: Path, target: str, start:
         raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
     for name, text in (
         ("selfcal_config.h", _config(model, tables, target)),
-        ("selfcal_model.h", _header(model, tables, start)),
+        ("selfcal_model.h", _header(model, tables, start, hold)),
         ("selfcal_model.c", _source(model, tables)),
     ):
         with whole(folder / name) as file:
@@ -160,7 +163,7 @@ def _config(model: Model, tables: Tables, target: str) -> str:
 """
 
 
-def _header(model: Model, tables: Tables, start: str) -> str:
+def _header(model: Model, tables: Tables, start: str, hold: bool) -> str:
     axes, hypotheses = len(tables.axes), len(tables.hypotheses)
     measured = f"\n * Priors of {remark(start)}, as `selfcal diagnose` measured them." if start else ""
     return f"""/* Made by `selfcal codegen` from the model '{remark(model.name)}'. Do not edit.{measured} */
@@ -195,9 +198,22 @@ def _header(model: Model, tables: Tables, start: str) -> str:
 #ifndef SELFCAL_MODEL_JUDGED
 #define SELFCAL_MODEL_JUDGED 1
 #endif
+/* 1: a report rests on a copy of its axis's sums, so that no sample overtakes it (lib/imu_hold.c). */
+#define SELFCAL_MODEL_HELD {int(hold)}
+#define SELFCAL_MODEL_HELD_BYTES \
+    (SELFCAL_MODEL_HELD \
+         ? SELFCAL_HELD_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_TERM_NODES, SELFCAL_MODEL_REGRESSORS) \
+         : 0U)
+/* Calls of selfcal_imu_work() in a bank interval that keep every report ahead of the samples; held, any number does. A
+ * program that makes so many with every sample says #if !SELFCAL_MODEL_KEEPS_UP(calls), and #error. */
+#define SELFCAL_MODEL_REPORT_STEPS \
+    (SELFCAL_MODEL_HELD \
+         ? 1U \
+         : SELFCAL_REPORT_CALLS(SELFCAL_MODEL_NODES, SELFCAL_MODEL_HYPOTHESES, SELFCAL_MODEL_REGRESSORS))
+#define SELFCAL_MODEL_KEEPS_UP(calls_a_sample) ((calls_a_sample) * {tables.block}U >= SELFCAL_MODEL_REPORT_STEPS)
 /* What selfcal_imu_init() wants. */
 #define SELFCAL_MODEL_IMU_BYTES \
-    (SELFCAL_MODEL_BYTES + \
+    (SELFCAL_MODEL_BYTES + SELFCAL_MODEL_HELD_BYTES + \
      SELFCAL_PARTS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_GATE, SELFCAL_MODEL_REGRESSORS, \
                         SELFCAL_MODEL_JUDGED, SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES))
 /* Rate of the samples, Hz. */
@@ -370,6 +386,7 @@ def _pipe(model: Model, tables: Tables) -> list[str]:
         f"    {'&selfcal_columns_code' if tables.regressors else 'NULL'},",
         "    SELFCAL_MODEL_JUDGED ? &selfcal_judging_code : NULL,",
         "    SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES ? &selfcal_changes_code : NULL,",
+        "    SELFCAL_MODEL_HELD ? &selfcal_holding_code : NULL,",
         "};",
         "",
     ]

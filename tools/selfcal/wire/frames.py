@@ -44,6 +44,7 @@ COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
 BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
 FOREIGN_STATUSES = 2  # whole statuses in a row that state another version, of a module that stated this one before
+TWINS = 3  # statuses that only two modules can have sent; a restart on the way of a status looks like one of them
 RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter; a stream is no stranger's from then
 
 
@@ -99,6 +100,7 @@ REASONS = {
     "not_identified": "not yet identified: leave it at rest for longer",
     "bad_sample": "bad sample, not finite or saturated on some axis: look at the sensor",
     "stuck": "stuck at one reading: exchange the sensor",
+    "overtaken": "no report yet, samples overtook each: call selfcal_imu_work() more often, or codegen --hold",
 }
 
 
@@ -364,6 +366,10 @@ class Decoder:
         self.finished = False
         #: Module time of the first status, ms, and of the last.
         self.status_ms: tuple[int, int] | None = None
+        self._good = 0  # frames of a right form and checksum since the last status
+        self._last_sent: int | None = None  # its frames_sent, and the one from which a status went back
+        self._left_sent: int | None = None
+        self._twins = 0  # statuses that one module cannot have sent
         self._counter: int | None = COUNTER - 1 if from_start else None
         self._origin: int | None = 0 if from_start else None  # frames_sent of the first frame watched
         self._sent = 0  # frames sent since then, as far as known
@@ -385,6 +391,11 @@ class Decoder:
             "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
         )
         return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {older}"
+
+    @property
+    def twins(self) -> str:
+        """What is wrong if two modules send as this node; empty if they do not. Their reports are none of either."""
+        return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= TWINS else ""
 
     @property
     def surely_foreign(self) -> bool:
@@ -429,6 +440,9 @@ class Decoder:
         if "frames_sent" in values and int(values["frames_sent"]) % COUNTER != counter:
             self.statistics.refused += 1
             return []
+        self._good += 1
+        if "frames_sent" in values:
+            self._look_for_twin(int(values["frames_sent"]))
         jump = self._accept(counter)
         if jump == 0:
             self.statistics.refused += 1
@@ -480,6 +494,22 @@ class Decoder:
         if "frames_sent" in values:
             self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
             self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
+
+    def _look_for_twin(self, sent: int) -> None:
+        """Count a status that no one module can have sent, by the frames that have come since the last one.
+
+        More have come than were sent. Or the count goes on from where it was before it went back, and too few have come
+        for that: after a restart the count begins anew."""
+        last, good = self._last_sent, self._good
+        self._last_sent, self._good = sent, 0
+        if last is None:
+            return
+        ahead = sent - last
+        if ahead < 0:
+            self._left_sent = last
+            return
+        returned = self._left_sent is not None and sent >= self._left_sent and ahead > 2 * good + COUNTER
+        self._twins += returned or (ahead > 0 and good > 1.5 * ahead + JUMP_MAX)
 
     def flush(self) -> list[AxisReport]:
         """Close the report under way, incomplete, for the end of a stream."""

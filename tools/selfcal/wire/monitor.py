@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any
 
 from selfcal.adequacy.checks import Judged
@@ -41,10 +41,11 @@ KEPT = 2000
 class Outcome(Statistics):
     """The frames, and whether the module was out of reach when the time was up or its port went.
 
-    An end that the user asked for is none of these.
+    An end that the user asked for is none of these. `twins`: two modules send as one node.
     """
 
     contact_lost: bool = False
+    twins: bool = False
 
 
 def feed(streams: Streams, frame: can.Message, contacts: dict[int, Contact] | None) -> list[AxisReport]:
@@ -119,9 +120,13 @@ def document(
     document = to_document(run, found)
     document["node"] = node
     for axis, entry in document["axes"].items():
+        report = history[axis][-1]
+        says = report.adequacy
         entry["adequate"] = None
+        entry["adequacy"] = asdict(says) if says is not None else None
+        entry["time_s"], entry["averages"] = report.time_s, int(report.value("count"))
         entry["module_reason"] = why.get(axis)
-        told = history[axis][-1].coefficients(names)
+        told = report.coefficients(names)
         if told:
             units = dict(names.columns)
             entry["coefficients"] = {
