@@ -36,7 +36,7 @@ from conftest import COMMAND as PROGRAM  # noqa: E402
 DOCUMENTS = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "host_sim/README.md", "port/README.md", "tests/README.md"),
     *("tests/ACCURACY.md", "tests/COST.md"),
-    *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md"),
+    *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "lib/EVALUATION.md"),
     *("tools/README.md", "tools/MODEL.md", "tools/LOGS.md", "tools/OTHERS.md"),
 )
 WALKTHROUGH = ROOT / "tools" / "README.md"
