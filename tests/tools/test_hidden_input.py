@@ -145,8 +145,10 @@ def test_diagnose_names_it_and_every_verb_reads_its_model(tmp_path: Path) -> Non
         {},
     )
     model = tmp_path / "model.yaml"
-    document = diagnose(tmp_path / "log.npz", write_model=model)
+    document = diagnose(tmp_path / "log.npz", write_model=model, on=tmp_path / "log.npz")
     (finding,) = document["findings"]
+    score = finding["gain_on"]["log_score_per_sample"]
+    assert (score["after"] - score["before"]) * score["samples"] > 0.9 * finding["evidence_nats"]  # the record itself
     assert finding["cause"] == "hidden_input"
     assert set(finding["axes"]) == set(NAMES)
     assert finding["confirmed"]

@@ -283,7 +283,7 @@ def carried(hidden: Hidden, states: Mapping[str, State]) -> dict[str, Any] | Non
         return None
     block = max(1, round(hidden.dt / states[hidden.names[0]].dt))
     y = np.array([blocks(states[name].y, block) for name in hidden.names]) / hidden.scale[:, None]
-    y = np.where(np.isfinite(y), without_lines(bridged_rows(y)), np.nan)
+    y = np.where(np.isfinite(y), without_lines(bridged_rows(y))[0], np.nan)
     scores = [np.nansum(course(model, y).scores(), axis=1) for model in (hidden.null, hidden.model)]
     more = course(hidden.model, y).ln_likelihood - course(hidden.null, y).ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())
