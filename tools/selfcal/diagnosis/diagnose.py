@@ -16,7 +16,7 @@ from selfcal.adequacy.identify import identify_axis, moved_beside
 from selfcal.base.ending import Held, Stopped, abandon
 from selfcal.base.errors import UserError, note
 from selfcal.base.progress import Doing
-from selfcal.diagnosis import hidden
+from selfcal.diagnosis import hidden, module
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
@@ -24,6 +24,7 @@ from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, carried, why_left_out
 from selfcal.diagnosis.verdict import of_checks
 from selfcal.likelihood import work
+from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.readings.readings import look
@@ -106,6 +107,13 @@ def entry_of(shared: hidden.Hidden, found: Mapping[str, Diagnosed], recording: R
     record = next(one.record for one in found.values() if one.hidden is shared)
     states = {**record.axes, **{name: one.state for name, one in found.items() if one.hidden is shared}}
     return hidden.entry(shared, states, units, record.start_s)
+
+
+def events_of(record: Record) -> dict[str, Array]:
+    """By axis what events of several axes add to the means of a record, which no model of another one has."""
+    states = {name: state.refit() for name, state in record.axes.items()}
+    seen = module.together(states, record.channels, record.since_power_on_s + record.start_s)
+    return {} if seen is None else {name: seen.effect(name) for name in seen.names}
 
 
 def less_stated(one: Diagnosed, model: Model) -> Diagnosed:

@@ -20,6 +20,7 @@ from selfcal.likelihood.fit import best
 from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES
 from selfcal.likelihood.joint import (
     LEAST_AXES,
+    LINE,
     Bins,
     Course,
     Joint,
@@ -276,14 +277,15 @@ def _sentence(axes: Mapping[str, Any], jumps: Sequence[Mapping[str, float]], tim
     )
 
 
-def carried(hidden: Hidden, states: Mapping[str, State]) -> dict[str, Any] | None:
+def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Array]) -> dict[str, Any] | None:
     """What the quantity gains on a second recording by the models of the first, all axes together; None: it has not the
-    axes. `states`: of the second recording."""
+    axes. `states`: of the second recording; `events`: by axis what its own events add to its means."""
     if not set(hidden.names) <= states.keys():
         return None
     block = max(1, round(hidden.dt / states[hidden.names[0]].dt))
-    y = np.array([blocks(states[name].y, block) for name in hidden.names]) / hidden.scale[:, None]
-    y = np.where(np.isfinite(y), without_lines(bridged_rows(y))[0], np.nan)
+    y = np.array([blocks(states[name].y, block) - events.get(name, 0.0) for name in hidden.names])
+    y /= hidden.scale[:, None]
+    y = np.where(np.isfinite(y), without_lines(bridged_rows(y), LINE)[0], np.nan)
     scores = [np.nansum(course(model, y).scores(), axis=1) for model in (hidden.null, hidden.model)]
     more = course(hidden.model, y).ln_likelihood - course(hidden.null, y).ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())

@@ -440,19 +440,29 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     if model is not None:
         search.weigh(model)
     search.go(NET_LEAST)
-    of = None if model is None else of_model(tuple(found), search.model, search.rest, scale, span)
-    return Module(tuple(found), span, tuple(search.several), of)
+    of = None
+    if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
+        y = y - sum(one.effect for one in search.several)
+        model = fitted(bins_of(bridged_rows(y)), span, True, search.model)
+        of = of_model(tuple(found), model, y, scale, span)
+    return Module(tuple(found), span, tuple(search.several), of, scale)
 
 
 @dataclass(frozen=True)
 class Module:
     """What acts on several of the axes `names`: `events`, of means `dt` s long, and one quantity that nobody recorded
-    or None."""
+    or None. `scale` [m]: units of the search."""
 
     names: tuple[str, ...]
     dt: float
     events: tuple[Candidate, ...]
     hidden: Hidden | None
+    scale: Array
+
+    def effect(self, name: str) -> Array:
+        """What the events add to the means of an axis, in its unit."""
+        at = self.names.index(name)
+        return np.asarray(self.scale[at] * sum(event.effect[at] for event in self.events))
 
 
 def sharpened(times: Sequence[float], states: Sequence[State], span: float) -> tuple[float, ...]:

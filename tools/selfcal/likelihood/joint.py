@@ -97,13 +97,13 @@ def bridged_rows(y: Array) -> Array:
     return found
 
 
-def without_lines(y: Array) -> tuple[Array, Mask]:
-    """Records [m, n] without gaps less their lines, and the frequencies [n // 2 + 1] at which that was done.
+def without_lines(y: Array, least: float = CLEAR_LINE) -> tuple[Array, Mask]:
+    """Records [m, n] without gaps less their lines of `least` times the level, and the frequencies [n // 2 + 1] at which that was done.
 
     A line is taken to 0 Hz and its slow amplitude out. The amplitude goes on as its mirror at the ends, so that one
     whose frequency wanders does not ring there."""
     n = y.shape[1]
-    where = np.any([_lines(np.abs(row) ** 2, CLEAR_LINE) for row in np.fft.rfft(np.diff(y, axis=1), axis=1)], axis=0)
+    where = np.any([_lines(np.abs(row) ** 2, least) for row in np.fft.rfft(np.diff(y, axis=1), axis=1)], axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
     found, pad = y - y.mean(axis=1)[:, None], n // 8
     for first, end in edges.reshape(-1, 2):

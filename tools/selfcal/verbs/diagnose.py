@@ -98,6 +98,7 @@ def diagnose(
         below_lattice,
         by_identify,
         entry_of,
+        events_of,
         less_stated,
         looked_at,
         options_given,
@@ -190,7 +191,7 @@ def diagnose(
             quantity = None if shared is None else entry_of(shared, found, recording)
             if shared is not None and quantity is not None and second is not None:
                 on_second = of_recording(second, loaded, 1.0 / shared.dt)
-                quantity["gain_on"] = hidden.carried(shared, on_second.axes)
+                quantity["gain_on"] = hidden.carried(shared, on_second.axes, events_of(on_second))
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
