@@ -498,6 +498,8 @@ def _of_clock(clock: Clock) -> list[str]:
     """A note where the stamps lie on no grid: of samples that were lost at random such a clock shows nothing."""
     if clock.off_grid_s is None or clock.missing_before.any() or clock.off_grid_s.size < 3:
         return []
+    if np.ptp(clock.off_grid_s) * clock.rate_hz <= 1.0:
+        return []  # the stamps are coarse
     spread = float(np.diff(clock.off_grid_s).std()) * clock.rate_hz
     told = f"the stamps lie on no grid: their mean rate, {clock.rate_hz:.4g} Hz, is taken; no lost sample shows"
     told += ": --rate HZ states another"
@@ -1289,8 +1291,7 @@ def _on_clocks(
     def clock_at(at: NDArray[np.int64], rate: float | None) -> Clock:
         lines = at if places is None else places[at]
         if time is not None:
-            skipped = np.diff(lines, prepend=lines[0]) - np.diff(at, prepend=at[0]) if places is not None else None
-            return clock_of(path, _at(time, at), noise_s, rate, lambda row, what: fail(int(at[row]), what), skipped)
+            return clock_of(path, _at(time, at), noise_s, rate, lambda row, what: fail(int(at[row]), what))
         assert rate is not None
         if lines[-1] / rate > LONGEST_S:
             raise UserError(f"{path}: {lines[-1] + 1} rows at {rate:g} Hz: a recording spans at most {LONGEST_S:g} s")

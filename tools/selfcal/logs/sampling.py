@@ -11,6 +11,7 @@ Stamps at random times, or in the bursts of a bus, lie on no grid. They have a m
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -18,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
 from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.special import betaln
 
 #: Rows looked at on either side of a long time step to tell missing samples from a late one.
 _NEIGHBOURS = 10
@@ -76,6 +78,15 @@ _SHORT, _SHORT_SHARE, _SHORT_NEAR, _SHORT_APART, _SHORT_MOST = 2 * _STEPS, 0.9, 
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
 
+#: Steps between stretches of samples, in usual steps; samples of a stretch and gaps of a rhythm at least; the share of
+#: the gaps that keep to a rhythm.
+_ASLEEP, _AWAKE, _RHYTHM = 20.0, 20, 0.9
+#: Stamps come in bursts where so many steps are shorter than this share of the mean one.
+_SHORT_STEPS, _BURST = 0.3, 0.45
+#: Mean steps, times the samples of a burst, by which stamps may stray from a steady count; bursts' distances beyond
+#: which there is a gap.
+_STRAY, _BURST_GAP = 5.0, 8.0
+
 Found = tuple[float, NDArray[np.int64]]
 
 
@@ -90,6 +101,29 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
     record with gaps take about a second and 10^6 rows another; all others are fast.
     """
     steps = np.diff(time)
+    asleep = _asleep(time, steps)
+    if asleep.any():
+        closed = np.where(asleep, _usual(steps), steps)
+        dt, missing = sampling(np.concatenate(([0.0], np.cumsum(closed))), noise_s, rate)
+        # No sleep moves the grid of all stretches from the stamps by more than half an interval.
+        place = np.cumsum(missing) + np.arange(time.size)
+        rows = np.flatnonzero(asleep) + 1
+        slept = np.rint(time[rows] / dt).astype(np.int64) - place[rows]
+        missing[rows] += np.diff(slept, prepend=0)
+        return _slope(np.cumsum(missing) + np.arange(time.size), time), missing
+    counted = by_count(time, steps, rate)
+    if counted is not None and (steps > 0.0).all():
+        return counted
+    try:
+        return _on_even_grid(time, steps, noise_s, rate)
+    except Ambiguous:
+        if counted is None:
+            raise
+        return counted
+
+
+def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
+    """Interval and missing_before[n] of samples that were taken one by one. Raises Ambiguous."""
     changes = rate_changes(time) if rate is None else []
     if changes:
         dt = min(min(one.before_s, one.after_s) for one in changes)
@@ -117,7 +151,74 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
             return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
         if _blurred(steps, dt):
             return _on_grid(time, dt)
+        if _in_batches(steps, missing):
+            return _slope(np.arange(time.size), time), np.zeros_like(missing)
     return dt, missing
+
+
+def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """bool[n - 1]: the steps between stretches of an even grid, whatever they last; none for other stamps."""
+    usual = _usual(steps)
+    long = steps > _ASLEEP * usual
+    count = int(np.count_nonzero(long))
+    if not 0 < count * _AWAKE < steps.size:
+        return np.zeros_like(long)
+    closed = np.where(long, usual, steps)
+    even = np.abs(closed - usual) < 1e-3 * usual
+    lattice = _lattice(closed, 1e-9 * usual)
+    shows = _even(np.cumsum(closed), usual) if lattice < _COARSE * usual else even.mean() > _RHYTHM
+    return long if shows else np.zeros_like(long)
+
+
+def _in_batches(steps: NDArray[np.float64], missing: NDArray[np.int64]) -> bool:
+    """Whether gaps come in a rhythm and are no whole intervals: a batch is stamped by another interval than its own."""
+    gaps = missing[1:] > 0
+    runs = np.diff(np.flatnonzero(gaps))
+    if runs.size < _AWAKE or np.mean(np.abs(runs - np.median(runs)) <= 1) < _RHYTHM:
+        return False
+    turns = steps[gaps] / float(steps[~gaps].mean())
+    off = turns - np.rint(turns)
+    return abs(float(off.mean())) > 5.0 * float(off.std()) / math.sqrt(off.size) + 1e-3
+
+
+def by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None) -> Found | None:
+    """Interval and missing_before of samples that arrive in bursts and are stamped on arrival; None for other stamps.
+
+    Of such stamps only the count over time is steady: it must follow one line, but for gaps between bursts.
+    """
+    if time.size < 3 * _AWAKE:
+        return None
+    at = np.linspace(0, time.size - 1, _AWAKE + 1).astype(int)
+    mean = float(np.median(np.diff(time[at]) / np.diff(at)))  # gaps are in few of the pieces
+    starts = np.flatnonzero(steps > mean) + 1
+    if np.mean(steps < _BURST * mean) < _SHORT_STEPS or starts.size < _AWAKE:
+        return None
+    size = time.size / (starts.size + 1)
+    cuts = (np.flatnonzero(steps > _BURST_GAP * float(np.median(np.diff(time[starts])))) + 1).tolist()
+    index = np.arange(time.size)
+    dt = _slope(index, time, cuts) if rate is None else 1.0 / rate
+    left = time - index * dt
+    levels = []
+    for begin, end in pairwise([0, *cuts, time.size]):
+        part = left[begin:end]
+        if float(np.ptp(part)) > _STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt):
+            return None
+        # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
+        reach = max(1, round(10.0 * size))
+        levels.append((float(part[:reach].min()), float(part[-reach:].min())))
+    missing = np.zeros(time.size, np.int64)
+    for cut, (before, after) in zip(cuts, pairwise(levels), strict=True):
+        missing[cut] = max(0, round((after[0] - before[1]) / dt))
+    return dt, missing
+
+
+def _slope(index: NDArray[np.int64], time: NDArray[np.float64], cuts: Sequence[int] = ()) -> float:
+    """The slope of `time` against `index` by least squares, with a level of its own after each of the rows `cuts`."""
+    part = np.repeat(np.arange(len(cuts) + 1), np.diff([0, *cuts, time.size]))
+    count = np.bincount(part)
+    x = index - (np.bincount(part, index) / count)[part]
+    y = time - (np.bincount(part, time) / count)[part]
+    return float(x @ y / (x @ x))
 
 
 def _usual(steps: NDArray[np.float64]) -> float:
@@ -453,10 +554,11 @@ def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -
 
 
 def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: float | None) -> Found:
+    steps = np.rint(np.diff(time) / lattice)
     whole = _unbroken(time, lattice)
-    if whole is not None:
-        return whole, np.zeros(time.size, np.int64)
-    if rate is None and _lossy(np.rint(np.diff(time) / lattice)):
+    if whole is not None and not (steps.min() >= 1.0 and _rather_lossy(steps, lattice, whole, rate)):
+        return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
+    if whole is not None or (rate is None and _lossy(steps)):
         return _on_every_step(time, lattice)
     low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
     head = time[:_HEAD]
@@ -468,6 +570,22 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
         if thinned is None:
             raise
         return thinned
+
+
+def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate: float | None) -> bool:
+    """Whether a grid of one lattice step that lost samples is likelier than the unbroken one of the interval `whole`.
+
+    Bayes: at an unknown share of losses B(m, n - m) for m gaps, and nearly pi^2/n^3 for one line of pixels. A lattice
+    that is no tick of a clock, but for this one, is the interval itself. A stated rate decides."""
+    if rate is not None:
+        return abs(rate * lattice - 1.0) < abs(rate * whole - 1.0)
+    gaps, n = int(np.count_nonzero(steps > 1.0)), steps.size
+    if not 0 < gaps < 0.1 * n:
+        return False
+    ticks = math.log10(lattice), math.log2(lattice)
+    lossy = betaln(gaps, n + 1 - gaps) - math.log(10.0)
+    pixels = 2.0 * math.log(math.pi) - 3.0 * math.log(n)
+    return lossy > pixels or min(abs(one - round(one)) for one in ticks) > 1e-6
 
 
 def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) -> Found | None:

@@ -28,16 +28,8 @@ _WRAP_GAP = 1000.0
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
 #: median of two rows or more.
 _OWN_SHARE, _OWN_NEAR = 0.6, 0.3
-#: Stamps come in bursts where so many steps are shorter than this share of the mean one, and bursts there must be.
-_SHORT_SHARE, _SHORT, _BURSTS = 0.3, 0.45, 20
-#: Mean steps, times the samples of a burst, by which stamps in bursts may stray from a steady count; bursts' distances
-#: beyond which there is a gap.
-_STRAY, _BURST_GAP = 5.0, 8.0
-
 #: Damaged stamps: rows a stamp at least, in a row at most, and rows to either side that show which of them it is.
 _DAMAGED_APART, _DAMAGED_MOST, _DAMAGED_WITHIN = 20, 3, 16
-#: Share of a step by which it may miss the length that skipped lines give it: stamps are rounded.
-_EXACT = 1e-6
 
 #: Raises UserError for a row and what is wrong there.
 Fail = Callable[[int, str], NoReturn]
@@ -193,30 +185,15 @@ def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
 
 
 def clock_of(
-    path: object,
-    time: NDArray[np.float64],
-    noise_s: float,
-    rate: float | None,
-    fail: Fail,
-    skipped: NDArray[np.int64] | None = None,
+    path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
 ) -> Clock:
     """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
-    states it. `skipped` [n]: lines without a stamp just before each. Raises UserError, by `fail` for a row."""
+    states it. Raises UserError, by `fail` for a row."""
     start = float(time[0])
     if not time[-1] <= LONGEST_S:
         _too_long(time, fail)
     time = time - start if start else time
-    rows = np.arange(time.size) if skipped is None else _with_skipped(time, skipped, noise_s)
-    if rows[-1] < time.size:
-        found, missing = _sampling(path, time, noise_s, rate, fail)
-    else:
-        every = np.interp(np.arange(rows[-1] + 1), rows, time)
-
-        def fail_row(row: int, what: str) -> NoReturn:
-            fail(int(np.searchsorted(rows, row)), what)
-
-        found, missing = _sampling(path, every, noise_s, rate, fail_row)
-        missing = np.diff((np.cumsum(missing) + np.arange(missing.size))[rows], prepend=missing[0] - 1) - 1
+    found, missing = _sampling(path, time, noise_s, rate, fail)
     lossy = 2 * np.count_nonzero(missing) > missing.size
     if rate is not None and (not 0.9 < found / rate < 1.1 or (lossy and not thinned_grid(time, 1.0 / rate))):
         raise _disagrees(path, rate)
@@ -231,16 +208,6 @@ def clock_of(
     return Clock(rate, missing, off_grid, start)
 
 
-def _with_skipped(time: NDArray[np.float64], skipped: NDArray[np.int64], noise_s: float) -> NDArray[np.int64]:
-    """int64[n]: places of the stamps [n] with a row for each skipped line that fills its step exactly."""
-    steps = np.diff(time, prepend=time[0])
-    usual = float(np.median(steps[1:]))
-    fills = np.abs(steps - (skipped + 1) * usual) <= max(4.0 * noise_s, _EXACT * usual)
-    rows = np.arange(time.size)
-    rows += np.cumsum(np.where(fills, skipped, 0))
-    return rows
-
-
 def _sampling(
     path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
 ) -> tuple[float, NDArray[np.int64]]:
@@ -253,22 +220,15 @@ def _sampling(
     repeats = steps == 0.0
     if repeats.any() and (not _repeats_often(repeats) or repeats.all()):
         fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
-    bursts = _bursts(time, steps, rate)
-    if bursts is not None and not repeats.any():
-        return bursts
     try:
         dt, missing = sampling(time, noise_s, rate)
     except Ambiguous as error:
-        if bursts is not None:
-            return bursts
         raise UserError(f"{path}: column 't': {error}: give --rate HZ") from error
     if repeats.any() and dt > 0.999 * float(steps[~repeats].min()):  # not for being coarse
-        if bursts is not None:
-            return bursts
         fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
     if not 0.0 < dt < math.inf:
         raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
-    if rate is not None and bursts is None and on_other_grid(time, 1.0 / rate, missing):
+    if rate is not None and on_other_grid(time, 1.0 / rate, missing):
         raise _disagrees(path, rate)
     return float(f"{1.0 / dt:.10g}"), missing
 
@@ -282,53 +242,3 @@ def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:
 
 def _disagrees(path: object, rate: float) -> UserError:
     return UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
-
-
-def _bursts(
-    time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None
-) -> tuple[float, NDArray[np.int64]] | None:
-    """Rate and missing_before of samples that arrive in bursts and are stamped on arrival; None for other stamps.
-
-    Of such stamps only the count over time is steady: it must follow one line, but for gaps between bursts.
-    """
-    if time.size < 3 * _BURSTS:
-        return None
-    mean = float(np.median(_window_means(time)))
-    short = steps < _SHORT * mean
-    starts = np.flatnonzero(steps > mean) + 1
-    if short.mean() < _SHORT_SHARE or starts.size < _BURSTS:
-        return None
-    size = time.size / (starts.size + 1)
-    apart = float(np.median(np.diff(time[starts])))
-    cuts = np.flatnonzero(steps > _BURST_GAP * apart) + 1
-    edges = np.concatenate(([0], cuts, [time.size]))
-    index = np.arange(time.size, dtype=np.float64)
-    dt = _common_slope(index, time, edges) if rate is None else 1.0 / rate
-    left = time - index * dt
-    levels = []
-    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        part = left[begin:end]
-        if float(np.ptp(part)) > _STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt):
-            return None
-        # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
-        reach = max(1, round(10.0 * size))
-        levels.append((float(part[:reach].min()), float(part[-reach:].min())))
-    missing = np.zeros(time.size, np.int64)
-    for cut, before, after in zip(cuts.tolist(), levels[:-1], levels[1:], strict=True):
-        missing[cut] = max(0, round((after[0] - before[1]) / dt))
-    return float(f"{1.0 / dt:.10g}"), missing
-
-
-def _window_means(time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean steps over windows of a twentieth of the record: gaps are in few of them."""
-    at = np.linspace(0, time.size - 1, 21).astype(int)
-    return np.asarray(np.diff(time[at]) / np.diff(at))
-
-
-def _common_slope(index: NDArray[np.float64], time: NDArray[np.float64], edges: NDArray[np.int64]) -> float:
-    """The slope of `time` against `index` by least squares, with a level of its own between any two `edges`."""
-    part = np.repeat(np.arange(edges.size - 1), np.diff(edges))
-    count = np.bincount(part)
-    x = index - (np.bincount(part, index) / count)[part]
-    y = time - (np.bincount(part, time) / count)[part]
-    return float(x @ y / (x @ x))
