@@ -522,8 +522,8 @@ def test_damaged_stamps_are_named_and_skipped(rate: float, stamps: str, tmp_path
 
 
 def test_other_faults_of_time_are_no_damaged_digits(tmp_path: Path) -> None:
-    """A clock that begins anew, a block of rows written twice, two sensors' stamps in turn: refused with --skip-bad as
-    without, and nothing is taken out."""
+    """A clock that begins anew, two sensors' stamps in turn: refused with --skip-bad as without, and nothing is taken
+    out. A block of rows written twice is refused, and left out with --skip-bad, which the message names."""
     log = tmp_path / "log.csv"
     rows = rows_of(600, 0.04, 5)
     anew = rows + rows
@@ -532,8 +532,14 @@ def test_other_faults_of_time_are_no_damaged_digits(tmp_path: Path) -> None:
     for made in (anew, twice, in_turn):
         log.write_text("t[s],gx[deg/s]\n" + "\n".join(made) + "\n")
         for skip_bad in (False, True):
-            with pytest.raises(UserError, match="column 't': time runs backwards"):
+            if made is twice and skip_bad:
+                assert load(log, skip_bad=True).samples == 600
+                continue
+            with pytest.raises(UserError, match="column 't': time runs backwards") as caught:
                 load(log, skip_bad=skip_bad)
+            assert ("--skip-bad" in str(caught.value)) == (made is twice)
+            assert "--no-time --rate HZ" in str(caught.value)
+            assert load(log, 25.0, no_time=True).samples == len(made)
 
 
 def test_a_file_of_other_lines_is_refused_all_the_same(tmp_path: Path) -> None:

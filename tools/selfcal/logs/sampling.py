@@ -95,7 +95,8 @@ class Ambiguous(ValueError):
 
 
 def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
-    """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing).
+    """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing but where
+    batches of one length overlap).
 
     `noise_s`: their rounding noise. `rate`: the stated rate (Hz) if there is one. Raises Ambiguous. Coarse stamps of a
     record with gaps take about a second and 10^6 rows another; all others are fast.
@@ -111,8 +112,10 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
         slept = np.rint(time[rows] / dt).astype(np.int64) - place[rows]
         missing[rows] += np.diff(slept, prepend=0)
         return _slope(np.cumsum(missing) + np.arange(time.size), time), missing
-    counted = by_count(time, steps, rate)
-    if counted is not None and (steps > 0.0).all():
+    counted = _by_count(time, steps, rate)
+    if (steps < 0.0).any() and counted is None:
+        raise Ambiguous("the stamps fall, and their count is not steady")
+    if counted is not None and (steps != 0.0).all():
         return counted
     try:
         return _on_even_grid(time, steps, noise_s, rate)
@@ -130,7 +133,7 @@ def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     window = max(1, min(_WINDOW, steps.size // 4))
     typical = float(np.median(time[window:] - time[:-window], overwrite_input=True)) / window
-    lattice = _lattice(steps, max(4.0 * noise_s, 1e-9 * typical))
+    lattice = common_step(steps, max(4.0 * noise_s, 1e-9 * typical))
     if lattice > _COARSE * typical:
         try:
             return _coarse(time, lattice, typical, rate)
@@ -165,7 +168,7 @@ def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np
         return np.zeros_like(long)
     closed = np.where(long, usual, steps)
     even = np.abs(closed - usual) < 1e-3 * usual
-    lattice = _lattice(closed, 1e-9 * usual)
+    lattice = common_step(closed, 1e-9 * usual)
     shows = _even(np.cumsum(closed), usual) if lattice < _COARSE * usual else even.mean() > _RHYTHM
     return long if shows else np.zeros_like(long)
 
@@ -173,16 +176,24 @@ def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np
 def _in_batches(steps: NDArray[np.float64], missing: NDArray[np.int64]) -> bool:
     """Whether gaps come in a rhythm and are no whole intervals: a batch is stamped by another interval than its own."""
     gaps = missing[1:] > 0
-    runs = np.diff(np.flatnonzero(gaps))
-    if runs.size < _AWAKE or np.mean(np.abs(runs - np.median(runs)) <= 1) < _RHYTHM:
+    if not in_rhythm(np.flatnonzero(gaps)):
         return False
     turns = steps[gaps] / float(steps[~gaps].mean())
     off = turns - np.rint(turns)
     return abs(float(off.mean())) > 5.0 * float(off.std()) / math.sqrt(off.size) + 1e-3
 
 
-def by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None) -> Found | None:
-    """Interval and missing_before of samples that arrive in bursts and are stamped on arrival; None for other stamps.
+def in_rhythm(rows: NDArray[np.int64]) -> bool:
+    """Whether rows, four or more apart, are as far apart from each other, but for one row."""
+    runs = np.diff(rows)
+    if runs.size < _AWAKE or np.median(runs) < 4:
+        return False
+    return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) >= _RHYTHM)
+
+
+def _by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None) -> Found | None:
+    """Interval and missing_before of samples that arrive in bursts and are stamped on arrival, or in batches whose
+    stamps overlap; None for other stamps.
 
     Of such stamps only the count over time is steady: it must follow one line, but for gaps between bursts.
     """
@@ -190,8 +201,9 @@ def by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float 
         return None
     at = np.linspace(0, time.size - 1, _AWAKE + 1).astype(int)
     mean = float(np.median(np.diff(time[at]) / np.diff(at)))  # gaps are in few of the pieces
-    starts = np.flatnonzero(steps > mean) + 1
-    if np.mean(steps < _BURST * mean) < _SHORT_STEPS or starts.size < _AWAKE:
+    overlap = steps < 0.0
+    starts = np.flatnonzero(overlap if overlap.any() else steps > mean) + 1
+    if (np.mean(steps < _BURST * mean) < _SHORT_STEPS and not overlap.any()) or starts.size < _AWAKE:
         return None
     size = time.size / (starts.size + 1)
     cuts = (np.flatnonzero(steps > _BURST_GAP * float(np.median(np.diff(time[starts])))) + 1).tolist()
@@ -257,7 +269,7 @@ def on_other_grid(time: NDArray[np.float64], dt: float, missing: NDArray[np.int6
     turns, power = _spectrum(time, dt)
     if not turns.size:
         return False
-    lattice = _lattice(np.diff(time), 1e-9 * dt)
+    lattice = common_step(np.diff(time), 1e-9 * dt)
     if lattice > _COARSE * dt:
         return abs(math.log(lattice / dt)) > _OTHER_APART and _lossy(np.rint(np.diff(time) / lattice))
     lines = turns[(power > _COHERENT) & (turns > 1.0 / _OTHER) & (turns < _OTHER)]
@@ -458,8 +470,8 @@ def _mean_step(time: NDArray[np.float64], step: float) -> float:
     return float(steps[whole].mean()) if whole.mean() > 0.5 else step
 
 
-def _lattice(steps: NDArray[np.float64], tolerance: float) -> float:
-    """Step (s) of the lattice that all time stamps lie on; 0 where there is none."""
+def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
+    """Step, s, of the lattice that all time stamps lie on: the steps are multiples of it. 0 where there is none."""
     ordered = steps[steps > tolerance]
     ordered.sort()
     if ordered.size == 0:
@@ -605,7 +617,7 @@ def _lossy_grid(steps: NDArray[np.float64], lattice: float) -> float:
     if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
         return lattice
     for rounding in _ROUNDINGS:
-        grid = _lattice(steps[:_PLACES], 2.5 * rounding)
+        grid = common_step(steps[:_PLACES], 2.5 * rounding)
         if grid > _ROUNDED * rounding and _lossy(np.rint(steps / grid)):
             # Two roundings make a step; the grid is known to one of them over many intervals.
             off = np.abs(steps - np.rint(steps / grid) * grid)
@@ -655,7 +667,7 @@ def _scanned(
     """The dt of a scan's grid [m] with the best of its scores [m, slacks], if there is but one."""
     head = time[:_HEAD]
     each = scores.min(axis=1)
-    best = _on_lattice(grid, each, lattice, head.size)
+    best = _oncommon_step(grid, each, lattice, head.size)
     reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
     same = np.abs(grid / grid[best] - 1.0) < reach
     rivals = grid[~same & (each < each[best] + _AS_GOOD)]
@@ -678,7 +690,7 @@ def _scanned(
     raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
 
 
-def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float, rows: int) -> int:
+def _oncommon_step(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float, rows: int) -> int:
     """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold."""
     best = int(each.argmin())
     times = np.rint(grid / lattice)

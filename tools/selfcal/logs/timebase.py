@@ -6,7 +6,6 @@ Stamps may be coarse or fine (`sampling.py`), come in bursts, or be those of a 3
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
@@ -16,20 +15,14 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
+from selfcal.logs.order import broken, mends
 from selfcal.logs.sampling import Ambiguous, on_other_grid, sampling, thinned_grid
 
-#: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
-_REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
-#: Counts of a counter that wraps, and the least count, and another that is not in the column's own unit, s. (One of ns
-#: would wrap every 4 s: such a step back is a restart.)
-_WRAPS_AT, _TICKS = 2.0**32, (1e-6, 1e-3)
-#: Median steps that a wrap may lie in a gap of.
-_WRAP_GAP = 1000.0
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
 #: median of two rows or more.
 _OWN_SHARE, _OWN_NEAR = 0.6, 0.3
-#: Damaged stamps: rows a stamp at least, in a row at most, and rows to either side that show which of them it is.
-_DAMAGED_APART, _DAMAGED_MOST, _DAMAGED_WITHIN = 20, 3, 16
+#: The way on for stamps of no use.
+AS_THEY_COME = "--no-time --rate HZ takes the rows as they come"
 
 #: Raises UserError for a row and what is wrong there.
 Fail = Callable[[int, str], NoReturn]
@@ -96,77 +89,6 @@ class Clock:
         )
 
 
-def unwrapped(time: NDArray[np.float64], tick_s: float) -> tuple[NDArray[np.float64], int]:
-    """Stamps [n], s from the first, with the wraps of a 32-bit counter undone, and their number. `tick_s`: a count of
-    their column, s."""
-    back = np.flatnonzero(np.diff(time) < 0.0)
-    if not back.size or time.size < 3:
-        return time, 0
-    steps = np.diff(time)
-    most = _WRAP_GAP * float(np.median(np.abs(steps)))
-    for span in (_WRAPS_AT * tick for tick in (max(tick_s, _TICKS[0]), *_TICKS)):
-        on = steps[back] + span
-        if np.ptp(time) < span and ((on > 0.0) & (on <= min(most, 0.5 * span))).all():
-            turns = np.zeros(time.size)
-            turns[back + 1] = span
-            return time + np.cumsum(turns), int(back.size)
-    return time, 0
-
-
-def few(rows: int, of: int) -> bool:
-    """Whether so many rows may be damaged ones."""
-    return rows * _DAMAGED_APART <= of
-
-
-def damaged_stamps(time: NDArray[np.float64]) -> NDArray[np.int64]:
-    """int64[k]: the fewest rows without which the stamps [n] rise; where they repeat often, do not fall.
-
-    A digit that is wrong makes single stamps too early or too late. None where it takes many rows, or many in a row."""
-    steps = np.diff(time)
-    repeats = steps == 0.0
-    strict = not _repeats_often(repeats)
-    wrong = (steps <= 0.0) if strict else (steps < 0.0)
-    none = np.empty(0, np.int64)
-    if not wrong.any() or not few(int(np.count_nonzero(wrong)), 2 * time.size):
-        return none
-    near = np.zeros(time.size + 1, bool)
-    for row in np.flatnonzero(wrong):
-        near[max(0, row + 1 - _DAMAGED_WITHIN) : row + 1 + _DAMAGED_WITHIN] = True
-    near[-1] = False
-    edges = np.flatnonzero(np.diff(near, prepend=False))
-    found = []
-    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        rows = np.delete(np.arange(first, last), _rising(time[first:last].tolist(), strict))
-        if (rows[_DAMAGED_MOST:] - rows[:-_DAMAGED_MOST] == _DAMAGED_MOST).any():
-            return none
-        found.append(rows)
-    damaged = np.concatenate(found)
-    left = np.diff(np.delete(time, damaged))
-    sound = left.size > 0 and bool((left > 0.0).all() if strict else (left >= 0.0).all())
-    return damaged if sound and few(damaged.size, time.size) else none
-
-
-def _rising(values: list[float], strict: bool) -> list[int]:
-    """Places of the longest subsequence that rises, or does not fall."""
-    ends: list[float] = []
-    at: list[int] = []
-    before: list[int] = []
-    for place, value in enumerate(values):
-        k = bisect_left(ends, value) if strict else bisect_right(ends, value)
-        before.append(at[k - 1] if k else -1)
-        ends[k : k + 1], at[k : k + 1] = [value], [place]
-    found = at[-1:]
-    while before[found[-1]] >= 0:
-        found.append(before[found[-1]])
-    return found[::-1]
-
-
-def _repeats_often(repeats: NDArray[np.bool_]) -> bool:
-    """Whether stamps are coarser than the sampling interval: repeats bool[n - 1] are no fault then."""
-    rows = repeats.size + 1
-    return rows >= _REPEATS_FROM and int(np.count_nonzero(repeats)) >= _REPEATS_LEAST * rows
-
-
 def has_own_clock(rows: NDArray[np.int64]) -> bool:
     """Whether the samples in these rows of a table are a slower channel's, or another sensor's between them."""
     if rows.size < 3:
@@ -184,9 +106,7 @@ def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
     return Clock(rate / every, np.maximum(np.diff(place, prepend=-1) - 1, 0), None, float(rows[0]) / rate)
 
 
-def clock_of(
-    path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
-) -> Clock:
+def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail) -> Clock:
     """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
     states it. Raises UserError, by `fail` for a row."""
     start = float(time[0])
@@ -212,25 +132,28 @@ def _sampling(
     path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
 ) -> tuple[float, NDArray[np.int64]]:
     """Rate in Hz and missing_before[n] of stamps [n], s from 0."""
+    fault = broken(time)
+    if fault is not None:
+        fail(fault[0], f"{fault[1]}: {_ways(time)}")
     steps = np.diff(time)
-    if steps.min() < 0.0:
-        row = int(next(iter(damaged_stamps(time)), np.argmax(steps < 0.0) + 1))
-        early = row > 0 and time[row] <= time[row - 1]
-        fail(row, "time runs backwards" if early else "the time stamp is later than the next one")
     repeats = steps == 0.0
-    if repeats.any() and (not _repeats_often(repeats) or repeats.all()):
-        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
     try:
         dt, missing = sampling(time, noise_s, rate)
     except Ambiguous as error:
-        raise UserError(f"{path}: column 't': {error}: give --rate HZ") from error
-    if repeats.any() and dt > 0.999 * float(steps[~repeats].min()):  # not for being coarse
-        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
+        way = f"{AS_THEY_COME}, where they are even" if (steps < 0.0).any() else "give --rate HZ"
+        raise UserError(f"{path}: column 't': {error}: {way}") from error
+    if repeats.any() and dt > 0.999 * float(steps[steps > 0.0].min()):  # not for being coarse
+        fail(int(np.argmax(repeats)) + 1, f"the time stamp repeats: {_ways(time)}")
     if not 0.0 < dt < math.inf:
         raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
     if rate is not None and on_other_grid(time, 1.0 / rate, missing):
         raise _disagrees(path, rate)
     return float(f"{1.0 / dt:.10g}"), missing
+
+
+def _ways(time: NDArray[np.float64]) -> str:
+    """What to type for stamps that are out of order."""
+    return f"--skip-bad mends such rows and counts them; {AS_THEY_COME}" if mends(time) else AS_THEY_COME
 
 
 def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:

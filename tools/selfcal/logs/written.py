@@ -10,17 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_COLUMNS, MOST_RATE_HZ
+from selfcal.logs.recorded import Recording
 from selfcal.logs.timebase import Clock
-
-if TYPE_CHECKING:
-    from selfcal.logs.recording import Recording
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]

@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, cast
 
@@ -35,7 +36,7 @@ from selfcal.base.limits import (
     reading,
 )
 from selfcal.logs.loaders.damage import Damaged
-from selfcal.logs.loaders.headings import RECEIVED
+from selfcal.logs.loaders.headings import RECEIVED, number_of
 
 #: Bytes of a file from which on reading it shows its progress.
 _SLOW_BYTES = 1 << 26
@@ -80,8 +81,10 @@ _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 #: A sampling rate in a comment, as Xsens writes it.
 _RATE = re.compile(r"(?:sampl\w+|update|output|data)[ _]?rate\W{1,4}(\d+(?:\.\d+)?) ?Hz", re.ASCII | re.IGNORECASE)
 
-#: Rows in which the numbers of several sensors are looked for, and so many sensors at most.
-_LOOKED_AT, _MOST_NUMBERED = 1000, 16
+#: Rows in which the sensors that take turns are looked for, so many sensors at most, and their names.
+_LOOKED_AT, _MOST_NUMBERED, _WORD = 1000, 16, re.compile(r"\w[\w ./:-]{0,59}")
+#: Turns of a sensor at least, and its rows in one turn at most.
+_TURNS, _LONGEST_TURN = 5, 64
 
 #: What opens a text in an archive: its bytes, and its packed size.
 Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
@@ -94,7 +97,7 @@ class _Bad(Exception):
         self.place, self.what = place, what
 
 
-class TextTable:
+class TextReader:
     """A table being read: `keys` are its headings, `first` the cells of its first row, `where` the header's line."""
 
     def __init__(
@@ -158,14 +161,18 @@ class TextTable:
             return 0.0 if math.isnan(self._day[0]) else self._day[0]
         return (self._origin if self._origin.tzinfo else self._origin.replace(tzinfo=UTC)).timestamp()
 
-    def numbers_in(self, key: str) -> list[str]:
-        """The cells of a column among the first rows, each once, where the rows of a few of them take turns."""
-        place = self.keys.index(key)
-        cells = [
-            cells[place].strip(' "') for line in self._batch[:_LOOKED_AT] if len(cells := self._cells(line)) > place
-        ]
-        found = list(dict.fromkeys(cells))
-        return found if 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 and all(map(str.isalnum, found)) else []
+    def in_turn(self) -> list[tuple[str, str]]:
+        """The column by which the rows of several sensors take turns, and its cell for each of them; none of one."""
+        rows = [cells for line in self._batch[:_LOOKED_AT] if len(cells := self._cells(line)) == len(self.keys)]
+        numbering = number_of(self.keys)
+        for place, key in enumerate(self.keys):
+            cells = [row[place].strip(_QUOTED) for row in rows]
+            found = list(dict.fromkeys(cells))
+            if not 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 or not all(map(_WORD.fullmatch, found)):
+                continue
+            if key == numbering or not (any(map(_ROW.fullmatch, found)) or _keeps(cells)):
+                return [(key, cell) for cell in found]
+        return []
 
     def only(self, key: str, cell: str) -> None:
         """Read only the rows that have this cell in a column."""
@@ -467,6 +474,19 @@ class TextTable:
             days += _DAY_S
         self._day = (second if math.isnan(first) else first, second, days)
         return second + days - self._day[0]
+
+
+def _keeps(cells: Sequence[str]) -> bool:
+    """Whether the words of a column last for many rows, come once, or come at random: they are no sensors."""
+    runs = [len(list(run)) for _, run in groupby(cells)]
+    if len(runs) < _TURNS or sorted(runs)[len(runs) // 2] > _LONGEST_TURN:
+        return True
+    for word in set(cells):
+        rows = [row for row, cell in enumerate(cells) if cell == word]
+        steps = [b - a for a, b in pairwise(rows)]
+        if len(steps) < _TURNS or sum(step == sorted(steps)[len(steps) // 2] for step in steps) < len(steps) / 2:
+            return True
+    return False
 
 
 def is_date(cell: str) -> bool:
