@@ -18,17 +18,14 @@ from selfcal.base.limits import LONGEST_S, MOST_CLOCKS
 from selfcal.logs import written
 from selfcal.logs.headers import Header, number_in
 from selfcal.logs.loaders.damage import Damaged
-from selfcal.logs.loaders.headings import split
+from selfcal.logs.loaders.headings import PART, split
 from selfcal.logs.loaders.table import Rows
 from selfcal.logs.order import few, in_order
 from selfcal.logs.recorded import Column, Recording, bridged, bridged_at
-from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock
+from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
-
-#: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
-_NO_GRID = 0.3
 
 
 @dataclass(frozen=True)
@@ -56,7 +53,7 @@ def assembled(rate: float | None, rows: Rows, header: Header, mend: bool) -> Rec
             rows.fail(int(np.argmax(np.isinf(values))), number, f"infinite at {field.lsb:g} {field.unit} an LSB")
         columns[field.name] = Column(field.name, field.unit, values)
     _check_truth(rows.path, rows.meta)
-    stamps = columns.pop("t", None)
+    stamps, part = columns.pop("t", None), columns.pop(PART, None)
     if stamps is None:
         rate = rate if rate is not None else _meta_rate(rows.path, rows.meta)
         if rate is None:
@@ -65,14 +62,14 @@ def assembled(rate: float | None, rows: Rows, header: Header, mend: bool) -> Rec
         return _on_clocks(rows, rate, columns, count, None, header)
     if header.written and np.isfinite(stamps.values).all():
         return _as_written(rows, columns, units.convert(stamps.values, stamps.unit, "s"), header)
-    ordered, kept = _ordered(rows, stamps, header, mend)
+    ordered, kept = _ordered(rows, stamps, part, header, mend)
     if kept.size < count or (np.diff(kept) < 0).any():
         columns = {name: replace(one, values=one.values[kept]) for name, one in columns.items()}
     return _on_clocks(rows, rate, columns, kept.size, ordered, header)
 
 
-def _ordered(rows: Rows, stamps: Column, header: Header, mend: bool) -> tuple[_Stamps, Places]:
-    """The stamps in their order, and the rows of the table that they are of."""
+def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header, mend: bool) -> tuple[_Stamps, Places]:
+    """The stamps in their order, and the rows of the table that they are of. `part`: what is added to the stamps."""
     number = [field.name for field in rows.fields].index("t")
     every = np.arange(stamps.values.size)
     known = np.flatnonzero(np.isfinite(stamps.values))
@@ -80,12 +77,14 @@ def _ordered(rows: Rows, stamps: Column, header: Header, mend: bool) -> tuple[_S
         rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
     values = stamps.values[known] if known.size < every.size else stamps.values
     tick_s = units.factor(stamps.unit, "s") * rows.fields[number].lsb
-    order = in_order(units.convert(values - values[0], stamps.unit, "s"), tick_s, mend)
+    since = units.convert(values - values[0], stamps.unit, "s")
+    if part is not None:
+        since += units.convert(np.nan_to_num(part.values[known]), part.unit, "s")
+    order = in_order(since, tick_s, mend)
     kept = known[order.rows]
-    count = order.damaged + every.size - known.size
-    if count:
-        header.damaged += Damaged(0, count)
-        header.notes.append(f"{count} line{'s were' if count > 1 else ' was'} skipped for a damaged time stamp")
+    if unknown := every.size - known.size:
+        header.notes.append(f"{unknown} line{'s were' if unknown > 1 else ' was'} skipped, without a time stamp")
+    header.damaged += Damaged(0, order.damaged + unknown)
     header.notes += order.notes
     size = np.abs(values).max(keepdims=True)
     first = float(units.convert(np.array([rows.started + values[0]]), stamps.unit, "s")[0])
@@ -142,7 +141,7 @@ def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: He
         meta,
         main.off_grid_s,
         started_s=started if math.isfinite(started) else None,
-        notes=(*of_log, *header.notes, *_of_clock(main)),
+        notes=(*of_log, *header.notes, *remarks(main)),
     )
 
 
@@ -189,7 +188,7 @@ def _on_clocks(
         rows.meta,
         main.off_grid_s,
         started_s=None if stamps is None else stamps.started_s + main.start_s,
-        notes=(*header.notes, *_of_clock(main)),
+        notes=(*header.notes, *(remarks(main) if rate is None else [])),
         damaged=header.damaged,
     )
 
@@ -261,15 +260,3 @@ def _check_truth(path: Path, meta: Mapping[str, Any]) -> None:
                 continue
             if not math.isfinite(number_in(value)):
                 raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {shown(value)}")
-
-
-def _of_clock(clock: Clock) -> list[str]:
-    """A note where the stamps lie on no grid: of samples that were lost at random such a clock shows nothing."""
-    if clock.off_grid_s is None or clock.missing_before.any() or clock.off_grid_s.size < 3:
-        return []
-    if np.ptp(clock.off_grid_s) * clock.rate_hz <= 1.0:
-        return []  # the stamps are coarse
-    spread = float(np.diff(clock.off_grid_s).std()) * clock.rate_hz
-    told = f"the stamps lie on no grid: their mean rate, {clock.rate_hz:.4g} Hz, is taken; no lost sample shows"
-    told += ": --rate HZ states another"
-    return [told] if spread > _NO_GRID else []

@@ -19,7 +19,7 @@ from selfcal.base.options import Scale
 from selfcal.base.units import SENSORS
 from selfcal.logs import written
 from selfcal.logs.loaders.damage import SOUND
-from selfcal.logs.loaders.headings import Meaning, Sensor, sensors_of, split
+from selfcal.logs.loaders.headings import PART, Meaning, Sensor, sensors_of, split
 from selfcal.logs.loaders.table import Field
 from selfcal.logs.loaders.text_table import is_clock, is_date, is_row
 from selfcal.logs.loaders.texts import Text
@@ -59,6 +59,8 @@ class Header:
         self.decided = {*stated, *(scale if "" not in scale else sensors)}
         #: Names that the user gives of columns, here or in the file, and that are there.
         self.found: set[str] = set()
+        #: The headings of all tables of the file.
+        self.seen: set[str] = set()
         #: Columns of a table that lack a unit, or the size of a count: heading, name here, and the usual unit.
         self.without_unit: list[tuple[str, str, str]] = []
         self.without_size: list[tuple[str, str, str]] = []
@@ -141,7 +143,7 @@ class Header:
                 )
             if dates or is_clock(cell):
                 self.dated = self.dated or key
-            if not (name == "t" and self.no_time):
+            if not (name in ("t", PART) and self.no_time):
                 lsb = entry.get("lsb", None if size == 1.0 else size)
                 found += self._field(key, name, entry.get("unit", unit), lsb, where, mapped=key in renamed, dates=dates)
         if self.without_unit or self.without_size:
@@ -263,7 +265,7 @@ class Header:
                 self.notes.append(f"column '{name}' is in {unit} by its heading, taken as {stated} by --unit")
             unit = stated
         asked = mapped or stated is not None or scaled is not None
-        optional = not asked and name != "t" and name not in self.sensors
+        optional = not asked and name not in ("t", PART) and name not in self.sensors
         dates = dates and name == "t" and stated is None
         unit = "s" if dates else unit
         known = isinstance(unit, str) and units.known(unit)

@@ -86,9 +86,10 @@ def _spans(time: Floats, steps: Floats, tick_s: float, usual: float) -> list[tup
     found = [(2.0**32 * tick, _LOST_OF_32, 32) for tick in ticks]
     found += [(span, _LOST, 0) for span in _CLOCKS]
     found += [(2.0**bits * tick, _LOST, bits) for bits in _BITS[1:] for tick in ticks]
-    step = common_step(np.abs(steps), 1e-9 * usual)
-    if step > 0.0:
-        found.append((step * 2.0 ** math.ceil(math.log2((np.ptp(time) + 0.5 * step) / step)), _LOST_OF_STEPS, 0))
+    counts = [common_step(np.abs(steps), 1e-9 * usual), *(10.0**-digits for digits in range(10))]
+    fits = (one for one in counts if one > 0.0 and np.abs(time / one - np.rint(time / one)).max() < 0.01)
+    for step in [*fits][:1]:
+        found.append((step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5)), _LOST_OF_STEPS, 0))
     return found
 
 
@@ -100,7 +101,7 @@ def broken(time: Floats) -> tuple[int, str] | None:
     back, repeats = steps < 0.0, steps == 0.0
     if back.any() and not in_rhythm(np.flatnonzero(back)):
         far = _far(time)
-        row = int(far[0] if 0 < far.size and few(far.size, time.size) else np.argmax(back) + 1)
+        row = int(far[0] if far.size > 0 and few(far.size, time.size) else np.argmax(back) + 1)
         early = row > 0 and time[row] <= time[row - 1]
         return row, "time runs backwards" if early else "the time stamp is later than the next one"
     if repeats.any() and (not _repeats_often(repeats) or repeats.all()):
@@ -123,7 +124,7 @@ def _mended(order: Order) -> Order:
     """Without damaged stamps, sorted where rows are near their place, without stamps that repeat; the order as it was
     where that takes too many rows."""
     time, n, notes = order.time, order.time.size, list(order.notes)
-    if n < 2 or broken(time) is None:
+    if n < 2 or (broken(time) is None and ((np.diff(time) != 0.0).all() or _coarse(time))):
         return order
     kept = np.arange(n)
     far = _far(time)

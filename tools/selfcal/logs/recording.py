@@ -86,6 +86,11 @@ def load(
         for one, header in zip(paths, headers, strict=True)
         for part in _load(one, rate, header, skip_bad, sources, hints)
     ]
+    there = {text for header in headers for key in header.seen for text in (key, split(key)[0])}
+    for name, wanted in columns.items():
+        if wanted not in there:
+            what = f"there is no column '{wanted}' for --column {name}={wanted}"
+            raise UserError(f"{' '.join(map(str, paths))}: {what}")
     recording = found[0] if len(found) == 1 else _joined(paths, found, headers[0])
     _check_gravity(recording, headers[0])
     recording = replace(
@@ -141,6 +146,7 @@ def _load(
             else:
                 tables = tables_of(path, form, hints)
         several = len(tables) > 1
+        header.seen = {key for table in tables for key in table.keys}
         parts = [part for table in tables for part in _parts(path, rate, header, table, several, skip_bad)]
         if not parts or (several and not any(part.axes for part in parts)):
             there = ", ".join(f"{one.source}: {', '.join(one.keys)}" for one in tables)

@@ -16,11 +16,15 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import Ambiguous, on_other_grid, sampling, thinned_grid
+from selfcal.logs.sampling import Ambiguous, common_step, in_rhythm, on_other_grid, sampling, thinned_grid
 
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
 #: median of two rows or more.
 _OWN_SHARE, _OWN_NEAR = 0.6, 0.3
+#: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
+_NO_GRID = 0.3
+#: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost.
+_NEARLY = 0.9
 #: The way on for stamps of no use.
 AS_THEY_COME = "--no-time --rate HZ takes the rows as they come"
 
@@ -140,6 +144,8 @@ def _sampling(
     try:
         dt, missing = sampling(time, noise_s, rate)
     except Ambiguous as error:
+        if repeats.any() and mends(time):
+            fail(int(np.argmax(repeats)) + 1, f"the time stamp repeats: {_ways(time)}")
         way = f"{AS_THEY_COME}, where they are even" if (steps < 0.0).any() else "give --rate HZ"
         raise UserError(f"{path}: column 't': {error}: {way}") from error
     if repeats.any() and dt > 0.999 * float(steps[steps > 0.0].min()):  # not for being coarse
@@ -149,6 +155,32 @@ def _sampling(
     if rate is not None and on_other_grid(time, 1.0 / rate, missing):
         raise _disagrees(path, rate)
     return float(f"{1.0 / dt:.10g}"), missing
+
+
+def remarks(clock: Clock) -> list[str]:
+    """A line on stamps that another clock explains as well, or that show no lost sample."""
+    rate, missing, off_grid = clock.rate_hz, clock.missing_before, clock.off_grid_s
+    if off_grid is None or off_grid.size < 3:
+        return []
+    gaps = np.flatnonzero(missing)
+    if gaps.size:
+        other = rate * missing.size / (missing.size + int(missing.sum()))
+        if not in_rhythm(gaps) or other < _NEARLY * rate:
+            return []
+        every = round(1.0 / (1.0 - other / rate))
+        other = float(f"{rate - rate / every:.6g}")
+        told = f"1 sample in {every} is missing, at regular intervals: a slower sensor's stamps are alike"
+        return [f"{told}: --rate {other:g} states that"]
+    steps = np.diff(clock.time_s + off_grid)
+    lattice = common_step(steps, 1e-9 / rate)
+    if _NEARLY < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:
+        other = float(f"{1.0 / lattice:.6g}")
+        told = f"stamps of {lattice:.4g} s: {other:g} Hz that loses 1 sample in {round(1.0 / (1.0 - rate * lattice))}"
+        return [f"{told} has the same: --rate {other:g} states that"]
+    if np.ptp(off_grid) * rate <= 1.0 or float(np.diff(off_grid).std()) * rate <= _NO_GRID:
+        return []
+    told = f"the stamps lie on no grid: their mean rate, {rate:.4g} Hz, is taken; no lost sample shows"
+    return [f"{told}: --rate HZ states another"]
 
 
 def _ways(time: NDArray[np.float64]) -> str:

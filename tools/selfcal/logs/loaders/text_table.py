@@ -52,11 +52,16 @@ _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*", re.ASCII)
 #: A number and its unit, in one cell.
 _WITH_UNIT = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)? ([^\W\d_][\w/^]{0,20})\s*", re.ASCII)
 _QUOTED = ' "'
+#: A number in quotes whose thousands commas separate: without a point one comma may be the decimal sign.
+_THOUSANDS = re.compile(r'"[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:,\d{3}){2,})"', re.ASCII)
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 #: A cell that holds no sample.
 _MISSING = re.compile(r"(nan?|#?n/a|#nv|null|none|-+|\?)?", re.ASCII | re.IGNORECASE)
 #: A date with a time of day (ISO 8601), in quotes or not.
-_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?", re.ASCII)
+_ISO = re.compile(
+    r"(?:\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?|\d{8}T\d{6}(?:[.,]\d+)?)(?:Z|[-+]\d\d:?\d\d)?",
+    re.ASCII,
+)
 #: A date or a time of day in any form.
 _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)
 #: A time of day with parts of a second; a date of any form before it, and a zone after it, say nothing more.
@@ -141,6 +146,9 @@ class TextReader:
         headings = self._stated(self._headings(header))
         if len(headings) == len(self._cells(self._batch[0])) + 1 and headings[-1].strip().lower() == _COMMENT_OF_ROWS:
             del headings[-1]  # of LabVIEW, which writes the comment of a row only where there is one
+        cells = self._cells(self._batch[0])
+        if len(cells) == len(headings) + 1 and not cells[-1].strip():
+            headings.append("")  # a separator ends each row
         self.keys = [self._heading(cell, number, place) for place, cell in enumerate(headings)]
         self.first = [cell.strip(' "') for cell in self._cells(self._batch[0])]
 
@@ -314,6 +322,8 @@ class TextReader:
         return found[0] if found else ","
 
     def _cells(self, line: str) -> list[str]:
+        if self._separator == "," and _THOUSANDS.search(line):
+            line = _THOUSANDS.sub(lambda cell: cell[0].replace(",", ""), line)
         return line.split() if self._separator == " " else line.split(self._separator)
 
     def _headings(self, line: str) -> list[str]:
@@ -427,7 +437,7 @@ class TextReader:
         cells = self._cells(line)
         if len(cells) != len(self.keys):
             what = f"{len(cells)} cells where the header has {len(self.keys)}" if line.strip() else "an empty line"
-            raise _Bad(None, what)
+            raise _Bad(None, f"{what}: --skip-bad leaves such lines out")
         return cells
 
     def _value(self, text: str, place: int, dated: bool = False) -> float:
@@ -641,6 +651,8 @@ class _Lines:
         self.stream: BinaryIO | _Wide = stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
+        #: Lines end with CR alone, as on old Macs.
+        self._returns = False
         self._packed, self._unpacked = packed, 0
         self._skip_bad, self.no_text = skip_bad, False
         #: The lines are a serial monitor's, and what separates their columns.
@@ -651,7 +663,9 @@ class _Lines:
         while not self.unfinished:
             with reading(self.path, f"not a whole {'gzip' if self.path.suffix.lower() == '.gz' else 'zip'} file"):
                 block = self._block()
-            data = self._carry + block
+            if self._start and not self._carry:
+                self._returns = b"\r" in block[:-1] and b"\n" not in block
+            data = self._carry + (block.replace(b"\r", b"\n") if self._returns else block)
             end = data.rfind(b"\n") + 1 if block else len(data)
             self.unfinished = not block and bool(data)
             self._carry = data[end:]
