@@ -21,12 +21,8 @@ from scipy.fft import rfft
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import betaln
 
-#: Rows looked at on either side of a long time step to tell missing samples from a late one.
-_NEIGHBOURS = 10
-#: Long steps looked at together, for the memory that they take.
-_AT_ONCE = 1 << 16
-#: Samples missing in a row that still count as a gap.
-_LONGEST_GAP = 2.0**53
+#: Intervals of a record at most.
+_LONGEST = 2.0**53
 #: Steps in one window of the first estimate.
 _WINDOW = 64
 #: Lattice step over interval from which stamps are coarse; below it a step of one interval is never taken for two.
@@ -49,22 +45,18 @@ _STEPS, _PIECES = 20, 500
 _PRICE_OF_PART = 40.0
 #: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
 _CHANGE = 0.015
-#: Stamps that need missing samples, or whose mean step is so much longer than the usual one, are asked for a grid.
-#: Without one a step of so many mean ones is a gap.
-_MEAN, _GAP = 1.2, 20.0
+#: Without a grid a step of so many mean ones is a gap.
+_GAP = 20.0
 #: Rows of a stretch, half turns in it that are tried to either side, stretches at most, and the least mean square
 #: length: jitter of 0.2 dt. Independent steps that spread by 0.15 dt and more stay below it.
 _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
-#: Jitter hides lost samples from their neighbours where such a share of the steps is so far from whole intervals.
-_BLURRED_SHARE, _BLURRED = 0.1, 0.3
 #: Rows over which a grid's phase is followed.
 _PIECE_OF_GRID = 100
-#: A stated rate is checked against other grids where so many steps hold missing samples: places in one interval,
-#: places looked at, rows at least, intervals from 1/_OTHER to _OTHER times the stated one, and how far from it (ln).
-_SUSPECT, _FINE, _OTHER_PLACES, _OTHER_ROWS, _OTHER, _OTHER_APART = 0.1, 16, 1 << 21, 100, 4.0, 0.1
-#: A grid behind jitter: the slowest line, turns in the mean step; the least power of one, that of jitter of 0.3 dt; and
-#: the largest of random times over the power of their noise, e^-10 among a few thousand.
-_LINE_FIRST, _LINE_LEAST, _LINE_CHANCE = 0.9, 0.012, 25.0
+#: Places in one interval whose spectrum is taken, and places of it at most.
+_FINE, _OTHER_PLACES = 16, 1 << 21
+#: A grid behind jitter: the slowest and the fastest line, turns in the mean step; the least power of one, which is that
+#: of jitter of 0.3 dt; and the largest of random times over the power of their noise, e^-10 among a few thousand.
+_LINE_FIRST, _LINE_LAST, _LINE_LEAST, _LINE_CHANCE = 0.9, 4.0, 0.012, 25.0
 #: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
 #: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
 _ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
@@ -139,24 +131,18 @@ def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s
             return _coarse(time, lattice, typical, rate)
         except Ambiguous:
             if rate is None:
-                raise  # a stated rate decides, and is checked by who knows it
-    elif rate is None:
-        grid = _lossy_grid(steps, lattice)
-        if grid > 0.0:
-            return _on_every_step(time, grid)
+                raise
+            return 1.0 / rate, _decode(time, 1.0 / rate, lattice)[0]
     if rate is not None and thinned_grid(time, 1.0 / rate):
         return _on_grid(time, 1.0 / rate)
-    first = _usual(steps) if rate is None else 1.0 / rate
-    dt, missing = _fine(time, steps, first)
-    if rate is None and (typical > _MEAN * first or missing.any()):
-        if not _even(time, dt):
-            dt = _line(time, typical, lattice)
-            return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
-        if _blurred(steps, dt):
-            return _on_grid(time, dt)
-        if _in_batches(steps, missing):
-            return _slope(np.arange(time.size), time), np.zeros_like(missing)
-    return dt, missing
+    grid = _lossy_grid(steps, lattice)
+    if grid > 0.0:
+        return _on_every_step(time, grid)
+    usual = _usual(steps)
+    if _in_batches(steps, usual):
+        return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
+    dt = usual if _even(time, usual) else _line(time, typical, lattice)
+    return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
 
 
 def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -173,9 +159,9 @@ def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np
     return long if shows else np.zeros_like(long)
 
 
-def _in_batches(steps: NDArray[np.float64], missing: NDArray[np.int64]) -> bool:
+def _in_batches(steps: NDArray[np.float64], usual: float) -> bool:
     """Whether gaps come in a rhythm and are no whole intervals: a batch is stamped by another interval than its own."""
-    gaps = missing[1:] > 0
+    gaps = steps > 1.15 * usual
     if not in_rhythm(np.flatnonzero(gaps)):
         return False
     turns = steps[gaps] / float(steps[~gaps].mean())
@@ -260,45 +246,20 @@ def thinned_grid(time: NDArray[np.float64], dt: float) -> bool:
     return _even(time, dt) and not _even(time, 2.0 * dt) and not _even(time, 3.0 * dt)
 
 
-def on_other_grid(time: NDArray[np.float64], dt: float, missing: NDArray[np.int64]) -> bool:
-    """Whether stamps lie on a grid whose interval is not the stated one, `dt`: they miss many samples of that one.
-
-    A grid is a line in the spectrum of the stamps, however many samples are lost. Its multiples are lines too."""
-    if np.count_nonzero(missing) < _SUSPECT * missing.size or _even(time, dt):
-        return False
-    turns, power = _spectrum(time, dt)
-    if not turns.size:
-        return False
-    lattice = common_step(np.diff(time), 1e-9 * dt)
-    if lattice > _COARSE * dt:
-        return abs(math.log(lattice / dt)) > _OTHER_APART and _lossy(np.rint(np.diff(time) / lattice))
-    lines = turns[(power > _COHERENT) & (turns > 1.0 / _OTHER) & (turns < _OTHER)]
-    return lines.size > 0 and abs(math.log(lines[0])) > _OTHER_APART
-
-
-def _spectrum(time: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Frequencies [m], turns in `dt`, and the power there of the first stamps, that of an exact grid being 1. Empty for
-    few stamps."""
-    head = time[:_STRETCH]
-    head = head[head < _OTHER_PLACES / _FINE * dt]
-    if head.size < _OTHER_ROWS:
-        return np.empty(0), np.empty(0)
-    stamped = np.bincount(np.rint(head * (_FINE / dt)).astype(np.int64))
-    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2 / head.size**2
-    return np.arange(power.size) * (_FINE / (2.0 * stamped.size)), power
-
-
 def _line(time: NDArray[np.float64], typical: float, lattice: float) -> float:
     """Interval, s, of a grid that jitter and losses hide from single steps; 0 if the stamps have none.
 
     A grid is a line in the spectrum of the stamps, jitter of the sd s dt leaves exp(-(2 pi s)^2) of its power. The
     stamps' own `lattice` is one as well. Of `typical`, the mean step, the grid may keep so many samples."""
-    turns, power = _spectrum(time, typical)
-    shown = (turns > _LINE_FIRST) & (turns < min(_OTHER, 0.5 * typical / max(lattice, 1e-300)))
+    head = time[:_STRETCH]
+    head = head[head < _OTHER_PLACES / _FINE * typical]
+    stamped = np.bincount(np.rint(head * (_FINE / typical)).astype(np.int64))
+    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2 / head.size**2
+    turns = np.arange(power.size) * (_FINE / (2.0 * stamped.size))
+    shown = (turns > _LINE_FIRST) & (turns < min(_LINE_LAST, 0.5 * typical / max(lattice, 1e-300)))
     if not shown.any():
         return 0.0
     dt = typical / float(turns[int(np.argmax(np.where(shown, power, 0.0)))])
-    head = time[:_STRETCH]
     # The spectrum is of rounded stamps, and so has images of a quicker line.
     exact = float(np.abs(np.exp(2j * math.pi * (head - head[0]) / dt).mean()) ** 2)
     return dt if exact > max(_LINE_LEAST, _LINE_CHANCE / head.size) else 0.0
@@ -309,8 +270,7 @@ def _mean_grid(steps: NDArray[np.float64]) -> Found:
     dt = float(steps.mean())
     for _ in range(8):
         dt = float(steps[steps < _GAP * dt].mean())
-    missing = np.where(steps < _GAP * dt, 0, np.rint(steps / dt).astype(np.int64) - 1)
-    return dt, np.concatenate(([0], missing))
+    return dt, np.concatenate(([0], np.where(steps < _GAP * dt, 0, np.rint(steps / dt).astype(np.int64) - 1)))
 
 
 @dataclass(frozen=True)
@@ -490,29 +450,16 @@ def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
 # ------------------------------------------------------------------------------------------------------- fine stamps
 
 
-def _fine(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> Found:
-    """Missing samples for a first dt, and dt from the time against the index with those in it, until both stay."""
-    missing = _missing(time, steps, dt)
-    for _ in range(8):
-        dt = float(time[-1]) / (time.size - 1 + int(missing.sum()))
-        again = _missing(time, steps, dt)
-        if np.array_equal(again, missing):
-            break
-        missing = again
-    return dt, missing
-
-
-def _blurred(steps: NDArray[np.float64], dt: float) -> bool:
-    """Whether jitter makes many steps no multiple of the interval: the phase of the grid counts better then."""
-    turns = steps / dt
-    return float(np.mean(np.abs(turns - np.rint(turns)) > _BLURRED)) > _BLURRED_SHARE
-
-
 def _on_grid(time: NDArray[np.float64], dt: float) -> Found:
-    """The nearest places of a grid of about `dt` whose phase and rate are followed over pieces of the record."""
+    """The nearest places of a grid of about `dt` whose phase and rate are followed over pieces of the record.
+
+    A sample may be late, and none after it is then; it is not early."""
+    if not time[-1] < _LONGEST * dt:
+        raise Ambiguous(f"a step of {float(np.diff(time).max()):.3g} s among others of {dt:.3g} s")
     turns, _ = followed_phase(np.ones(time.size), time, 1.0 / dt, _PIECE_OF_GRID)
-    place = np.maximum.accumulate(np.rint(turns).astype(np.int64) - np.arange(time.size))
-    missing = np.diff(place, prepend=place[0])
+    place = np.rint(turns).astype(np.int64) - np.arange(time.size)
+    missing = np.diff(np.minimum.accumulate(place[::-1])[::-1], prepend=place.min())
+    missing[0] = 0
     return float(time[-1]) / (time.size - 1 + int(missing.sum())), missing
 
 
@@ -536,32 +483,6 @@ def followed_phase(
     return phase, float(np.abs(np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)).sum())
 
 
-def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> NDArray[np.int64]:
-    """missing_before[n]. A late sample makes one long step and then a short one; missing ones shift all that follows.
-
-    So the shift is taken from the earliest of the rows since the last long step to the earliest of those that follow.
-    """
-    missing = np.zeros(time.size, np.int64)
-    long = np.flatnonzero(steps > 1.5 * dt) + 1
-    if long.size == 0:
-        return missing
-    reach = np.arange(_NEIGHBOURS)
-    last = np.concatenate(([0], long[:-1]))  # first row since the long step before
-    for at in range(0, long.size, _AT_ONCE):
-        rows = long[at : at + _AT_ONCE, None]
-        before = np.maximum(rows - 1 - reach, last[at : at + _AT_ONCE, None])
-        after = np.minimum(rows + reach, time.size - 1)
-        # Relative to the row before the step, so that 10^8 rows cost no digits.
-        origin, start = rows - 1, time[rows - 1]
-        early = (time[before] - start - (before - origin) * dt).min(axis=1)
-        late = (time[after] - start - (after - origin) * dt).min(axis=1)
-        gaps = np.rint((late - early) / dt)
-        if not gaps.max() < _LONGEST_GAP:
-            raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {dt:.3g} s")
-        missing[rows[:, 0]] = np.maximum(0, gaps).astype(np.int64)
-    return missing
-
-
 # ----------------------------------------------------------------------------------------------------- coarse stamps
 
 
@@ -570,7 +491,7 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     whole = _unbroken(time, lattice)
     if whole is not None and not (steps.min() >= 1.0 and _rather_lossy(steps, lattice, whole, rate)):
         return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
-    if whole is not None or (rate is None and _lossy(steps)):
+    if whole is not None or _lossy(steps):
         return _on_every_step(time, lattice)
     low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
     head = time[:_HEAD]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import Ambiguous, common_step, in_rhythm, on_other_grid, sampling, thinned_grid
+from selfcal.logs.sampling import Ambiguous, common_step, in_rhythm, sampling, thinned_grid
 
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
 #: median of two rows or more.
@@ -152,8 +152,6 @@ def _sampling(
         fail(int(np.argmax(repeats)) + 1, f"the time stamp repeats: {_ways(time)}")
     if not 0.0 < dt < math.inf:
         raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
-    if rate is not None and on_other_grid(time, 1.0 / rate, missing):
-        raise _disagrees(path, rate)
     return float(f"{1.0 / dt:.10g}"), missing
 
 

@@ -308,7 +308,7 @@ def _time(form: _Form, keys: Sequence[str], taken: Mapping[str, str], source: st
 
 
 def _in_two(keys: Sequence[str], source: str) -> dict[str, Meaning]:
-    """The time of a source in whole seconds, and the nanoseconds beside them in another column; nothing without both."""
+    """The whole seconds of a source's time, and the nanoseconds in a column beside them; nothing without both."""
     whole = {match[1]: key for key in keys if (match := re.fullmatch(r"(.*?)(?:secs?|seconds?)", key, re.IGNORECASE))}
     for key in keys:
         match = re.fullmatch(r"(.*?)(?:n|nano)(?:secs?|seconds?)", key, re.IGNORECASE)
