@@ -148,7 +148,8 @@ def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s
 def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.bool_]:
     """bool[n - 1]: the steps between stretches of an even grid, whatever they last; none for other stamps."""
     usual = _usual(steps)
-    long = steps > _ASLEEP * usual
+    # Samples that come at once after a step make up for it.
+    long = (steps > _ASLEEP * usual) & (np.append(steps[1:], usual) > 0.5 * usual)
     count = int(np.count_nonzero(long))
     if not 0 < count * _AWAKE < steps.size:
         return np.zeros_like(long)
@@ -288,7 +289,11 @@ def rate_changes(time: NDArray[np.float64]) -> list[Change]:
 
     Of regular stamps a rate that lasts _SHORT rows or more is seen if it differs by a tenth. Of others it must last two
     pieces of n / _PIECES rows, or of 3 * _STEPS."""
-    return _regular_parts(time) or _parts(time)
+    found = _regular_parts(time) or _parts(time)
+    steps = np.diff(time)
+    # A burst after a stall makes up for it: samples of one rate, stamped late.
+    late = (steps[max(0, one.row - 3) : one.row + 2].max() > _STEPS * max(one.before_s, one.after_s) for one in found)
+    return [] if any(late) else found
 
 
 def _regular_parts(time: NDArray[np.float64]) -> list[Change]:
@@ -309,11 +314,6 @@ def _regular_parts(time: NDArray[np.float64]) -> list[Change]:
     # Medians within _STEPS rows of a change are the extremes of one part's steps.
     inner = [ln[a + (_STEPS if a else 0) : b - (_STEPS if b < steps.size else 0)] for a, b in spans]
     if any(near[a:b].mean() < _SHORT_SHARE for a, b in spans) or any(np.ptp(one) > _SHORT_APART for one in inner):
-        return []
-    # A burst after a stall makes up for it: samples of one rate, stamped late.
-    edges = rows[:, None] + np.arange(-2, 3)
-    slower = np.maximum(level[rows - 1], level[rows])
-    if (steps[edges] > (1.0 + 2.0 * _SHORT_NEAR) * slower[:, None]).any():
         return []
     exact = [float(steps[a:b][near[a:b]].mean()) for a, b in spans]
     scatter = max(1e-3, float(np.std(np.log(steps[near] / level[near]))))
