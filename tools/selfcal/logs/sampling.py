@@ -18,7 +18,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
-from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import betaln
 
 #: Intervals of a record at most.
@@ -64,9 +63,6 @@ _ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
 _ROUNDINGS, _ROUNDED = (1e-9, 1e-6, 1e-3), 20.0
 #: Steps of one lattice step that such a grid has at least, and their share over that of independent losses.
 _ONES, _ONES_SHARE = 20, 0.7
-#: A regular part: rows at least, the share of its steps that are near its interval, how near, how constant the medians
-#: of its steps and how far from the next part's (ln), and parts at most.
-_SHORT, _SHORT_SHARE, _SHORT_NEAR, _SHORT_APART, _SHORT_MOST = 2 * _STEPS, 0.9, 0.3, 0.1, 100
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
 
@@ -287,47 +283,18 @@ class Change:
 def rate_changes(time: NDArray[np.float64]) -> list[Change]:
     """Every change of rate in stamps float64[n], s, in order of time.
 
-    Of regular stamps a rate that lasts _SHORT rows or more is seen if it differs by a tenth. Of others it must last two
-    pieces of n / _PIECES rows, or of 3 * _STEPS."""
-    found = _regular_parts(time) or _parts(time)
+    A rate must last two pieces of n / _PIECES rows, or of 3 * _STEPS; one that differs much, of _STEPS."""
+    found = _parts(time, 3 * _STEPS) or _parts(time, _STEPS)
     steps = np.diff(time)
     # A burst after a stall makes up for it: samples of one rate, stamped late.
     late = (steps[max(0, one.row - 3) : one.row + 2].max() > _STEPS * max(one.before_s, one.after_s) for one in found)
     return [] if any(late) else found
 
 
-def _regular_parts(time: NDArray[np.float64]) -> list[Change]:
-    """The changes of rate of stamps whose steps are nearly all those of their part; none for other stamps."""
-    steps = np.diff(time)
-    if steps.size < 2 * _SHORT:
-        return []
-    level = median_filter(steps, 2 * _STEPS + 1, mode="nearest")
-    if not level.min() > 0.0:
-        return []
-    ln = np.log(level)
-    jump = np.abs(np.diff(ln))
-    rows = np.flatnonzero((jump > _SHORT_APART) & (jump == maximum_filter1d(jump, 5))) + 1
-    if not 0 < rows.size < _SHORT_MOST or np.diff(rows, prepend=0, append=steps.size).min() <= _SHORT:
-        return []
-    near = np.abs(steps / level - 1.0) < _SHORT_NEAR
-    spans = list(pairwise([0, *rows.tolist(), steps.size]))
-    # Medians within _STEPS rows of a change are the extremes of one part's steps.
-    inner = [ln[a + (_STEPS if a else 0) : b - (_STEPS if b < steps.size else 0)] for a, b in spans]
-    if any(near[a:b].mean() < _SHORT_SHARE for a, b in spans) or any(np.ptp(one) > _SHORT_APART for one in inner):
-        return []
-    exact = [float(steps[a:b][near[a:b]].mean()) for a, b in spans]
-    scatter = max(1e-3, float(np.std(np.log(steps[near] / level[near]))))
-    found = []
-    for ((a, b), (c, d)), (before, after) in zip(pairwise(spans), pairwise(exact), strict=True):
-        nats = 0.5 * min(b - a, d - c) * (math.log(after / before) / scatter) ** 2
-        found.append(Change(b, before, after, min(1e6, nats)))
-    return found
-
-
-def _parts(time: NDArray[np.float64]) -> list[Change]:
-    """The changes between parts of many rows, whose steps may be any on average."""
+def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
+    """The changes between parts of some pieces, which have `least` rows or more."""
     n = time.size
-    size = max(3 * _STEPS, n // _PIECES)
+    size = max(least, n // _PIECES)
     if n < 6 * size:
         return []
     steps = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
@@ -588,7 +555,7 @@ def _scanned(
     """The dt of a scan's grid [m] with the best of its scores [m, slacks], if there is but one."""
     head = time[:_HEAD]
     each = scores.min(axis=1)
-    best = _oncommon_step(grid, each, lattice, head.size)
+    best = _on_lattice(grid, each, lattice, head.size)
     reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
     same = np.abs(grid / grid[best] - 1.0) < reach
     rivals = grid[~same & (each < each[best] + _AS_GOOD)]
@@ -611,7 +578,7 @@ def _scanned(
     raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
 
 
-def _oncommon_step(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float, rows: int) -> int:
+def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float, rows: int) -> int:
     """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold."""
     best = int(each.argmin())
     times = np.rint(grid / lattice)
