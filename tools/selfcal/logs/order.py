@@ -162,9 +162,10 @@ def _coarse(time: Floats) -> bool:
         return False
     try:
         return sampling(time - time[0], 0.0, None)[0] <= 0.999 * float(steps[steps > 0.0].min())
-    except Ambiguous:  # stamps that are coarse repeat in a rhythm
-        runs = np.diff(np.flatnonzero(steps == 0.0))
-        return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) > 0.5)
+    except Ambiguous:  # stamps that are coarse repeat in a rhythm, all the time
+        rows = np.flatnonzero(steps == 0.0)
+        runs = np.diff(rows)
+        return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) > 0.5 and 2 * np.ptp(rows) > time.size)
 
 
 def _repeats_often(repeats: NDArray[np.bool_]) -> bool:

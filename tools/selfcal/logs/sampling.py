@@ -18,6 +18,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
+from scipy.optimize import minimize_scalar
 from scipy.special import betaln
 
 #: Intervals of a record at most.
@@ -52,15 +53,13 @@ _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
 #: Rows over which a grid's phase is followed.
 _PIECE_OF_GRID = 100
 #: Places in one interval whose spectrum is taken, and places of it at most.
-_FINE, _OTHER_PLACES = 16, 1 << 21
-#: A grid behind jitter: the slowest and the fastest line, turns in the mean step; the least power of one, which is that
-#: of jitter of 0.3 dt; and the largest of random times over the power of their noise, e^-10 among a few thousand.
-_LINE_FIRST, _LINE_LAST, _LINE_LEAST, _LINE_CHANCE = 0.9, 4.0, 0.012, 25.0
+_FINE, _OTHER_PLACES = 64, 1 << 22
+#: A grid behind jitter: the slowest and the fastest line, turns in the mean step, but for grids with little jitter; and
+#: the largest of random times over the power of their noise, e^-10 among a few thousand, which bins about it show.
+_LINE_FIRST, _LINE_LAST, _LINE_CHANCE, _LINE_ABOUT = 0.9, 4.0, 25.0, 64
 #: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
 #: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
 _ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
-#: Roundings of stamps, s, and how many of them an interval has at least that shows beside them.
-_ROUNDINGS, _ROUNDED = (1e-9, 1e-6, 1e-3), 20.0
 #: Steps of one lattice step that such a grid has at least, and their share over that of independent losses.
 _ONES, _ONES_SHARE = 20, 0.7
 #: Another dt with this many missing samples more or fewer is as good.
@@ -131,9 +130,8 @@ def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s
             return 1.0 / rate, _decode(time, 1.0 / rate, lattice)[0]
     if rate is not None and thinned_grid(time, 1.0 / rate):
         return _on_grid(time, 1.0 / rate)
-    grid = _lossy_grid(steps, lattice)
-    if grid > 0.0:
-        return _on_every_step(time, grid)
+    if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
+        return _on_every_step(time, lattice)
     usual = _usual(steps)
     if _in_batches(steps, usual):
         return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
@@ -253,13 +251,16 @@ def _line(time: NDArray[np.float64], typical: float, lattice: float) -> float:
     stamped = np.bincount(np.rint(head * (_FINE / typical)).astype(np.int64))
     power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2 / head.size**2
     turns = np.arange(power.size) * (_FINE / (2.0 * stamped.size))
-    shown = (turns > _LINE_FIRST) & (turns < min(_LINE_LAST, 0.5 * typical / max(lattice, 1e-300)))
+    shown = (turns > _LINE_FIRST) & ((turns < _LINE_LAST) | (power > _COHERENT))
+    shown &= turns * lattice < 0.5 * typical
     if not shown.any():
         return 0.0
-    dt = typical / float(turns[int(np.argmax(np.where(shown, power, 0.0)))])
+    at = int(np.argmax(np.where(shown, power, 0.0)))
+    dt = typical / float(turns[at])
+    noise = float(np.median(power[max(0, at - _LINE_ABOUT) : at + _LINE_ABOUT])) / math.log(2.0)
     # The spectrum is of rounded stamps, and so has images of a quicker line.
     exact = float(np.abs(np.exp(2j * math.pi * (head - head[0]) / dt).mean()) ** 2)
-    return dt if exact > max(_LINE_LEAST, _LINE_CHANCE / head.size) else 0.0
+    return dt if exact > _LINE_CHANCE * max(noise, 1.0 / head.size) else 0.0
 
 
 def _mean_grid(steps: NDArray[np.float64]) -> Found:
@@ -407,7 +408,11 @@ def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
     if starts.size > 1000:
         return 0.0
     distinct = np.add.reduceat(ordered, starts) / np.diff(starts, append=ordered.size)
-    lattice = float(min(distinct.min(), np.diff(distinct).min(initial=np.inf)))
+    lattice = 0.0
+    for step in distinct.tolist():
+        rest = step
+        while rest > 10.0 * tolerance:  # Euclid's algorithm
+            lattice, rest = rest, abs(lattice - rest * round(lattice / rest))
     times = np.rint(distinct / lattice)
     if (np.abs(distinct - times * lattice) > np.maximum(10.0 * tolerance, 0.01 * lattice)).any():
         return 0.0
@@ -498,22 +503,6 @@ def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) 
     return _on_every_step(time, lattice)
 
 
-def _lossy_grid(steps: NDArray[np.float64], lattice: float) -> float:
-    """Interval, s, of an even grid that loses samples, of which each step is a multiple; 0 if there is none.
-
-    It is the `lattice`, or one far coarser than the rounding of the stamps."""
-    if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
-        return lattice
-    for rounding in _ROUNDINGS:
-        grid = common_step(steps[:_PLACES], 2.5 * rounding)
-        if grid > _ROUNDED * rounding and _lossy(np.rint(steps / grid)):
-            # Two roundings make a step; the grid is known to one of them over many intervals.
-            off = np.abs(steps - np.rint(steps / grid) * grid)
-            if float(off.max()) < 2.0 * rounding:
-                return grid
-    return 0.0
-
-
 def _lossy(steps: NDArray[np.float64]) -> bool:
     """Whether whole numbers of lattice steps are those of an even grid of one step that loses samples.
 
@@ -591,7 +580,7 @@ def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: f
 def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
     """The mean step, if for some dt all stamps lie within a lattice step of an even grid without a gap; else None.
 
-    The span of what is left is a convex function of dt: a ternary search finds its least. The mean step is within
+    The span of what is left is a convex function of dt. The mean step is within
     lattice/duration of the true dt, which the dt of the least span need not be.
     """
     index = np.arange(time.size)
@@ -602,16 +591,11 @@ def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
         return float(left.max() - left.min())
 
     middle, reach = float(time[-1]) / (time.size - 1), 1.5 * lattice / (time.size - 1)
-    low, high = middle - reach, middle + reach
     if span(middle) < lattice:
         return middle
-    for _ in range(40):
-        third = (high - low) / 3.0
-        if span(low + third) < span(high - third):
-            high -= third
-        else:
-            low += third
-    return middle if span(0.5 * (low + high)) < lattice * (1.0 + 1e-6) else None
+    bounds = middle - reach, middle + reach
+    least = minimize_scalar(span, bounds=bounds, method="bounded", options={"xatol": 1e-9 * reach})
+    return middle if least.fun < lattice * (1.0 + 1e-6) else None
 
 
 def _scan(
