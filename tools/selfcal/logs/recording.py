@@ -32,8 +32,8 @@ from selfcal.logs.loaders.sources import Part, chosen
 from selfcal.logs.loaders.table import Field, Hints, Table, meta_place
 from selfcal.logs.loaders.text_table import is_date
 from selfcal.logs.recorded import SIDE_CHANNELS, Column, Recording, as_float, bridged, bridged_at
-from selfcal.logs.saved import save
 from selfcal.logs.timebase import Clock
+from selfcal.logs.written import save
 
 __all__ = ["SIDE_CHANNELS", "Column", "Recording", "as_float", "bridged", "list_of", "load", "meta_place", "save"]
 
@@ -170,7 +170,7 @@ def _load(
 def _parts(path: Path, rate: float | None, header: Header, table: Table, several: bool, mend: bool) -> list[Part]:
     """The sensors of a table, and the temperature in one without any."""
     keys = table.keys
-    sensors = header.sensors_of(keys, table.file(path), table.before)
+    sensors = header.sensors_of(keys, table.name, table.before)
     sides = sides_of(keys) if several and not sensors else None
     if several and not sensors and sides is None:
         return []
@@ -232,7 +232,7 @@ class _Sensor:
         table = self.table
         cells = dict(zip(table.keys, table.first, strict=False))
         first = [cells.get(key, "") for key in keys] if cells else ()
-        fields = header.fields(keys, table.where, table.described, first, self.sensor.meant)
+        fields = header.fields(keys, table.where, table.meta.get("columns", {}), first, self.sensor.meant)
         fields += header.marks(keys, table.meta, rate, fields)
         rows = table.rows(self.path, fields)
         header.damaged += rows.damaged

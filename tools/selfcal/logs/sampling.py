@@ -468,13 +468,7 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
     head = time[:_HEAD]
     grid, scores = _scan(head, lattice, low, high)
-    try:
-        return _scanned(time, lattice, grid, scores)
-    except Ambiguous:
-        thinned = _thinned(time, lattice, float(scores.min()), head.size) if low < lattice < high else None
-        if thinned is None:
-            raise
-        return thinned
+    return _scanned(time, lattice, grid, scores)
 
 
 def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate: float | None) -> bool:
@@ -491,16 +485,6 @@ def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate
     lossy = betaln(gaps, n + 1 - gaps) - math.log(10.0)
     pixels = 2.0 * math.log(math.pi) - 3.0 * math.log(n)
     return lossy > pixels or min(abs(one - round(one)) for one in ticks) > 1e-6
-
-
-def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) -> Found | None:
-    """An even grid of one lattice step, samples lost here and there, if no dt makes do with clearly fewer gaps in the
-    first `rows` than it needs; `gaps`: the fewest of any. Of random losses some dt or other saves a few."""
-    steps = np.rint(np.diff(time) / lattice).astype(np.int64)
-    own = int((steps[: rows - 1] > 1).sum())
-    if steps.min() < 1 or own > gaps + 0.5 * math.sqrt(gaps) + _AS_GOOD:
-        return None
-    return _on_every_step(time, lattice)
 
 
 def _lossy(steps: NDArray[np.float64]) -> bool:
@@ -544,7 +528,7 @@ def _scanned(
     """The dt of a scan's grid [m] with the best of its scores [m, slacks], if there is but one."""
     head = time[:_HEAD]
     each = scores.min(axis=1)
-    best = _on_lattice(grid, each, lattice, head.size)
+    best = _on_lattice(grid, each, lattice)
     reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
     same = np.abs(grid / grid[best] - 1.0) < reach
     rivals = grid[~same & (each < each[best] + _AS_GOOD)]
@@ -567,14 +551,14 @@ def _scanned(
     raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
 
 
-def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float, rows: int) -> int:
-    """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold."""
+def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float) -> int:
+    """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold. Of
+    random losses some dt or other saves a few."""
     best = int(each.argmin())
     times = np.rint(grid / lattice)
-    for k in np.flatnonzero((times > 0) & (np.abs(grid - times * lattice) < 1e-9 * grid)):
-        if each[k] <= each[best] + _AS_GOOD and each[k] <= max(3.0, 0.05 * rows):
-            return int(k)
-    return best
+    enough = each[best] + 0.5 * math.sqrt(each[best]) + _AS_GOOD
+    exact = np.flatnonzero((times > 0) & (np.abs(grid - times * lattice) < 1e-9 * grid) & (each <= enough))
+    return int(exact[0]) if exact.size else best
 
 
 def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:

@@ -87,34 +87,22 @@ class Table:
     notes: tuple[str, ...] = ()
     damaged: Damaged = SOUND
 
+    #: Of a text: its name, headings, the lines before them, their line in messages, and the cells of the first row.
+    name: str = ""
+    headings: Sequence[str] = ()
+    before: Sequence[str] | None = None
+    line: str = ""
+    first: Sequence[str] = ()
+
     @property
     def keys(self) -> Sequence[str]:
         """The headings."""
-        return list(self.members)
-
-    @property
-    def first(self) -> Sequence[str]:
-        """The cells of the first row of a text."""
-        return ()
-
-    @property
-    def described(self) -> Any:
-        """What `meta` says of columns that are named plainly."""
-        return self.meta.get("columns", {})
+        return self.headings or list(self.members)
 
     @property
     def where(self) -> str:
         """What a message puts after the path."""
-        return f"{self.source}: " if self.source else ""
-
-    @property
-    def before(self) -> Sequence[str] | None:
-        """The lines before the headings of a text; None for other tables."""
-        return None
-
-    def file(self, path: Path) -> str:
-        """The name that may explain the headings."""
-        return path.name
+        return self.line or (f"{self.source}: " if self.source else "")
 
     def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
         """The columns of the fields. Raises UserError."""

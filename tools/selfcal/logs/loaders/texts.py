@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, NoReturn, cast
+from typing import BinaryIO, NoReturn, cast
 
 from selfcal.base.errors import UserError, printable, shown
 from selfcal.base.limits import MOST_COLUMNS, MOST_META_BYTES, read_text, reading
@@ -48,34 +48,7 @@ class TextTable(Table):
     text: Text = field(default_factory=lambda: Text(Path(), ""))
     knows: Callable[[Text], Knows] = lambda _: lambda _: False
     skip_bad: bool = False
-    headings: tuple[str, ...] = ()
-    cells: tuple[str, ...] = ()
-    leading: tuple[str, ...] = ()
-    line: str = ""
     only: tuple[str, str] | None = None
-
-    @property
-    def keys(self) -> Sequence[str]:
-        return self.headings
-
-    @property
-    def first(self) -> Sequence[str]:
-        return self.cells
-
-    @property
-    def described(self) -> Any:
-        return {}
-
-    @property
-    def where(self) -> str:
-        return self.line
-
-    @property
-    def before(self) -> Sequence[str]:
-        return self.leading
-
-    def file(self, path: Path) -> str:
-        return self.text.name
 
     def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
         path = self.text.path
@@ -129,8 +102,8 @@ def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Tab
             source = "/".join(one for one in (text.source, ":".join(only or ())) if one)
             found.append(
                 TextTable(
-                    source, {}, meta, text=text, knows=knows, skip_bad=skip_bad, headings=tuple(reader.keys),
-                    cells=tuple(reader.first), leading=tuple(reader.before), line=reader.where, only=only,
+                    source, {}, meta, name=text.name, headings=reader.keys, before=reader.before, line=reader.where,
+                    first=reader.first, text=text, knows=knows, skip_bad=skip_bad, only=only,
                 )
             )  # fmt: skip
     return found
