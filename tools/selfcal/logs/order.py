@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
-from selfcal.logs.sampling import Ambiguous, common_step, in_rhythm, sampling
+from selfcal.logs.sampling import common_step, overlapping
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-#: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
-_REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
+#: Rows from which on stamps may repeat for being coarser than the sampling interval.
+_REPEATS_FROM = 100
 #: Bits of counters, and counts, s, that are not in the column's own unit.
 _BITS, _TICKS = (32, 24, 16), (1e-6, 1e-3)
 #: Spans of a clock's own, s. It may be set back by the first of them.
@@ -99,12 +99,12 @@ def broken(time: Floats) -> tuple[int, str] | None:
     Stamps may repeat for being coarse. They may fall where batches of one length overlap."""
     steps = np.diff(time)
     back, repeats = steps < 0.0, steps == 0.0
-    if back.any() and not in_rhythm(np.flatnonzero(back)):
+    if back.any() and not overlapping(time):
         far = _far(time)
         row = int(far[0] if far.size > 0 and few(far.size, time.size) else np.argmax(back) + 1)
         early = row > 0 and time[row] <= time[row - 1]
         return row, "time runs backwards" if early else "the time stamp is later than the next one"
-    if repeats.any() and (not _repeats_often(repeats) or repeats.all()):
+    if repeats.any() and (not _coarse(steps) or repeats.all()):
         return int(np.argmax(repeats)) + 1, "the time stamp repeats"
     return None
 
@@ -124,7 +124,7 @@ def _mended(order: Order) -> Order:
     """Without damaged stamps, sorted where rows are near their place, without stamps that repeat; the order as it was
     where that takes too many rows."""
     time, n, notes = order.time, order.time.size, list(order.notes)
-    if n < 2 or (broken(time) is None and ((np.diff(time) != 0.0).all() or _coarse(time))):
+    if n < 2 or broken(time) is None:
         return order
     kept = np.arange(n)
     far = _far(time)
@@ -135,7 +135,7 @@ def _mended(order: Order) -> Order:
         return order
     kept = kept[sort]
     repeats = np.diff(time[kept], prepend=-np.inf) == 0.0
-    if repeats.any() and not _coarse(time[kept]):
+    if repeats.any() and not _coarse(np.diff(time[kept])):
         kept = kept[~repeats]
     left_out = n - kept.size
     if not few(left_out, n) or kept.size < 2:
@@ -155,20 +155,11 @@ def _far(time: Floats) -> Rows:
     return np.flatnonzero(np.abs(time - middle) > (_NEAR + 0.5) * float(np.median(np.abs(np.diff(time)))))
 
 
-def _coarse(time: Floats) -> bool:
-    """Whether sorted stamps repeat for being coarse."""
-    steps = np.diff(time)
-    if not _repeats_often(steps == 0.0) or not steps.any():
+def _coarse(steps: Floats) -> bool:
+    """Whether stamps repeat for being coarse: often, or in a rhythm all the time."""
+    rows = np.flatnonzero(steps == 0.0)
+    if steps.size < _REPEATS_FROM or rows.size < 2:
         return False
-    try:
-        return sampling(time - time[0], 0.0, None)[0] <= 0.999 * float(steps[steps > 0.0].min())
-    except Ambiguous:  # stamps that are coarse repeat in a rhythm, all the time
-        rows = np.flatnonzero(steps == 0.0)
-        runs = np.diff(rows)
-        return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) > 0.5 and 2 * np.ptp(rows) > time.size)
-
-
-def _repeats_often(repeats: NDArray[np.bool_]) -> bool:
-    """Whether stamps are coarser than the sampling interval: repeats bool[n - 1] are no fault then."""
-    rows = repeats.size + 1
-    return rows >= _REPEATS_FROM and int(np.count_nonzero(repeats)) >= _REPEATS_LEAST * rows
+    runs = np.diff(rows)
+    steady = np.mean(np.abs(runs - np.median(runs)) <= 1) > 0.5 and 2 * np.ptp(rows) > steps.size
+    return bool(steady) or not few(rows.size, steps.size)

@@ -155,8 +155,9 @@ def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np
 
 
 def _in_batches(steps: NDArray[np.float64], usual: float) -> bool:
-    """Whether gaps come in a rhythm and are no whole intervals: a batch is stamped by another interval than its own."""
-    gaps = steps > 1.15 * usual
+    """Whether steps of another length come in a rhythm and are no whole intervals: a batch is stamped by another
+    interval than its own."""
+    gaps = np.abs(steps - usual) > 0.15 * usual
     if not in_rhythm(np.flatnonzero(gaps)):
         return False
     turns = steps[gaps] / float(steps[~gaps].mean())
@@ -170,6 +171,14 @@ def in_rhythm(rows: NDArray[np.int64]) -> bool:
     if runs.size < _AWAKE or np.median(runs) < 4:
         return False
     return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) >= _RHYTHM)
+
+
+def overlapping(time: NDArray[np.float64]) -> bool:
+    """Whether stamps fall in a rhythm, and go on from there: batches overlap. Where rows are swapped they catch up."""
+    steps = np.diff(time)
+    rows = np.flatnonzero(steps < 0.0)
+    around = time[np.minimum(rows + 4, time.size - 1)] - time[np.maximum(rows - 3, 0)]
+    return in_rhythm(rows) and float(np.median(around)) < 6.0 * float(np.median(steps))
 
 
 def _by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None) -> Found | None:
@@ -468,7 +477,17 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
     head = time[:_HEAD]
     grid, scores = _scan(head, lattice, low, high)
-    return _scanned(time, lattice, grid, scores)
+    try:
+        return _scanned(time, lattice, grid, scores)
+    except Ambiguous:
+        if steps.min() < 1.0 or np.mean(steps > 1.0) > 0.1 or _is_tick(lattice):
+            raise
+        return _on_every_step(time, lattice)
+
+
+def _is_tick(lattice: float) -> bool:
+    """Whether a lattice is a clock's tick, 10^-k or 2^-k s, and not the interval itself."""
+    return min(abs(one - round(one)) for one in (math.log10(lattice), math.log2(lattice))) < 1e-6
 
 
 def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate: float | None) -> bool:
@@ -481,10 +500,9 @@ def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate
     gaps, n = int(np.count_nonzero(steps > 1.0)), steps.size
     if not 0 < gaps < 0.1 * n:
         return False
-    ticks = math.log10(lattice), math.log2(lattice)
     lossy = betaln(gaps, n + 1 - gaps) - math.log(10.0)
     pixels = 2.0 * math.log(math.pi) - 3.0 * math.log(n)
-    return lossy > pixels or min(abs(one - round(one)) for one in ticks) > 1e-6
+    return lossy > pixels or not _is_tick(lattice)
 
 
 def _lossy(steps: NDArray[np.float64]) -> bool:

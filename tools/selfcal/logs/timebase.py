@@ -144,8 +144,6 @@ def _sampling(
     try:
         dt, missing = sampling(time, noise_s, rate)
     except Ambiguous as error:
-        if repeats.any() and mends(time):
-            fail(int(np.argmax(repeats)) + 1, f"the time stamp repeats: {_ways(time)}")
         way = f"{AS_THEY_COME}, where they are even" if (steps < 0.0).any() else "give --rate HZ"
         raise UserError(f"{path}: column 't': {error}: {way}") from error
     if repeats.any() and dt > 0.999 * float(steps[steps > 0.0].min()):  # not for being coarse
