@@ -749,3 +749,104 @@ def test_readings_far_beyond_the_range_ask_for_the_unit(tmp_path: Path, capfd: p
     with pytest.raises(UserError, match="beyond the range of 300 deg/s: is the unit right"):
         identify(tmp_path / "log.csv")
     assert "Warning" not in capfd.readouterr().err
+
+
+def in_turn(path: Path, head: str, words: Sequence[str], levels: Sequence[float], turn: int, rows: int) -> Path:
+    """Rows of sensors in turn, `turn` rows each at 40 Hz, a millisecond apart, told apart by a word."""
+    random = np.random.default_rng(8)
+    lines = [
+        f"{(k * turn + j) / 40.0 + 0.001 * place:.3f},{word},{level + 0.01 * random.standard_normal():.5f}"
+        for k in range(rows // turn)
+        for place, (word, level) in enumerate(zip(words, levels, strict=True))
+        for j in range(turn)
+    ]
+    path.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("heading", ["source", "what", "Sensor Name", "msg"])
+@pytest.mark.parametrize("turn", [1, 12])
+@pytest.mark.parametrize("words", [("Gyro_A", "Gyro_B"), ("imu.left", "imu.right", "imu.mid")])
+def test_sensors_told_apart_by_a_word_are_never_mixed(
+    heading: str, turn: int, words: Sequence[str], tmp_path: Path
+) -> None:
+    """Whatever the column's name. Each way that the line names reads that sensor's rows alone."""
+    levels = [0.5 + 2.0 * k for k in range(len(words))]
+    log = in_turn(tmp_path / "log.csv", f"t[s],{heading},gx[deg/s]", words, levels, turn, 1200)
+    with pytest.raises(UserError, match="several sensors: give --source") as caught:
+        load(log)
+    for word, level in zip(words, levels, strict=True):
+        source = f"{heading}:{word}"
+        assert f"--source '{source}' (gx; 40 Hz" in str(caught.value)
+        recording = load(log, sources=[source])
+        assert (recording.samples, int(recording.missing_before.sum())) == (1200, 0)
+        assert recording.rate_hz == pytest.approx(40.0, rel=1e-9)
+        assert recording.columns["gx"].values == pytest.approx(level, abs=0.06)
+
+
+def test_axes_of_a_long_form_are_named_by_the_user(tmp_path: Path) -> None:
+    """Headings without a sensor's name or unit: one line leads on, and its ways read one sensor."""
+    log = in_turn(tmp_path / "log.csv", "time,kind,value", ("gyr", "acc"), (0.2, 9.8), 1, 900)
+    with pytest.raises(UserError, match=r"no sensor column .*--column gx=NAME, and --unit gx=UNIT"):
+        load(log)
+    options: dict[str, Any] = {"columns": {"gx": "value"}, "units": {"gx": "deg/s", "t": "s"}}
+    with pytest.raises(UserError, match="--source 'kind:gyr'"):
+        load(log, **options)
+    recording = load(log, sources=["kind:gyr"], **options)
+    assert recording.samples == 900 and recording.columns["gx"].values == pytest.approx(0.2, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        lambda k, r: "warn" if r.random() < 0.3 else "ok",
+        lambda k, r: "heat" if k // 150 % 2 else "cool",
+        lambda k, r: "pps" if k % 25 == 0 else "none",
+        lambda k, r: "start" if k == 0 else "run",
+    ],
+    ids=["at random", "for long", "seldom", "once"],
+)
+def test_a_state_in_words_is_no_sensor(word: Callable[[int, np.random.Generator], str], tmp_path: Path) -> None:
+    random = np.random.default_rng(2)
+    rows = "\n".join(f"{k / 50:.2f},{word(k, random)},{random.standard_normal():.4f}" for k in range(3000))
+    (tmp_path / "log.csv").write_text(f"t[s],state,gx[deg/s]\n{rows}\n", encoding="utf-8")
+    assert load(tmp_path / "log.csv").samples == 3000
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("t[s],gx[deg/s]", lambda t, g: f"{t:.3f},{g:.4f},"),
+        ("t[s],gx[deg/s]", lambda t, g: f'"{t:,.3f}",{g:.4f}'),
+        ("t[s];gx[deg/s]", lambda t, g: f"{t:.3f};{g:.4f};"),
+        ("sec,nanosec,gx[deg/s]", lambda t, g: f"{1_650_000_000 + int(t)},{round(t % 1 * 1e9)},{g:.4f}"),
+        ("stamp.secs,stamp.nsecs,gx[deg/s]", lambda t, g: f"{int(t)},{round(t % 1 * 1e9)},{g:.4f}"),
+        ("time,gx[deg/s]", lambda t, g: f"20230228T23{int(t) // 60 % 60:02d}{t % 60:06.3f},{g:.4f}"),
+    ],
+    ids=[
+        "a comma ends a row",
+        "thousands in quotes",
+        "a semicolon ends a row",
+        "seconds and ns",
+        "of ROS 1",
+        "compact",
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_more_forms_of_text(head: str, row: Callable[[float, float], str], end: str, tmp_path: Path) -> None:
+    """The numbers that were written, from 1400 s on: thousands appear, minutes change. Lines end as on any system."""
+    values = np.round(white(4000, 0.3, 6), 4)
+    rows = [row(1400.0 + k / 8.0, value) for k, value in enumerate(values.tolist())]
+    log = tmp_path / "log.csv"
+    log.write_bytes((end.join([head, *rows]) + end).encode())
+    recording = load(log)
+    assert recording.rate_hz == pytest.approx(8.0, rel=1e-9)
+    assert np.array_equal(recording.columns["gx"].values, values)
+
+
+def test_a_comma_in_quotes_may_be_a_decimal_sign(tmp_path: Path) -> None:
+    """One comma and no point: refused, not guessed."""
+    rows = "\n".join(f'"{k},250",{k % 7}' for k in range(100))
+    (tmp_path / "log.csv").write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    with pytest.raises(UserError, match="line 2: 3 cells where the header has 2"):
+        load(tmp_path / "log.csv")

@@ -89,16 +89,20 @@ class Header:
 
     def sensors_of(self, keys: Sequence[str], file: str = "", before: Sequence[str] | None = None) -> list[Sensor]:
         """The sensors of a table with these headings, after the lines `before` of a text."""
-        taken = {}
-        for name, wanted in self.columns.items():
-            for key in [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]:
-                taken[key] = name
         found = []
-        for sensor in sensors_of(file or self.path.name, keys, self.sensors, taken, before):
+        for sensor in sensors_of(file or self.path.name, keys, self.sensors, self.mapped(keys), before):
             meant = {key: one for key, one in sensor.meant.items() if not one.optional or self._asks(key, one.name)}
             if any(one.name in self.sensors for one in meant.values()) or len(meant) == len(sensor.meant):
                 found.append(replace(sensor, meant=meant))
         return found
+
+    def mapped(self, keys: Sequence[str]) -> dict[str, str]:
+        """The names here, by heading, that the user gives."""
+        return {
+            key: name
+            for name, wanted in self.columns.items()
+            for key in [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
+        }
 
     def fields(
         self,

@@ -179,7 +179,7 @@ def _parts(path: Path, rate: float | None, header: Header, table: Table, several
         others = {key for one in sensors if one is not sensor for key in one.meant} - sensor.meant.keys()
         kept = [key for key in keys if key not in others]
         one = _Sensor(path, rate, header, table, sensor, kept, bool(sides), mend)
-        names = {one.name(key) for key in kept}
+        names = set(map(one.name, kept))
         source = "/".join(name for name in (table.source, sensor.source) if name)
         found.append(Part(source, frozenset(names & set(header.sensors)), "temp" in names, one.span, one.read))
     return found
@@ -200,7 +200,9 @@ class _Sensor:
 
     def name(self, key: str) -> str:
         """A column's name here."""
-        return self.sensor.meant[key].name if key in self.sensor.meant else split(key)[0]
+        if key in self.sensor.meant:
+            return self.sensor.meant[key].name
+        return self.header.mapped(self.keys).get(key, split(key)[0])
 
     def span(self) -> tuple[int, float]:
         """Number of readings, and the seconds of them."""

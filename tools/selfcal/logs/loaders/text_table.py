@@ -88,8 +88,8 @@ _RATE = re.compile(r"(?:sampl\w+|update|output|data)[ _]?rate\W{1,4}(\d+(?:\.\d+
 
 #: Rows in which the sensors that take turns are looked for, so many sensors at most, and their names.
 _LOOKED_AT, _MOST_NUMBERED, _WORD = 1000, 16, re.compile(r"\w[\w ./:-]{0,59}")
-#: Turns of a sensor at least, and its rows in one turn at most.
-_TURNS, _LONGEST_TURN = 5, 64
+#: Turns of a sensor at least, its rows in one turn at most, and how many times as many another may have.
+_TURNS, _LONGEST_TURN, _SELDOM = 5, 64, 8
 
 #: What opens a text in an archive: its bytes, and its packed size.
 Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
@@ -487,9 +487,10 @@ class TextReader:
 
 
 def _keeps(cells: Sequence[str]) -> bool:
-    """Whether the words of a column last for many rows, come once, or come at random: they are no sensors."""
+    """Whether the words of a column last for many rows, come seldom, or come at random: they are no sensors."""
     runs = [len(list(run)) for _, run in groupby(cells)]
-    if len(runs) < _TURNS or sorted(runs)[len(runs) // 2] > _LONGEST_TURN:
+    rows_of = sorted(map(cells.count, set(cells)))
+    if len(runs) < _TURNS or sorted(runs)[len(runs) // 2] > _LONGEST_TURN or rows_of[0] * _SELDOM < rows_of[-1]:
         return True
     for word in set(cells):
         rows = [row for row, cell in enumerate(cells) if cell == word]
