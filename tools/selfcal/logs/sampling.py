@@ -18,7 +18,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
-from scipy.optimize import minimize_scalar
 from scipy.special import betaln
 
 #: Intervals of a record at most.
@@ -595,6 +594,8 @@ def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
     middle, reach = float(time[-1]) / (time.size - 1), 1.5 * lattice / (time.size - 1)
     if span(middle) < lattice:
         return middle
+    from scipy.optimize import minimize_scalar
+
     bounds = middle - reach, middle + reach
     least = minimize_scalar(span, bounds=bounds, method="bounded", options={"xatol": 1e-9 * reach})
     return middle if least.fun < lattice * (1.0 + 1e-6) else None

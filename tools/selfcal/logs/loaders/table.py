@@ -129,9 +129,11 @@ class Table:
         for one in fields:
             array = self.members[one.key].read()
             if one.name == "t" and array.dtype.kind in "iu":
-                # Time since an epoch in ns does not fit a float64; a difference of two int64 does.
+                # Time since an epoch in ns does not fit a float64; a difference of two int64 fits a uint64.
                 bits = array.astype(np.uint64 if array.dtype.kind == "u" else np.int64).view(np.uint64)
-                started, array = float(array[0]), (bits - bits[0]).view(np.int64)
+                back, started = array[1:] < array[:-1], float(array[0])
+                steps = np.where(back, -(bits[:-1] - bits[1:]).astype(float), (bits[1:] - bits[:-1]).astype(float))
+                array = np.append(0.0, np.cumsum(steps)) if back.any() else bits - bits[0]
             columns.append(array.astype(np.float64))
         return Rows(path, fields, columns, fail, self.meta, started)
 
