@@ -20,12 +20,12 @@ Rows = NDArray[np.int64]
 
 #: Rows from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM = 100
-#: Bits of counters, and counts, s, that are not in the column's own unit.
+#: Bits by which a counter is named, and counts, s, that are not in the column's own unit.
 _BITS, _TICKS = (32, 24, 16), (1e-6, 1e-3)
 #: Spans of a clock's own, s. It may be set back by the first of them.
 _CLOCKS = {3600.0: "an hour", 43200.0: "half a day", 86400.0: "a day", 604800.0: "a week"}
 #: Usual steps in a span at least, and usual steps that a gap where a clock begins anew may last: of 32 bits and a known
-#: tick, of others, of one that the steps alone show.
+#: tick, of others, of one that begins anew once and whose tick the steps show.
 _IN_SPAN, _LOST_OF_32, _LOST, _LOST_OF_STEPS = 20, 1000.0, 20.0, 2.0
 #: Rows a damaged one at least, and rows to either side that show which of them it is.
 _DAMAGED_APART, _NEAR = 20, 16
@@ -58,38 +58,36 @@ def in_order(time: Floats, tick_s: float, mend: bool) -> Order:
 
 def unwrapped(time: Floats, tick_s: float) -> tuple[Floats, list[str]]:
     """Stamps [n], s, of a clock that went on, and a line for each span by which it begins anew."""
-    told: list[str] = []
     steps = np.diff(time)
     if time.size < 3 or not (steps < 0.0).any():
-        return time, told
+        return time, []
     usual = float(np.median(np.abs(steps)))
-    for span, most, bits in _spans(time, steps, tick_s, usual):
+    for span, lost in _spans(time, steps, tick_s, usual):
         on = steps + span
-        begins = (steps < 0.0) & (on > 0.0) & (on <= min(most * usual, 0.5 * span))
+        begins = (steps < 0.0) & (on > 0.0) & (on <= min(lost * usual, 0.5 * span))
         count = int(np.count_nonzero(begins))
         set_back = span in _CLOCKS and count == 1
         if not count or span < _IN_SPAN * usual or not (set_back or np.ptp(time) < span):
             continue
         again = time + np.concatenate(([0.0], np.cumsum(np.where(begins, span, 0.0))))
         times = f"{count} time{'s' if count > 1 else ''}"
+        bits = [bits for bits in _BITS for tick in (tick_s, *_TICKS) if abs(span / tick / 2.0**bits - 1.0) < 1e-9]
         if bits:
-            told.append(f"column 't' wraps {times} like a {bits}-bit counter: undone")
-        else:
-            told.append(f"column 't' goes back {times} by {_CLOCKS.get(span, f'{span:.10g} s')}: undone")
-        return again, told
-    return time, told
+            return again, [f"column 't' wraps {times} like a {bits[0]}-bit counter: undone"]
+        return again, [f"column 't' goes back {times} by {_CLOCKS.get(span, f'{span:.10g} s')}: undone"]
+    return time, []
 
 
-def _spans(time: Floats, steps: Floats, tick_s: float, usual: float) -> list[tuple[float, float, int]]:
-    """Spans, s, that a clock may have, the usual steps that may be lost where it begins anew, and a counter's bits."""
-    ticks = dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))
-    found = [(2.0**32 * tick, _LOST_OF_32, 32) for tick in ticks]
-    found += [(span, _LOST, 0) for span in _CLOCKS]
-    found += [(2.0**bits * tick, _LOST, bits) for bits in _BITS[1:] for tick in ticks]
+def _spans(time: Floats, steps: Floats, tick_s: float, usual: float) -> list[tuple[float, float]]:
+    """Spans, s, that a clock may have, and the usual steps that may be lost where it begins anew."""
+    found = [(2.0**32 * tick, _LOST_OF_32) for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))]
+    found += [(span, _LOST) for span in _CLOCKS]
     counts = [common_step(np.abs(steps), 1e-9 * usual), *(10.0**-digits for digits in range(10))]
     fits = (one for one in counts if one > 0.0 and np.abs(time / one - np.rint(time / one)).max() < 0.01)
+    once = np.count_nonzero(steps < 0.0) == 1
     for step in [*fits][:1]:
-        found.append((step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5)), _LOST_OF_STEPS, 0))
+        span = step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))
+        found.append((span, _LOST_OF_STEPS if once else _LOST))
     return found
 
 

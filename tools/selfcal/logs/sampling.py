@@ -134,7 +134,12 @@ def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s
     usual = _usual(steps)
     if _in_batches(steps, usual):
         return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
-    dt = usual if _even(time, usual) else _line(time, typical, lattice)
+    if _even(time, usual):
+        return _on_grid(time, usual)
+    mean = float(time[-1]) / steps.size
+    if np.ptp(time - mean * np.arange(time.size)) < mean:  # a count that is steady has lost no sample
+        return mean, np.zeros(time.size, np.int64)
+    dt = _line(time, typical, lattice)
     return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
 
 
@@ -198,18 +203,15 @@ def _by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float
     cuts = (np.flatnonzero(steps > _BURST_GAP * float(np.median(np.diff(time[starts])))) + 1).tolist()
     index = np.arange(time.size)
     dt = _slope(index, time, cuts) if rate is None else 1.0 / rate
-    left = time - index * dt
-    levels = []
-    for begin, end in pairwise([0, *cuts, time.size]):
-        part = left[begin:end]
-        if float(np.ptp(part)) > _STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt):
-            return None
-        # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
-        reach = max(1, round(10.0 * size))
-        levels.append((float(part[:reach].min()), float(part[-reach:].min())))
+    parts = np.split(time - index * dt, cuts)
+    stray = [_STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt) for part in parts]
+    if any(float(np.ptp(part)) > most for part, most in zip(parts, stray, strict=True)):
+        return None
+    # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
+    reach = max(1, round(10.0 * size))
     missing = np.zeros(time.size, np.int64)
-    for cut, (before, after) in zip(cuts, pairwise(levels), strict=True):
-        missing[cut] = max(0, round((after[0] - before[1]) / dt))
+    for cut, (before, after) in zip(cuts, pairwise(parts), strict=True):
+        missing[cut] = max(0, round((after[:reach].min() - before[-reach:].min()) / dt))
     return dt, missing
 
 
@@ -324,7 +326,8 @@ def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
     spans = [slice(a, b) for a, b in pairwise(ends)]
     if any(b - a < 2 * _STEPS for a, b in pairwise(ends)) or _lossy_parts(time, spans, level):
         return []
-    exact = [_mean_step(time[one.start : one.stop + 1], step) for one, step in zip(spans, level, strict=True)]
+    own = [np.diff(time[one.start : one.stop + 1]) for one in spans]
+    exact = [float(each[np.abs(each - step) < 0.5 * step].mean()) for each, step in zip(own, level, strict=True)]
     scatter = max(1e-3, _scatter(value, parts))
     return [
         Change(row, *intervals, min(1e6, 0.5 * n * math.log(intervals[1] / intervals[0]) ** 2 / scatter**2))
@@ -397,13 +400,6 @@ def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[floa
     fastest = min(level)
     heads = [(time[one][:_STRETCH], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
     return any(not _even(head, step) and _even(head, fastest) for head, step in heads)
-
-
-def _mean_step(time: NDArray[np.float64], step: float) -> float:
-    """Mean of the steps between stamps that are no gap of an even grid, `step` where the grid has none such."""
-    steps = np.diff(time)
-    whole = np.abs(steps - step) < 0.5 * step
-    return float(steps[whole].mean()) if whole.mean() > 0.5 else step
 
 
 def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
