@@ -590,11 +590,11 @@ def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
     middle, reach = float(time[-1]) / (time.size - 1), 1.5 * lattice / (time.size - 1)
     if span(middle) < lattice:
         return middle
-    from scipy.optimize import minimize_scalar
-
-    bounds = middle - reach, middle + reach
-    least = minimize_scalar(span, bounds=bounds, method="bounded", options={"xatol": 1e-9 * reach})
-    return middle if least.fun < lattice * (1.0 + 1e-6) else None
+    low, high = middle - reach, middle + reach
+    for _ in range(40):  # a ternary search
+        third = (high - low) / 3.0
+        low, high = (low, high - third) if span(low + third) < span(high - third) else (low + third, high)
+    return middle if span(0.5 * (low + high)) < lattice * (1.0 + 1e-6) else None
 
 
 def _scan(
