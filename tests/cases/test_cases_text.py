@@ -850,3 +850,27 @@ def test_a_comma_in_quotes_may_be_a_decimal_sign(tmp_path: Path) -> None:
     (tmp_path / "log.csv").write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
     with pytest.raises(UserError, match="line 2: 3 cells where the header has 2"):
         load(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "rate"),
+    [
+        ("Q10_duty.py", "2", 50.0),
+        ("Q10_duty.py", "3 1 10 100 7200", 100.0),
+        ("Q10_duty.py", "4 30 600 20 43200", 20.0),
+        ("Q04_fifobatch.py", "5", 112.0),
+        ("Q04_fifobatch.py", "6 96", 96.0),
+        ("Q04_fifobatch.py", "7 101", 101.0),
+        ("Q01_wrap24.py", "8", 100.0),
+    ],
+)
+def test_a_shared_case_of_stamps_has_its_noise(name: str, arguments: str, rate: float, tmp_path: Path) -> None:
+    """N 0.04 deg/s/sqrt(Hz) is within four sd of its posterior, as the likeliest law has it. None is lost awake."""
+    log = shared_case(name, tmp_path, *arguments.split())
+    recording = load(log)
+    assert recording.rate_hz == pytest.approx(rate, rel=1e-4)
+    assert bool(recording.missing_before.any()) == name.startswith("Q10")
+    axis = identify(log, axes=["gx"], suspicion=False)["axes"]["gx"]
+    law = max(axis["hypotheses"], key=lambda one: axis["hypotheses"][one])
+    noise = axis["parameters"][law]["N"]
+    assert abs(math.log(noise["median"] / 0.04)) < 4.0 * math.log(noise["q95"] / noise["q05"]) / 3.29
