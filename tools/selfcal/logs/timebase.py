@@ -26,7 +26,7 @@ _NO_GRID = 0.3
 #: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost.
 _NEARLY = 0.9
 #: The way on for stamps of no use.
-AS_THEY_COME = "--no-time --rate HZ takes the rows as they come"
+AS_THEY_COME = "--no-time --rate HZ takes the rows of one file as they come"
 
 #: Raises UserError for a row and what is wrong there.
 Fail = Callable[[int, str], NoReturn]
