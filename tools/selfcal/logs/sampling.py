@@ -299,7 +299,9 @@ def rate_changes(time: NDArray[np.float64]) -> list[Change]:
     steps = np.diff(time)
     # A burst after a stall makes up for it: samples of one rate, stamped late.
     late = (steps[max(0, one.row - 3) : one.row + 2].max() > _STEPS * max(one.before_s, one.after_s) for one in found)
-    return [] if any(late) else found
+    # Levels of coarse stamps may differ where their mean intervals do not.
+    same = (abs(math.log(one.after_s / one.before_s)) < 0.5 * _CHANGE for one in found)
+    return [] if any(late) or any(same) else found
 
 
 def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
@@ -541,7 +543,8 @@ def _scanned(
     """The dt of a scan's grid [m] with the best of its scores [m, slacks], if there is but one."""
     head = time[:_HEAD]
     each = scores.min(axis=1)
-    best = _on_lattice(grid, each, lattice)
+    repeats = bool((np.diff(head) < 0.5 * lattice).any())  # by an interval that is shorter than the lattice
+    best = int(each.argmin()) if repeats else _on_lattice(grid, each, lattice)
     reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
     same = np.abs(grid / grid[best] - 1.0) < reach
     rivals = grid[~same & (each < each[best] + _AS_GOOD)]
