@@ -22,6 +22,7 @@ from selfcal.bank.library import Bank
 from selfcal.bank.reference import identify_axis
 from selfcal.logs.recording import save
 from selfcal.model.file import Model, Prior
+from selfcal.model.laws import lost_of
 from selfcal.model.tables import make_tables
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -250,3 +251,13 @@ def test_both_engines_have_the_bias_of_the_last_sample(drift: tuple[str, dict[st
     assert ours.bias_mean == pytest.approx(theirs.bias_mean, abs=0.05 * theirs.bias_sd)
     assert ours.bias_sd == pytest.approx(theirs.bias_sd, rel=0.03)
     assert ours.bias_sd > 1.1 * before.bias_sd
+
+
+@pytest.mark.parametrize("block", [2, 7, 60, 3600])
+def test_lost_readings_of_a_drift_faster_than_the_readings(block: int) -> None:
+    """Readings 10 days apart beside drifts of seconds: the number goes over into its limit, 1, and stays there. Where
+    exp(-x / block) is 1e-6 to 1e-9 the exact form has digits left to show the same, to 2 block exp(-FORGOTTEN)."""
+    near = [lost_of(block * x, block) for x in (14.0, 18.0, 19.99, 20.01, 23.0)]
+    assert near == pytest.approx([1.0] * 5, abs=2e-6 + 2.0 * block * math.exp(-20.0))
+    for x in (750.0, 1e5, 1e12):
+        assert lost_of(block * x, block) == 1.0

@@ -253,3 +253,174 @@ def test_lossy_records_are_right_or_refused(lost: float, whole: bool, tmp_path: 
             for name, truth in (("N", n_true), ("K", k_true)):
                 sd = np.log(parameters[name]["q95"] / parameters[name]["q05"]) / 3.29
                 assert abs(np.log(parameters[name]["median"] / truth)) < 4.0 * sd
+
+
+# ------------------------------------------------------------------------------------------- sleeps, batches, rhythms
+
+
+@pytest.mark.parametrize(
+    ("awake_s", "every_s", "rate_hz", "length_s"),
+    [(3.0, 45.0, 64.0, 4000.0), (0.8, 9.0, 128.0, 1500.0), (45.0, 700.0, 16.0, 20_000.0), (25.0, 60.0, 50.0, 3000.0)],
+)
+@pytest.mark.parametrize("jitter", [0.0, 0.06])
+@pytest.mark.parametrize("off", [0.0, 0.37])
+def test_sleep_between_stretches_is_gaps(
+    awake_s: float, every_s: float, rate_hz: float, length_s: float, jitter: float, off: float
+) -> None:
+    """Stretches at the true rate, whose sleeps last whole intervals or `off` ones more. A gap is known to half an
+    interval; jitter of the first and the last stamp spreads over the samples of a stretch."""
+    random = np.random.default_rng(12)
+    place = np.arange(round(length_s * rate_hz))
+    kept = place[place / rate_hz % every_s < awake_s - 1e-9]
+    sleeps = np.concatenate([[0], np.cumsum(np.diff(kept) > 1)])
+    time = (kept + off * sleeps + jitter * random.standard_normal(kept.size)) / rate_hz
+    rate, missing = found(time)
+    assert rate == pytest.approx(rate_hz, rel=1e-9 if jitter == off == 0.0 else 2e-4)
+    assert missing == pytest.approx(kept[-1] - kept[0] + 1 - kept.size + off * sleeps[-1], abs=1 + missing * 2e-4)
+
+
+@pytest.mark.parametrize("size", [16, 25])
+@pytest.mark.parametrize("true_hz", [188.0, 193.0, 199.0, 204.5, 215.0, 231.0])
+def test_batches_stamped_by_a_nominal_step_have_the_rate_of_their_count(size: int, true_hz: float) -> None:
+    """A FIFO whose first sample has the time of its interrupt, the others follow by 1/208 s. Small holes or overlaps
+    lie between batches; no sample is lost. The interrupt comes 0.1 ms late, at random."""
+
+    def fail(row: int, why: str) -> NoReturn:
+        raise UserError(f"row {row}: {why}")
+
+    for seed in range(case_records(2, 20)):
+        random = np.random.default_rng([seed, size])
+        at = np.arange(size * 1200)
+        late = 1e-4 * random.standard_normal(1200).repeat(size)
+        time = np.round(at // size * size / true_hz + at % size / 208.0 + late, 6)
+        clock = clock_of("log.csv", time - time[0], 1e-9, None, fail)
+        # The first and the last batch bend the line by their part of 1200.
+        assert clock.rate_hz == pytest.approx(true_hz, rel=2.0 / 1200 * abs(true_hz / 208.0 - 1.0) + 1e-5)
+        assert int(clock.missing_before.sum()) <= 2
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+@pytest.mark.parametrize(("step_s", "digits"), [(0.1, 1), (0.01, 2), (0.25, 2)])
+def test_a_few_lost_samples_do_not_bend_the_rate(lost: int, step_s: float, digits: int) -> None:
+    """Stamps in whole intervals: one step of two is a lost sample, and not an interval that is longer by one in n."""
+    for seed in range(case_records(4, 40)):
+        random = np.random.default_rng([seed, lost, digits])
+        rows = int(random.integers(150, 5000))
+        kept = np.delete(np.arange(rows), random.choice(np.arange(1, rows - 1), lost, replace=False))
+        rate, missing = found(np.round(kept * step_s, digits))
+        assert (rate, missing) == (pytest.approx(1.0 / step_s, rel=1e-9), lost)
+
+
+@pytest.mark.parametrize(("rate_hz", "every"), [(50.0, 16), (125.0, 20), (40.0, 35)])
+def test_losses_in_a_rhythm_are_told_and_either_rate_can_be_stated(rate_hz: float, every: int, tmp_path: Path) -> None:
+    """One row of so many is missing: a sensor of the mean rate, whose stamps are rounded down to intervals, writes the
+    same. The line names both rates, and each can be given."""
+    kept = np.flatnonzero(np.arange(12_000) % every)
+    values = np.random.default_rng(3).standard_normal(kept.size)
+    log = tmp_path / "log.csv"
+    rows = "\n".join(f"{t:.6f},{value:.4f}" for t, value in zip(kept / rate_hz, values, strict=True))
+    log.write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    recording = load(log)
+    lost = int(np.ptp(kept)) + 1 - kept.size
+    assert (recording.rate_hz, int(recording.missing_before.sum())) == (pytest.approx(rate_hz, rel=1e-9), lost)
+    (note,) = recording.notes
+    assert f"1 sample in {every} is missing" in note
+    slower = float(note.split("--rate ")[1].split()[0])
+    assert slower == pytest.approx(rate_hz * (1.0 - 1.0 / every), rel=1e-5)
+    assert int(load(log, rate=slower).missing_before.sum()) == 0
+    assert int(load(log, rate=rate_hz).missing_before.sum()) == lost
+
+
+def test_a_stall_is_no_loss_and_no_sleep() -> None:
+    """Rows that wait for up to 1.5 s and then come at once, 0.4 ms apart: none is missing."""
+    for seed in range(case_records(3, 40)):
+        random = np.random.default_rng([seed, 81])
+        time = np.arange(9000) / 40.0
+        for begin in random.choice(np.arange(200, 8800, 200), 5, replace=False):
+            size = int(random.integers(8, 60))
+            time[begin : begin + size] = time[begin + size] - 4e-4 * np.arange(size, 0, -1)
+        rate, missing = found(time)
+        assert (rate, missing) == (pytest.approx(40.0, rel=1e-4), 0)
+
+
+# ------------------------------------------------------------------------------------------------ clocks that go back
+
+COUNT = 40_000
+PLACE = np.arange(COUNT)
+LATE = np.random.default_rng(21).integers(0, 700, COUNT)
+
+
+@pytest.mark.parametrize(
+    ("stamps", "unit", "rate_hz", "note"),
+    [
+        ((PLACE * 10_240 + 9_000_000) % 2**24, "us", 97.65625, "wraps 24 times like a 24-bit counter"),
+        (PLACE * 20 % 2**16, "ms", 50.0, "wraps 12 times like a 16-bit counter"),
+        (PLACE * 256 % 2**22 * 39.0625e-6, "s", 100.0, "goes back 2 times by 163.84 s"),
+        ((PLACE * 9973 + LATE) % 2**21, "us", 1e6 / 9973, "goes back 190 times by 2.097152 s"),
+        ((604_700_000 + PLACE * 50) % 604_800_000, "ms", 20.0, "goes back 1 time by a week"),
+        ((86_300.0 + PLACE / 80.0) % 86_400.0, "s", 80.0, "goes back 1 time by a day"),
+        ((3_000.0 + PLACE / 8.0) % 3_600.0, "s", 8.0, "goes back 2 times by an hour"),
+        (9_000.0 + PLACE / 80.0 - 3_600.0 * (PLACE > 23_456), "s", 80.0, "goes back 1 time by an hour"),
+        (PLACE[::-1] / 80.0, "s", 80.0, "newest first"),
+        ((PLACE * 20 % 2**16)[::-1], "ms", 50.0, "newest first"),
+    ],
+    ids=["24 bits", "16 bits", "22 bits of odd ticks", "21 bits", "week", "day", "hour", "summer time", "newest first",
+         "newest first of 16 bits"],
+)  # fmt: skip
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_clock_that_goes_back_goes_on(
+    stamps: Floats, unit: str, rate_hz: float, note: str, lost: bool, tmp_path: Path
+) -> None:
+    """No sample is missing but those that were taken out, of which none lies where the clock begins anew. Jitter of
+    0.07 intervals moves the mean rate by its share of the length."""
+    back = np.flatnonzero(np.abs(np.diff(stamps)) > 100.0 * np.median(np.abs(np.diff(stamps))))
+    kept = np.ones(COUNT, bool)
+    if lost:
+        kept[np.setdiff1d(np.arange(700, COUNT - 700, 1111), np.concatenate([back, back + 1]))] = False
+    log = tmp_path / "log.csv"
+    values = np.random.default_rng(5).standard_normal(COUNT)
+    rows = "\n".join(f"{t:.7f},{value:.4f}" for t, value in zip(stamps[kept], values[kept], strict=True))
+    log.write_text(f"t[{unit}],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    recording = load(log)
+    assert recording.rate_hz == pytest.approx(rate_hz, rel=1e-5)
+    assert int(recording.missing_before.sum()) == int((~kept).sum())
+    assert any(note in one for one in recording.notes)
+    expected = values[kept][::-1] if "newest" in note else values[kept]
+    assert recording.columns["gx"].values == pytest.approx(expected, abs=1e-4)
+
+
+@pytest.mark.parametrize("twice", [0, 150])
+@pytest.mark.parametrize("swapped", [0, 180])
+@pytest.mark.parametrize("lost", [0, 210])
+def test_rows_out_of_order_have_ways_that_work(twice: int, swapped: int, lost: int, tmp_path: Path) -> None:
+    """Rows written twice, neighbours swapped, rows lost: alone and together. One line names --skip-bad, by which each
+    row is in its place, and --no-time --rate, by which rows are as they come."""
+    random = np.random.default_rng([twice, swapped, lost])
+    rows, rate_hz = 20_000, 40.0
+    values = np.round(random.standard_normal(rows), 5)
+    order = np.delete(np.arange(rows), np.arange(77, rows - 9, 93)[:lost])
+    order = np.sort(np.concatenate([order, random.choice(order[1:-1], twice, replace=False)]))
+    for row in np.arange(40, rows - 500, 101)[:swapped]:
+        order[row], order[row + 1] = order[row + 1], order[row]
+    log = tmp_path / "log.csv"
+    text = "\n".join(f"{row / rate_hz:.3f},{values[row]:.5f}" for row in order.tolist())
+    log.write_text(f"t[s],gx[deg/s]\n{text}\n", encoding="utf-8")
+    sound = np.unique(order)
+    if twice or swapped:
+        with pytest.raises(UserError, match=r"line \d+: column 't': .*--skip-bad .*--no-time --rate HZ") as caught:
+            load(log)
+        assert "\n" not in str(caught.value)
+    recording = load(log, skip_bad=True)
+    assert recording.rate_hz == pytest.approx(rate_hz, rel=1e-9)
+    assert np.array_equal(recording.clock.place, sound)
+    assert np.array_equal(recording.columns["gx"].values, values[sound])
+    assert recording.damaged.messages == twice
+    assert load(log, rate=rate_hz, no_time=True).samples == order.size
+
+
+def test_empty_cells_at_regular_rows_are_missing_samples(tmp_path: Path) -> None:
+    """Every 90th cell is empty; the stamps of these rows are there, in tenths of a second."""
+    rows = "\n".join(f"{k / 10:.1f},{'' if k % 90 == 5 else k % 7}" for k in range(4000))
+    (tmp_path / "log.csv").write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    recording = load(tmp_path / "log.csv")
+    assert (recording.rate_hz, int(recording.missing_before.sum())) == (pytest.approx(10.0, rel=1e-9), 45)

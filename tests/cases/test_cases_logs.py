@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 import shlex
+import struct
 import subprocess
 import sys
 import time
@@ -225,6 +226,44 @@ def test_frames_by_a_database(suffix: str, drawn: logs.Drawn, tmp_path: Path) ->
     other.write_text(logs.DBC.replace("BO_ 2", "BO_ 3").replace("BO_ 5", "BO_ 6"), encoding="utf-8")
     with pytest.raises(UserError, match="no frame in it is a message of"):
         load(log, dbc=other)
+
+
+VEHICLE = """VERSION ""
+BU_: ECU
+BO_ 291 Motion: 8 ECU
+ SG_ Yaw_Rate : 0|16@1+ (0.01,-327.68) [0|0] "°/s" Vector__XXX
+ SG_ Acc_Y : 16|16@1- (0.002,0) [0|0] "g" Vector__XXX
+BO_ 801 Turns: 3 ECU
+ SG_ Which M : 0|8@1+ (1,0) [0|0] "" Vector__XXX
+ SG_ RollRate m0 : 8|16@1- (0.02,0) [0|0] "°/s" Vector__XXX
+ SG_ PitchRate m1 : 8|16@1- (0.02,0) [0|0] "°/s" Vector__XXX
+"""
+
+
+@pytest.mark.usefixtures("forked")
+def test_a_vehicle_s_rates_and_multiplexed_messages(tmp_path: Path) -> None:
+    """Yaw, roll and pitch are z, x and y; a multiplexer's two signals take turns. Truth: the counts in the frames. A
+    column that no message has is refused, and a message shorter than its database says is named."""
+    random = np.random.default_rng(14)
+    yaw, side, turn = (random.integers(-900, 900, 1000) for _ in range(3))
+    dbc, log = tmp_path / "car.dbc", tmp_path / "car.log"
+    dbc.write_bytes(VEHICLE.encode("latin-1"))
+    lines = []
+    for k in range(1000):
+        motion = struct.pack("<Hh", int(yaw[k]) + 32768, int(side[k])) + bytes(4)
+        lines.append(f"({1000 + k / 25:.6f}) can0 123#{motion.hex().upper()}")
+        lines.append(f"({1000.001 + k / 25:.6f}) can0 321#{struct.pack('<Bh', k % 2, int(turn[k])).hex().upper()}")
+    log.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    recording = load(log, dbc=dbc)
+    wanted = {"gz": 0.01 * yaw, "ay": 0.002 * side, "gx": 0.02 * turn[::2], "gy": 0.02 * turn[1::2]}
+    assert recording.columns.keys() >= wanted.keys()
+    for name, truth in wanted.items():
+        assert recording.columns[name].values == pytest.approx(truth, abs=1e-9)
+        assert recording.clock_of(name).rate_hz == pytest.approx(truth.size / 40.0, rel=1e-4)
+    with pytest.raises(UserError, match="there is no column 'Heave' for --column az=Heave"):
+        load(log, dbc=dbc, columns={"az": "Heave"})
+    log.write_text("\n".join([*lines, "(1041.000000) can0 321#0001"]) + "\n", encoding="utf-8")
+    assert any("left out: frames of Turns" in note for note in load(log, dbc=dbc).notes)
 
 
 @pytest.mark.parametrize("fine", [False, True])

@@ -522,8 +522,8 @@ def test_damaged_stamps_are_named_and_skipped(rate: float, stamps: str, tmp_path
 
 
 def test_other_faults_of_time_are_no_damaged_digits(tmp_path: Path) -> None:
-    """A clock that begins anew, a block of rows written twice, two sensors' stamps in turn: refused with --skip-bad as
-    without, and nothing is taken out."""
+    """A clock that begins anew, two sensors' stamps in turn: refused with --skip-bad as without, and nothing is taken
+    out. A block of rows written twice is refused, and left out with --skip-bad, which the message names."""
     log = tmp_path / "log.csv"
     rows = rows_of(600, 0.04, 5)
     anew = rows + rows
@@ -532,8 +532,14 @@ def test_other_faults_of_time_are_no_damaged_digits(tmp_path: Path) -> None:
     for made in (anew, twice, in_turn):
         log.write_text("t[s],gx[deg/s]\n" + "\n".join(made) + "\n")
         for skip_bad in (False, True):
-            with pytest.raises(UserError, match="column 't': time runs backwards"):
+            if made is twice and skip_bad:
+                assert load(log, skip_bad=True).samples == 600
+                continue
+            with pytest.raises(UserError, match="column 't': time runs backwards") as caught:
                 load(log, skip_bad=skip_bad)
+            assert ("--skip-bad" in str(caught.value)) == (made is twice)
+            assert "--no-time --rate HZ" in str(caught.value)
+            assert load(log, 25.0, no_time=True).samples == len(made)
 
 
 def test_a_file_of_other_lines_is_refused_all_the_same(tmp_path: Path) -> None:
@@ -743,3 +749,128 @@ def test_readings_far_beyond_the_range_ask_for_the_unit(tmp_path: Path, capfd: p
     with pytest.raises(UserError, match="beyond the range of 300 deg/s: is the unit right"):
         identify(tmp_path / "log.csv")
     assert "Warning" not in capfd.readouterr().err
+
+
+def in_turn(path: Path, head: str, words: Sequence[str], levels: Sequence[float], turn: int, rows: int) -> Path:
+    """Rows of sensors in turn, `turn` rows each at 40 Hz, a millisecond apart, told apart by a word."""
+    random = np.random.default_rng(8)
+    lines = [
+        f"{(k * turn + j) / 40.0 + 0.001 * place:.3f},{word},{level + 0.01 * random.standard_normal():.5f}"
+        for k in range(rows // turn)
+        for place, (word, level) in enumerate(zip(words, levels, strict=True))
+        for j in range(turn)
+    ]
+    path.write_text("\n".join([head, *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize("heading", ["source", "what", "Sensor Name", "msg"])
+@pytest.mark.parametrize("turn", [1, 12])
+@pytest.mark.parametrize("words", [("Gyro_A", "Gyro_B"), ("imu.left", "imu.right", "imu.mid")])
+def test_sensors_told_apart_by_a_word_are_never_mixed(
+    heading: str, turn: int, words: Sequence[str], tmp_path: Path
+) -> None:
+    """Whatever the column's name. Each way that the line names reads that sensor's rows alone."""
+    levels = [0.5 + 2.0 * k for k in range(len(words))]
+    log = in_turn(tmp_path / "log.csv", f"t[s],{heading},gx[deg/s]", words, levels, turn, 1200)
+    with pytest.raises(UserError, match="several sensors: give --source") as caught:
+        load(log)
+    for word, level in zip(words, levels, strict=True):
+        source = f"{heading}:{word}"
+        assert f"--source '{source}' (gx; 40 Hz" in str(caught.value)
+        recording = load(log, sources=[source])
+        assert (recording.samples, int(recording.missing_before.sum())) == (1200, 0)
+        assert recording.rate_hz == pytest.approx(40.0, rel=1e-9)
+        assert recording.columns["gx"].values == pytest.approx(level, abs=0.06)
+
+
+def test_axes_of_a_long_form_are_named_by_the_user(tmp_path: Path) -> None:
+    """Headings without a sensor's name or unit: one line leads on, and its ways read one sensor."""
+    log = in_turn(tmp_path / "log.csv", "time,kind,value", ("gyr", "acc"), (0.2, 9.8), 1, 900)
+    with pytest.raises(UserError, match=r"no sensor column .*--column gx=NAME, and --unit gx=UNIT"):
+        load(log)
+    options: dict[str, Any] = {"columns": {"gx": "value"}, "units": {"gx": "deg/s", "t": "s"}}
+    with pytest.raises(UserError, match="--source 'kind:gyr'"):
+        load(log, **options)
+    recording = load(log, sources=["kind:gyr"], **options)
+    assert recording.samples == 900 and recording.columns["gx"].values == pytest.approx(0.2, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        lambda k, r: "warn" if r.random() < 0.3 else "ok",
+        lambda k, r: "heat" if k // 150 % 2 else "cool",
+        lambda k, r: "pps" if k % 25 == 0 else "none",
+        lambda k, r: "start" if k == 0 else "run",
+    ],
+    ids=["at random", "for long", "seldom", "once"],
+)
+def test_a_state_in_words_is_no_sensor(word: Callable[[int, np.random.Generator], str], tmp_path: Path) -> None:
+    random = np.random.default_rng(2)
+    rows = "\n".join(f"{k / 50:.2f},{word(k, random)},{random.standard_normal():.4f}" for k in range(3000))
+    (tmp_path / "log.csv").write_text(f"t[s],state,gx[deg/s]\n{rows}\n", encoding="utf-8")
+    assert load(tmp_path / "log.csv").samples == 3000
+
+
+@pytest.mark.parametrize(
+    ("head", "row"),
+    [
+        ("t[s],gx[deg/s]", lambda t, g: f"{t:.3f},{g:.4f},"),
+        ("t[s],gx[deg/s]", lambda t, g: f'"{t:,.3f}",{g:.4f}'),
+        ("t[s];gx[deg/s]", lambda t, g: f"{t:.3f};{g:.4f};"),
+        ("sec,nanosec,gx[deg/s]", lambda t, g: f"{1_650_000_000 + int(t)},{round(t % 1 * 1e9)},{g:.4f}"),
+        ("stamp.secs,stamp.nsecs,gx[deg/s]", lambda t, g: f"{int(t)},{round(t % 1 * 1e9)},{g:.4f}"),
+        ("time,gx[deg/s]", lambda t, g: f"20230228T23{int(t) // 60 % 60:02d}{t % 60:06.3f},{g:.4f}"),
+    ],
+    ids=[
+        "a comma ends a row",
+        "thousands in quotes",
+        "a semicolon ends a row",
+        "seconds and ns",
+        "of ROS 1",
+        "compact",
+    ],
+)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_more_forms_of_text(head: str, row: Callable[[float, float], str], end: str, tmp_path: Path) -> None:
+    """The numbers that were written, from 1400 s on: thousands appear, minutes change. Lines end as on any system."""
+    values = np.round(white(4000, 0.3, 6), 4)
+    rows = [row(1400.0 + k / 8.0, value) for k, value in enumerate(values.tolist())]
+    log = tmp_path / "log.csv"
+    log.write_bytes((end.join([head, *rows]) + end).encode())
+    recording = load(log)
+    assert recording.rate_hz == pytest.approx(8.0, rel=1e-9)
+    assert np.array_equal(recording.columns["gx"].values, values)
+
+
+def test_a_comma_in_quotes_may_be_a_decimal_sign(tmp_path: Path) -> None:
+    """One comma and no point: refused, not guessed."""
+    rows = "\n".join(f'"{k},250",{k % 7}' for k in range(100))
+    (tmp_path / "log.csv").write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    with pytest.raises(UserError, match="line 2: 3 cells where the header has 2"):
+        load(tmp_path / "log.csv")
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "rate"),
+    [
+        ("Q10_duty.py", "2", 50.0),
+        ("Q10_duty.py", "3 1 10 100 7200", 100.0),
+        ("Q10_duty.py", "4 30 600 20 43200", 20.0),
+        ("Q04_fifobatch.py", "5", 112.0),
+        ("Q04_fifobatch.py", "6 96", 96.0),
+        ("Q04_fifobatch.py", "7 101", 101.0),
+        ("Q01_wrap24.py", "8", 100.0),
+    ],
+)
+def test_a_shared_case_of_stamps_has_its_noise(name: str, arguments: str, rate: float, tmp_path: Path) -> None:
+    """N 0.04 deg/s/sqrt(Hz) is within four sd of its posterior, as the likeliest law has it. None is lost awake."""
+    log = shared_case(name, tmp_path, *arguments.split())
+    recording = load(log)
+    assert recording.rate_hz == pytest.approx(rate, rel=1e-4)
+    assert bool(recording.missing_before.any()) == name.startswith("Q10")
+    axis = identify(log, axes=["gx"], suspicion=False)["axes"]["gx"]
+    law = max(axis["hypotheses"], key=lambda one: axis["hypotheses"][one])
+    noise = axis["parameters"][law]["N"]
+    assert abs(math.log(noise["median"] / 0.04)) < 4.0 * math.log(noise["q95"] / noise["q05"]) / 3.29

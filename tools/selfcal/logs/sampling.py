@@ -11,20 +11,17 @@ Stamps at random times, or in the bursts of a bus, lie on no grid. They have a m
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
-from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.special import betaln
 
-#: Rows looked at on either side of a long time step to tell missing samples from a late one.
-_NEIGHBOURS = 10
-#: Long steps looked at together, for the memory that they take.
-_AT_ONCE = 1 << 16
-#: Samples missing in a row that still count as a gap.
-_LONGEST_GAP = 2.0**53
+#: Intervals of a record at most.
+_LONGEST = 2.0**53
 #: Steps in one window of the first estimate.
 _WINDOW = 64
 #: Lattice step over interval from which stamps are coarse; below it a step of one interval is never taken for two.
@@ -47,34 +44,34 @@ _STEPS, _PIECES = 20, 500
 _PRICE_OF_PART = 40.0
 #: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
 _CHANGE = 0.015
-#: Stamps that need missing samples, or whose mean step is so much longer than the usual one, are asked for a grid.
-#: Without one a step of so many mean ones is a gap.
-_MEAN, _GAP = 1.2, 20.0
+#: Without a grid a step of so many mean ones is a gap.
+_GAP = 20.0
 #: Rows of a stretch, half turns in it that are tried to either side, stretches at most, and the least mean square
 #: length: jitter of 0.2 dt. Independent steps that spread by 0.15 dt and more stay below it.
 _STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
-#: Jitter hides lost samples from their neighbours where such a share of the steps is so far from whole intervals.
-_BLURRED_SHARE, _BLURRED = 0.1, 0.3
 #: Rows over which a grid's phase is followed.
 _PIECE_OF_GRID = 100
-#: A stated rate is checked against other grids where so many steps hold missing samples: places in one interval,
-#: places looked at, rows at least, intervals from 1/_OTHER to _OTHER times the stated one, and how far from it (ln).
-_SUSPECT, _FINE, _OTHER_PLACES, _OTHER_ROWS, _OTHER, _OTHER_APART = 0.1, 16, 1 << 21, 100, 4.0, 0.1
-#: A grid behind jitter: the slowest line, turns in the mean step; the least power of one, that of jitter of 0.3 dt; and
-#: the largest of random times over the power of their noise, e^-10 among a few thousand.
-_LINE_FIRST, _LINE_LEAST, _LINE_CHANCE = 0.9, 0.012, 25.0
+#: Places in one interval whose spectrum is taken, and places of it at most.
+_FINE, _OTHER_PLACES = 64, 1 << 22
+#: A grid behind jitter: the slowest and the fastest line, turns in the mean step, but for grids with little jitter; and
+#: the largest of random times over the power of their noise, e^-10 among a few thousand, which bins about it show.
+_LINE_FIRST, _LINE_LAST, _LINE_CHANCE, _LINE_ABOUT = 0.9, 4.0, 25.0, 64
 #: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
 #: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
 _ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
-#: Roundings of stamps, s, and how many of them an interval has at least that shows beside them.
-_ROUNDINGS, _ROUNDED = (1e-9, 1e-6, 1e-3), 20.0
 #: Steps of one lattice step that such a grid has at least, and their share over that of independent losses.
 _ONES, _ONES_SHARE = 20, 0.7
-#: A regular part: rows at least, the share of its steps that are near its interval, how near, how constant the medians
-#: of its steps and how far from the next part's (ln), and parts at most.
-_SHORT, _SHORT_SHARE, _SHORT_NEAR, _SHORT_APART, _SHORT_MOST = 2 * _STEPS, 0.9, 0.3, 0.1, 100
 #: Another dt with this many missing samples more or fewer is as good.
 _AS_GOOD = 5
+
+#: Steps between stretches of samples, in usual steps; samples of a stretch and gaps of a rhythm at least; the share of
+#: the gaps that keep to a rhythm.
+_ASLEEP, _AWAKE, _RHYTHM = 20.0, 20, 0.9
+#: Stamps come in bursts where so many steps are shorter than this share of the mean one.
+_SHORT_STEPS, _BURST = 0.3, 0.45
+#: Mean steps, times the samples of a burst, by which stamps may stray from a steady count; bursts' distances beyond
+#: which there is a gap.
+_STRAY, _BURST_GAP = 5.0, 8.0
 
 Found = tuple[float, NDArray[np.int64]]
 
@@ -84,40 +81,147 @@ class Ambiguous(ValueError):
 
 
 def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
-    """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing).
+    """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing but where
+    batches of one length overlap).
 
     `noise_s`: their rounding noise. `rate`: the stated rate (Hz) if there is one. Raises Ambiguous. Coarse stamps of a
     record with gaps take about a second and 10^6 rows another; all others are fast.
     """
     steps = np.diff(time)
+    asleep = _asleep(time, steps)
+    if asleep.any():
+        closed = np.where(asleep, _usual(steps), steps)
+        dt, missing = sampling(np.concatenate(([0.0], np.cumsum(closed))), noise_s, rate)
+        # No sleep moves the grid of all stretches from the stamps by more than half an interval.
+        place = np.cumsum(missing) + np.arange(time.size)
+        rows = np.flatnonzero(asleep) + 1
+        slept = np.rint(time[rows] / dt).astype(np.int64) - place[rows]
+        missing[rows] += np.diff(slept, prepend=0)
+        return _slope(np.cumsum(missing) + np.arange(time.size), time), missing
+    counted = _by_count(time, steps, rate)
+    if (steps < 0.0).any() and counted is None:
+        raise Ambiguous("the stamps fall, and their count is not steady")
+    if counted is not None and (steps != 0.0).all():
+        return counted
+    try:
+        return _on_even_grid(time, steps, noise_s, rate)
+    except Ambiguous:
+        if counted is None:
+            raise
+        return counted
+
+
+def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
+    """Interval and missing_before[n] of samples that were taken one by one. Raises Ambiguous."""
     changes = rate_changes(time) if rate is None else []
     if changes:
         dt = min(min(one.before_s, one.after_s) for one in changes)
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     window = max(1, min(_WINDOW, steps.size // 4))
     typical = float(np.median(time[window:] - time[:-window], overwrite_input=True)) / window
-    lattice = _lattice(steps, max(4.0 * noise_s, 1e-9 * typical))
+    lattice = common_step(steps, max(4.0 * noise_s, 1e-9 * typical))
     if lattice > _COARSE * typical:
         try:
             return _coarse(time, lattice, typical, rate)
         except Ambiguous:
             if rate is None:
-                raise  # a stated rate decides, and is checked by who knows it
-    elif rate is None:
-        grid = _lossy_grid(steps, lattice)
-        if grid > 0.0:
-            return _on_every_step(time, grid)
+                raise
+            return 1.0 / rate, _decode(time, 1.0 / rate, lattice)[0]
     if rate is not None and thinned_grid(time, 1.0 / rate):
         return _on_grid(time, 1.0 / rate)
-    first = _usual(steps) if rate is None else 1.0 / rate
-    dt, missing = _fine(time, steps, first)
-    if rate is None and (typical > _MEAN * first or missing.any()):
-        if not _even(time, dt):
-            dt = _line(time, typical, lattice)
-            return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
-        if _blurred(steps, dt):
-            return _on_grid(time, dt)
+    if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
+        return _on_every_step(time, lattice)
+    usual = _usual(steps)
+    if _in_batches(steps, usual):
+        return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
+    if _even(time, usual):
+        return _on_grid(time, usual)
+    mean = float(time[-1]) / steps.size
+    if np.ptp(time - mean * np.arange(time.size)) < mean:  # a count that is steady has lost no sample
+        return mean, np.zeros(time.size, np.int64)
+    dt = _line(time, typical, lattice)
+    return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
+
+
+def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """bool[n - 1]: the steps between stretches of an even grid, whatever they last; none for other stamps."""
+    usual = _usual(steps)
+    # Samples that come at once after a step make up for it.
+    long = (steps > _ASLEEP * usual) & (np.append(steps[1:], usual) > 0.5 * usual)
+    count = int(np.count_nonzero(long))
+    if not 0 < count * _AWAKE < steps.size:
+        return np.zeros_like(long)
+    closed = np.where(long, usual, steps)
+    even = np.abs(closed - usual) < 1e-3 * usual
+    lattice = common_step(closed, 1e-9 * usual)
+    shows = _even(np.cumsum(closed), usual) if lattice < _COARSE * usual else even.mean() > _RHYTHM
+    return long if shows else np.zeros_like(long)
+
+
+def _in_batches(steps: NDArray[np.float64], usual: float) -> bool:
+    """Whether steps of another length come in a rhythm and are no whole intervals: a batch is stamped by another
+    interval than its own."""
+    gaps = np.abs(steps - usual) > 0.15 * usual
+    if not in_rhythm(np.flatnonzero(gaps)):
+        return False
+    turns = steps[gaps] / float(steps[~gaps].mean())
+    off = turns - np.rint(turns)
+    return abs(float(off.mean())) > 5.0 * float(off.std()) / math.sqrt(off.size) + 1e-3
+
+
+def in_rhythm(rows: NDArray[np.int64]) -> bool:
+    """Whether rows, four or more apart, are as far apart from each other, but for one row."""
+    runs = np.diff(rows)
+    if runs.size < _AWAKE or np.median(runs) < 4:
+        return False
+    return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) >= _RHYTHM)
+
+
+def overlapping(time: NDArray[np.float64]) -> bool:
+    """Whether stamps fall in a rhythm, and go on from there: batches overlap. Where rows are swapped they catch up."""
+    steps = np.diff(time)
+    rows = np.flatnonzero(steps < 0.0)
+    around = time[np.minimum(rows + 4, time.size - 1)] - time[np.maximum(rows - 3, 0)]
+    return in_rhythm(rows) and float(np.median(around)) < 6.0 * float(np.median(steps))
+
+
+def _by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None) -> Found | None:
+    """Interval and missing_before of samples that arrive in bursts and are stamped on arrival, or in batches whose
+    stamps overlap; None for other stamps.
+
+    Of such stamps only the count over time is steady: it must follow one line, but for gaps between bursts.
+    """
+    if time.size < 3 * _AWAKE:
+        return None
+    at = np.linspace(0, time.size - 1, _AWAKE + 1).astype(int)
+    mean = float(np.median(np.diff(time[at]) / np.diff(at)))  # gaps are in few of the pieces
+    overlap = steps < 0.0
+    starts = np.flatnonzero(overlap if overlap.any() else steps > mean) + 1
+    if (np.mean(steps < _BURST * mean) < _SHORT_STEPS and not overlap.any()) or starts.size < _AWAKE:
+        return None
+    size = time.size / (starts.size + 1)
+    cuts = (np.flatnonzero(steps > _BURST_GAP * float(np.median(np.diff(time[starts])))) + 1).tolist()
+    index = np.arange(time.size)
+    dt = _slope(index, time, cuts) if rate is None else 1.0 / rate
+    parts = np.split(time - index * dt, cuts)
+    stray = [_STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt) for part in parts]
+    if any(float(np.ptp(part)) > most for part, most in zip(parts, stray, strict=True)):
+        return None
+    # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
+    reach = max(1, round(10.0 * size))
+    missing = np.zeros(time.size, np.int64)
+    for cut, (before, after) in zip(cuts, pairwise(parts), strict=True):
+        missing[cut] = max(0, round((after[:reach].min() - before[-reach:].min()) / dt))
     return dt, missing
+
+
+def _slope(index: NDArray[np.int64], time: NDArray[np.float64], cuts: Sequence[int] = ()) -> float:
+    """The slope of `time` against `index` by least squares, with a level of its own after each of the rows `cuts`."""
+    part = np.repeat(np.arange(len(cuts) + 1), np.diff([0, *cuts, time.size]))
+    count = np.bincount(part)
+    x = index - (np.bincount(part, index) / count)[part]
+    y = time - (np.bincount(part, time) / count)[part]
+    return float(x @ y / (x @ x))
 
 
 def _usual(steps: NDArray[np.float64]) -> float:
@@ -147,48 +251,26 @@ def thinned_grid(time: NDArray[np.float64], dt: float) -> bool:
     return _even(time, dt) and not _even(time, 2.0 * dt) and not _even(time, 3.0 * dt)
 
 
-def on_other_grid(time: NDArray[np.float64], dt: float, missing: NDArray[np.int64]) -> bool:
-    """Whether stamps lie on a grid whose interval is not the stated one, `dt`: they miss many samples of that one.
-
-    A grid is a line in the spectrum of the stamps, however many samples are lost. Its multiples are lines too."""
-    if np.count_nonzero(missing) < _SUSPECT * missing.size or _even(time, dt):
-        return False
-    turns, power = _spectrum(time, dt)
-    if not turns.size:
-        return False
-    lattice = _lattice(np.diff(time), 1e-9 * dt)
-    if lattice > _COARSE * dt:
-        return abs(math.log(lattice / dt)) > _OTHER_APART and _lossy(np.rint(np.diff(time) / lattice))
-    lines = turns[(power > _COHERENT) & (turns > 1.0 / _OTHER) & (turns < _OTHER)]
-    return lines.size > 0 and abs(math.log(lines[0])) > _OTHER_APART
-
-
-def _spectrum(time: NDArray[np.float64], dt: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Frequencies [m], turns in `dt`, and the power there of the first stamps, that of an exact grid being 1. Empty for
-    few stamps."""
-    head = time[:_STRETCH]
-    head = head[head < _OTHER_PLACES / _FINE * dt]
-    if head.size < _OTHER_ROWS:
-        return np.empty(0), np.empty(0)
-    stamped = np.bincount(np.rint(head * (_FINE / dt)).astype(np.int64))
-    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2 / head.size**2
-    return np.arange(power.size) * (_FINE / (2.0 * stamped.size)), power
-
-
 def _line(time: NDArray[np.float64], typical: float, lattice: float) -> float:
     """Interval, s, of a grid that jitter and losses hide from single steps; 0 if the stamps have none.
 
     A grid is a line in the spectrum of the stamps, jitter of the sd s dt leaves exp(-(2 pi s)^2) of its power. The
     stamps' own `lattice` is one as well. Of `typical`, the mean step, the grid may keep so many samples."""
-    turns, power = _spectrum(time, typical)
-    shown = (turns > _LINE_FIRST) & (turns < min(_OTHER, 0.5 * typical / max(lattice, 1e-300)))
+    head = time[:_STRETCH]
+    head = head[head < _OTHER_PLACES / _FINE * typical]
+    stamped = np.bincount(np.rint(head * (_FINE / typical)).astype(np.int64))
+    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2 / head.size**2
+    turns = np.arange(power.size) * (_FINE / (2.0 * stamped.size))
+    shown = (turns > _LINE_FIRST) & ((turns < _LINE_LAST) | (power > _COHERENT))
+    shown &= turns * lattice < 0.5 * typical
     if not shown.any():
         return 0.0
-    dt = typical / float(turns[int(np.argmax(np.where(shown, power, 0.0)))])
-    head = time[:_STRETCH]
+    at = int(np.argmax(np.where(shown, power, 0.0)))
+    dt = typical / float(turns[at])
+    noise = float(np.median(power[max(0, at - _LINE_ABOUT) : at + _LINE_ABOUT])) / math.log(2.0)
     # The spectrum is of rounded stamps, and so has images of a quicker line.
     exact = float(np.abs(np.exp(2j * math.pi * (head - head[0]) / dt).mean()) ** 2)
-    return dt if exact > max(_LINE_LEAST, _LINE_CHANCE / head.size) else 0.0
+    return dt if exact > _LINE_CHANCE * max(noise, 1.0 / head.size) else 0.0
 
 
 def _mean_grid(steps: NDArray[np.float64]) -> Found:
@@ -196,8 +278,7 @@ def _mean_grid(steps: NDArray[np.float64]) -> Found:
     dt = float(steps.mean())
     for _ in range(8):
         dt = float(steps[steps < _GAP * dt].mean())
-    missing = np.where(steps < _GAP * dt, 0, np.rint(steps / dt).astype(np.int64) - 1)
-    return dt, np.concatenate(([0], missing))
+    return dt, np.concatenate(([0], np.where(steps < _GAP * dt, 0, np.rint(steps / dt).astype(np.int64) - 1)))
 
 
 @dataclass(frozen=True)
@@ -213,48 +294,20 @@ class Change:
 def rate_changes(time: NDArray[np.float64]) -> list[Change]:
     """Every change of rate in stamps float64[n], s, in order of time.
 
-    Of regular stamps a rate that lasts _SHORT rows or more is seen if it differs by a tenth. Of others it must last two
-    pieces of n / _PIECES rows, or of 3 * _STEPS."""
-    return _regular_parts(time) or _parts(time)
-
-
-def _regular_parts(time: NDArray[np.float64]) -> list[Change]:
-    """The changes of rate of stamps whose steps are nearly all those of their part; none for other stamps."""
+    A rate must last two pieces of n / _PIECES rows, or of 3 * _STEPS; one that differs much, of _STEPS."""
+    found = _parts(time, 3 * _STEPS) or _parts(time, _STEPS)
     steps = np.diff(time)
-    if steps.size < 2 * _SHORT:
-        return []
-    level = median_filter(steps, 2 * _STEPS + 1, mode="nearest")
-    if not level.min() > 0.0:
-        return []
-    ln = np.log(level)
-    jump = np.abs(np.diff(ln))
-    rows = np.flatnonzero((jump > _SHORT_APART) & (jump == maximum_filter1d(jump, 5))) + 1
-    if not 0 < rows.size < _SHORT_MOST or np.diff(rows, prepend=0, append=steps.size).min() <= _SHORT:
-        return []
-    near = np.abs(steps / level - 1.0) < _SHORT_NEAR
-    spans = list(pairwise([0, *rows.tolist(), steps.size]))
-    # Medians within _STEPS rows of a change are the extremes of one part's steps.
-    inner = [ln[a + (_STEPS if a else 0) : b - (_STEPS if b < steps.size else 0)] for a, b in spans]
-    if any(near[a:b].mean() < _SHORT_SHARE for a, b in spans) or any(np.ptp(one) > _SHORT_APART for one in inner):
-        return []
     # A burst after a stall makes up for it: samples of one rate, stamped late.
-    edges = rows[:, None] + np.arange(-2, 3)
-    slower = np.maximum(level[rows - 1], level[rows])
-    if (steps[edges] > (1.0 + 2.0 * _SHORT_NEAR) * slower[:, None]).any():
-        return []
-    exact = [float(steps[a:b][near[a:b]].mean()) for a, b in spans]
-    scatter = max(1e-3, float(np.std(np.log(steps[near] / level[near]))))
-    found = []
-    for ((a, b), (c, d)), (before, after) in zip(pairwise(spans), pairwise(exact), strict=True):
-        nats = 0.5 * min(b - a, d - c) * (math.log(after / before) / scatter) ** 2
-        found.append(Change(b, before, after, min(1e6, nats)))
-    return found
+    late = (steps[max(0, one.row - 3) : one.row + 2].max() > _STEPS * max(one.before_s, one.after_s) for one in found)
+    # Levels of coarse stamps may differ where their mean intervals do not.
+    same = (abs(math.log(one.after_s / one.before_s)) < 0.5 * _CHANGE for one in found)
+    return [] if any(late) or any(same) else found
 
 
-def _parts(time: NDArray[np.float64]) -> list[Change]:
-    """The changes between parts of many rows, whose steps may be any on average."""
+def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
+    """The changes between parts of some pieces, which have `least` rows or more."""
     n = time.size
-    size = max(3 * _STEPS, n // _PIECES)
+    size = max(least, n // _PIECES)
     if n < 6 * size:
         return []
     steps = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
@@ -275,7 +328,8 @@ def _parts(time: NDArray[np.float64]) -> list[Change]:
     spans = [slice(a, b) for a, b in pairwise(ends)]
     if any(b - a < 2 * _STEPS for a, b in pairwise(ends)) or _lossy_parts(time, spans, level):
         return []
-    exact = [_mean_step(time[one.start : one.stop + 1], step) for one, step in zip(spans, level, strict=True)]
+    own = [np.diff(time[one.start : one.stop + 1]) for one in spans]
+    exact = [float(each[np.abs(each - step) < 0.5 * step].mean()) for each, step in zip(own, level, strict=True)]
     scatter = max(1e-3, _scatter(value, parts))
     return [
         Change(row, *intervals, min(1e6, 0.5 * n * math.log(intervals[1] / intervals[0]) ** 2 / scatter**2))
@@ -350,15 +404,8 @@ def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[floa
     return any(not _even(head, step) and _even(head, fastest) for head, step in heads)
 
 
-def _mean_step(time: NDArray[np.float64], step: float) -> float:
-    """Mean of the steps between stamps that are no gap of an even grid, `step` where the grid has none such."""
-    steps = np.diff(time)
-    whole = np.abs(steps - step) < 0.5 * step
-    return float(steps[whole].mean()) if whole.mean() > 0.5 else step
-
-
-def _lattice(steps: NDArray[np.float64], tolerance: float) -> float:
-    """Step (s) of the lattice that all time stamps lie on; 0 where there is none."""
+def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
+    """Step, s, of the lattice that all time stamps lie on: the steps are multiples of it. 0 where there is none."""
     ordered = steps[steps > tolerance]
     ordered.sort()
     if ordered.size == 0:
@@ -367,7 +414,11 @@ def _lattice(steps: NDArray[np.float64], tolerance: float) -> float:
     if starts.size > 1000:
         return 0.0
     distinct = np.add.reduceat(ordered, starts) / np.diff(starts, append=ordered.size)
-    lattice = float(min(distinct.min(), np.diff(distinct).min(initial=np.inf)))
+    lattice = 0.0
+    for step in distinct.tolist():
+        rest = step
+        while rest > 10.0 * tolerance:  # Euclid's algorithm
+            lattice, rest = rest, abs(lattice - rest * round(lattice / rest))
     times = np.rint(distinct / lattice)
     if (np.abs(distinct - times * lattice) > np.maximum(10.0 * tolerance, 0.01 * lattice)).any():
         return 0.0
@@ -377,29 +428,16 @@ def _lattice(steps: NDArray[np.float64], tolerance: float) -> float:
 # ------------------------------------------------------------------------------------------------------- fine stamps
 
 
-def _fine(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> Found:
-    """Missing samples for a first dt, and dt from the time against the index with those in it, until both stay."""
-    missing = _missing(time, steps, dt)
-    for _ in range(8):
-        dt = float(time[-1]) / (time.size - 1 + int(missing.sum()))
-        again = _missing(time, steps, dt)
-        if np.array_equal(again, missing):
-            break
-        missing = again
-    return dt, missing
-
-
-def _blurred(steps: NDArray[np.float64], dt: float) -> bool:
-    """Whether jitter makes many steps no multiple of the interval: the phase of the grid counts better then."""
-    turns = steps / dt
-    return float(np.mean(np.abs(turns - np.rint(turns)) > _BLURRED)) > _BLURRED_SHARE
-
-
 def _on_grid(time: NDArray[np.float64], dt: float) -> Found:
-    """The nearest places of a grid of about `dt` whose phase and rate are followed over pieces of the record."""
+    """The nearest places of a grid of about `dt` whose phase and rate are followed over pieces of the record.
+
+    A sample may be late, and none after it is then; it is not early."""
+    if not time[-1] < _LONGEST * dt:
+        raise Ambiguous(f"a step of {float(np.diff(time).max()):.3g} s among others of {dt:.3g} s")
     turns, _ = followed_phase(np.ones(time.size), time, 1.0 / dt, _PIECE_OF_GRID)
-    place = np.maximum.accumulate(np.rint(turns).astype(np.int64) - np.arange(time.size))
-    missing = np.diff(place, prepend=place[0])
+    place = np.rint(turns).astype(np.int64) - np.arange(time.size)
+    missing = np.diff(np.minimum.accumulate(place[::-1])[::-1], prepend=place.min())
+    missing[0] = 0
     return float(time[-1]) / (time.size - 1 + int(missing.sum())), missing
 
 
@@ -423,40 +461,15 @@ def followed_phase(
     return phase, float(np.abs(np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)).sum())
 
 
-def _missing(time: NDArray[np.float64], steps: NDArray[np.float64], dt: float) -> NDArray[np.int64]:
-    """missing_before[n]. A late sample makes one long step and then a short one; missing ones shift all that follows.
-
-    So the shift is taken from the earliest of the rows since the last long step to the earliest of those that follow.
-    """
-    missing = np.zeros(time.size, np.int64)
-    long = np.flatnonzero(steps > 1.5 * dt) + 1
-    if long.size == 0:
-        return missing
-    reach = np.arange(_NEIGHBOURS)
-    last = np.concatenate(([0], long[:-1]))  # first row since the long step before
-    for at in range(0, long.size, _AT_ONCE):
-        rows = long[at : at + _AT_ONCE, None]
-        before = np.maximum(rows - 1 - reach, last[at : at + _AT_ONCE, None])
-        after = np.minimum(rows + reach, time.size - 1)
-        # Relative to the row before the step, so that 10^8 rows cost no digits.
-        origin, start = rows - 1, time[rows - 1]
-        early = (time[before] - start - (before - origin) * dt).min(axis=1)
-        late = (time[after] - start - (after - origin) * dt).min(axis=1)
-        gaps = np.rint((late - early) / dt)
-        if not gaps.max() < _LONGEST_GAP:
-            raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {dt:.3g} s")
-        missing[rows[:, 0]] = np.maximum(0, gaps).astype(np.int64)
-    return missing
-
-
 # ----------------------------------------------------------------------------------------------------- coarse stamps
 
 
 def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: float | None) -> Found:
+    steps = np.rint(np.diff(time) / lattice)
     whole = _unbroken(time, lattice)
-    if whole is not None:
-        return whole, np.zeros(time.size, np.int64)
-    if rate is None and _lossy(np.rint(np.diff(time) / lattice)):
+    if whole is not None and not (steps.min() >= 1.0 and _rather_lossy(steps, lattice, whole, rate)):
+        return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
+    if whole is not None or _lossy(steps):
         return _on_every_step(time, lattice)
     low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
     head = time[:_HEAD]
@@ -464,36 +477,29 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     try:
         return _scanned(time, lattice, grid, scores)
     except Ambiguous:
-        thinned = _thinned(time, lattice, float(scores.min()), head.size) if low < lattice < high else None
-        if thinned is None:
+        if steps.min() < 1.0 or np.mean(steps > 1.0) > 0.1 or _is_tick(lattice):
             raise
-        return thinned
+        return _on_every_step(time, lattice)
 
 
-def _thinned(time: NDArray[np.float64], lattice: float, gaps: float, rows: int) -> Found | None:
-    """An even grid of one lattice step, samples lost here and there, if no dt makes do with clearly fewer gaps in the
-    first `rows` than it needs; `gaps`: the fewest of any. Of random losses some dt or other saves a few."""
-    steps = np.rint(np.diff(time) / lattice).astype(np.int64)
-    own = int((steps[: rows - 1] > 1).sum())
-    if steps.min() < 1 or own > gaps + 0.5 * math.sqrt(gaps) + _AS_GOOD:
-        return None
-    return _on_every_step(time, lattice)
+def _is_tick(lattice: float) -> bool:
+    """Whether a lattice is a clock's tick, 10^-k or 2^-k s, and not the interval itself."""
+    return min(abs(one - round(one)) for one in (math.log10(lattice), math.log2(lattice))) < 1e-6
 
 
-def _lossy_grid(steps: NDArray[np.float64], lattice: float) -> float:
-    """Interval, s, of an even grid that loses samples, of which each step is a multiple; 0 if there is none.
+def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate: float | None) -> bool:
+    """Whether a grid of one lattice step that lost samples is likelier than the unbroken one of the interval `whole`.
 
-    It is the `lattice`, or one far coarser than the rounding of the stamps."""
-    if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
-        return lattice
-    for rounding in _ROUNDINGS:
-        grid = _lattice(steps[:_PLACES], 2.5 * rounding)
-        if grid > _ROUNDED * rounding and _lossy(np.rint(steps / grid)):
-            # Two roundings make a step; the grid is known to one of them over many intervals.
-            off = np.abs(steps - np.rint(steps / grid) * grid)
-            if float(off.max()) < 2.0 * rounding:
-                return grid
-    return 0.0
+    Bayes: at an unknown share of losses B(m, n - m) for m gaps, and nearly pi^2/n^3 for one line of pixels. A lattice
+    that is no tick of a clock, but for this one, is the interval itself. A stated rate decides."""
+    if rate is not None:
+        return abs(rate * lattice - 1.0) < abs(rate * whole - 1.0)
+    gaps, n = int(np.count_nonzero(steps > 1.0)), steps.size
+    if not 0 < gaps < 0.1 * n:
+        return False
+    lossy = betaln(gaps, n + 1 - gaps) - math.log(10.0)
+    pixels = 2.0 * math.log(math.pi) - 3.0 * math.log(n)
+    return lossy > pixels or not _is_tick(lattice)
 
 
 def _lossy(steps: NDArray[np.float64]) -> bool:
@@ -537,7 +543,8 @@ def _scanned(
     """The dt of a scan's grid [m] with the best of its scores [m, slacks], if there is but one."""
     head = time[:_HEAD]
     each = scores.min(axis=1)
-    best = _on_lattice(grid, each, lattice, head.size)
+    repeats = bool((np.diff(head) < 0.5 * lattice).any())  # by an interval that is shorter than the lattice
+    best = int(each.argmin()) if repeats else _on_lattice(grid, each, lattice)
     reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
     same = np.abs(grid / grid[best] - 1.0) < reach
     rivals = grid[~same & (each < each[best] + _AS_GOOD)]
@@ -560,20 +567,20 @@ def _scanned(
     raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
 
 
-def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float, rows: int) -> int:
-    """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold."""
+def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float) -> int:
+    """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold. Of
+    random losses some dt or other saves a few."""
     best = int(each.argmin())
     times = np.rint(grid / lattice)
-    for k in np.flatnonzero((times > 0) & (np.abs(grid - times * lattice) < 1e-9 * grid)):
-        if each[k] <= each[best] + _AS_GOOD and each[k] <= max(3.0, 0.05 * rows):
-            return int(k)
-    return best
+    enough = each[best] + 0.5 * math.sqrt(each[best]) + _AS_GOOD
+    exact = np.flatnonzero((times > 0) & (np.abs(grid - times * lattice) < 1e-9 * grid) & (each <= enough))
+    return int(exact[0]) if exact.size else best
 
 
 def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
     """The mean step, if for some dt all stamps lie within a lattice step of an even grid without a gap; else None.
 
-    The span of what is left is a convex function of dt: a ternary search finds its least. The mean step is within
+    The span of what is left is a convex function of dt. The mean step is within
     lattice/duration of the true dt, which the dt of the least span need not be.
     """
     index = np.arange(time.size)
@@ -584,15 +591,12 @@ def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
         return float(left.max() - left.min())
 
     middle, reach = float(time[-1]) / (time.size - 1), 1.5 * lattice / (time.size - 1)
-    low, high = middle - reach, middle + reach
     if span(middle) < lattice:
         return middle
-    for _ in range(40):
+    low, high = middle - reach, middle + reach
+    for _ in range(40):  # a ternary search
         third = (high - low) / 3.0
-        if span(low + third) < span(high - third):
-            high -= third
-        else:
-            low += third
+        low, high = (low, high - third) if span(low + third) < span(high - third) else (low + third, high)
     return middle if span(0.5 * (low + high)) < lattice * (1.0 + 1e-6) else None
 
 

@@ -6,7 +6,6 @@ Stamps may be coarse or fine (`sampling.py`), come in bursts, or be those of a 3
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NoReturn
@@ -16,28 +15,18 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
-from selfcal.logs.sampling import Ambiguous, on_other_grid, sampling, thinned_grid
+from selfcal.logs.order import broken, mends
+from selfcal.logs.sampling import Ambiguous, common_step, in_rhythm, sampling, thinned_grid
 
-#: Rows, and repeats a row, from which on stamps may repeat for being coarser than the sampling interval.
-_REPEATS_FROM, _REPEATS_LEAST = 100, 0.005
-#: Counts of a counter that wraps, and the least count, and another that is not in the column's own unit, s. (One of ns
-#: would wrap every 4 s: such a step back is a restart.)
-_WRAPS_AT, _TICKS = 2.0**32, (1e-6, 1e-3)
-#: Median steps that a wrap may lie in a gap of.
-_WRAP_GAP = 1000.0
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
 #: median of two rows or more.
 _OWN_SHARE, _OWN_NEAR = 0.6, 0.3
-#: Stamps come in bursts where so many steps are shorter than this share of the mean one, and bursts there must be.
-_SHORT_SHARE, _SHORT, _BURSTS = 0.3, 0.45, 20
-#: Mean steps, times the samples of a burst, by which stamps in bursts may stray from a steady count; bursts' distances
-#: beyond which there is a gap.
-_STRAY, _BURST_GAP = 5.0, 8.0
-
-#: Damaged stamps: rows a stamp at least, in a row at most, and rows to either side that show which of them it is.
-_DAMAGED_APART, _DAMAGED_MOST, _DAMAGED_WITHIN = 20, 3, 16
-#: Share of a step by which it may miss the length that skipped lines give it: stamps are rounded.
-_EXACT = 1e-6
+#: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
+_NO_GRID = 0.3
+#: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost.
+_NEARLY = 0.9
+#: The way on for stamps of no use.
+AS_THEY_COME = "--no-time --rate HZ takes the rows of one file as they come"
 
 #: Raises UserError for a row and what is wrong there.
 Fail = Callable[[int, str], NoReturn]
@@ -104,77 +93,6 @@ class Clock:
         )
 
 
-def unwrapped(time: NDArray[np.float64], tick_s: float) -> tuple[NDArray[np.float64], int]:
-    """Stamps [n], s from the first, with the wraps of a 32-bit counter undone, and their number. `tick_s`: a count of
-    their column, s."""
-    back = np.flatnonzero(np.diff(time) < 0.0)
-    if not back.size or time.size < 3:
-        return time, 0
-    steps = np.diff(time)
-    most = _WRAP_GAP * float(np.median(np.abs(steps)))
-    for span in (_WRAPS_AT * tick for tick in (max(tick_s, _TICKS[0]), *_TICKS)):
-        on = steps[back] + span
-        if np.ptp(time) < span and ((on > 0.0) & (on <= min(most, 0.5 * span))).all():
-            turns = np.zeros(time.size)
-            turns[back + 1] = span
-            return time + np.cumsum(turns), int(back.size)
-    return time, 0
-
-
-def few(rows: int, of: int) -> bool:
-    """Whether so many rows may be damaged ones."""
-    return rows * _DAMAGED_APART <= of
-
-
-def damaged_stamps(time: NDArray[np.float64]) -> NDArray[np.int64]:
-    """int64[k]: the fewest rows without which the stamps [n] rise; where they repeat often, do not fall.
-
-    A digit that is wrong makes single stamps too early or too late. None where it takes many rows, or many in a row."""
-    steps = np.diff(time)
-    repeats = steps == 0.0
-    strict = not _repeats_often(repeats)
-    wrong = (steps <= 0.0) if strict else (steps < 0.0)
-    none = np.empty(0, np.int64)
-    if not wrong.any() or not few(int(np.count_nonzero(wrong)), 2 * time.size):
-        return none
-    near = np.zeros(time.size + 1, bool)
-    for row in np.flatnonzero(wrong):
-        near[max(0, row + 1 - _DAMAGED_WITHIN) : row + 1 + _DAMAGED_WITHIN] = True
-    near[-1] = False
-    edges = np.flatnonzero(np.diff(near, prepend=False))
-    found = []
-    for first, last in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
-        rows = np.delete(np.arange(first, last), _rising(time[first:last].tolist(), strict))
-        if (rows[_DAMAGED_MOST:] - rows[:-_DAMAGED_MOST] == _DAMAGED_MOST).any():
-            return none
-        found.append(rows)
-    damaged = np.concatenate(found)
-    left = np.diff(np.delete(time, damaged))
-    sound = left.size > 0 and bool((left > 0.0).all() if strict else (left >= 0.0).all())
-    return damaged if sound and few(damaged.size, time.size) else none
-
-
-def _rising(values: list[float], strict: bool) -> list[int]:
-    """Places of the longest subsequence that rises, or does not fall."""
-    ends: list[float] = []
-    at: list[int] = []
-    before: list[int] = []
-    for place, value in enumerate(values):
-        k = bisect_left(ends, value) if strict else bisect_right(ends, value)
-        before.append(at[k - 1] if k else -1)
-        ends[k : k + 1], at[k : k + 1] = [value], [place]
-    found = at[-1:]
-    while before[found[-1]] >= 0:
-        found.append(before[found[-1]])
-    return found[::-1]
-
-
-def _repeats_often(repeats: NDArray[np.bool_]) -> bool:
-    """Whether stamps are coarser than the sampling interval: repeats bool[n - 1] are no fault then."""
-    rows = repeats.size + 1
-    return rows >= _REPEATS_FROM and int(np.count_nonzero(repeats)) >= _REPEATS_LEAST * rows
-
-
 def has_own_clock(rows: NDArray[np.int64]) -> bool:
     """Whether the samples in these rows of a table are a slower channel's, or another sensor's between them."""
     if rows.size < 3:
@@ -192,31 +110,14 @@ def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
     return Clock(rate / every, np.maximum(np.diff(place, prepend=-1) - 1, 0), None, float(rows[0]) / rate)
 
 
-def clock_of(
-    path: object,
-    time: NDArray[np.float64],
-    noise_s: float,
-    rate: float | None,
-    fail: Fail,
-    skipped: NDArray[np.int64] | None = None,
-) -> Clock:
+def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail) -> Clock:
     """The clock of stamps [n], s from the first row of the recording. `noise_s`: their rounding. `rate`: as the user
-    states it. `skipped` [n]: lines without a stamp just before each. Raises UserError, by `fail` for a row."""
+    states it. Raises UserError, by `fail` for a row."""
     start = float(time[0])
     if not time[-1] <= LONGEST_S:
         _too_long(time, fail)
     time = time - start if start else time
-    rows = np.arange(time.size) if skipped is None else _with_skipped(time, skipped, noise_s)
-    if rows[-1] < time.size:
-        found, missing = _sampling(path, time, noise_s, rate, fail)
-    else:
-        every = np.interp(np.arange(rows[-1] + 1), rows, time)
-
-        def fail_row(row: int, what: str) -> NoReturn:
-            fail(int(np.searchsorted(rows, row)), what)
-
-        found, missing = _sampling(path, every, noise_s, rate, fail_row)
-        missing = np.diff((np.cumsum(missing) + np.arange(missing.size))[rows], prepend=missing[0] - 1) - 1
+    found, missing = _sampling(path, time, noise_s, rate, fail)
     lossy = 2 * np.count_nonzero(missing) > missing.size
     if rate is not None and (not 0.9 < found / rate < 1.1 or (lossy and not thinned_grid(time, 1.0 / rate))):
         raise _disagrees(path, rate)
@@ -231,46 +132,56 @@ def clock_of(
     return Clock(rate, missing, off_grid, start)
 
 
-def _with_skipped(time: NDArray[np.float64], skipped: NDArray[np.int64], noise_s: float) -> NDArray[np.int64]:
-    """int64[n]: places of the stamps [n] with a row for each skipped line that fills its step exactly."""
-    steps = np.diff(time, prepend=time[0])
-    usual = float(np.median(steps[1:]))
-    fills = np.abs(steps - (skipped + 1) * usual) <= max(4.0 * noise_s, _EXACT * usual)
-    rows = np.arange(time.size)
-    rows += np.cumsum(np.where(fills, skipped, 0))
-    return rows
-
-
 def _sampling(
     path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail
 ) -> tuple[float, NDArray[np.int64]]:
     """Rate in Hz and missing_before[n] of stamps [n], s from 0."""
+    fault = broken(time)
+    if fault is not None:
+        fail(fault[0], f"{fault[1]}: {_ways(time)}")
     steps = np.diff(time)
-    if steps.min() < 0.0:
-        row = int(next(iter(damaged_stamps(time)), np.argmax(steps < 0.0) + 1))
-        early = row > 0 and time[row] <= time[row - 1]
-        fail(row, "time runs backwards" if early else "the time stamp is later than the next one")
     repeats = steps == 0.0
-    if repeats.any() and (not _repeats_often(repeats) or repeats.all()):
-        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
-    bursts = _bursts(time, steps, rate)
-    if bursts is not None and not repeats.any():
-        return bursts
     try:
         dt, missing = sampling(time, noise_s, rate)
     except Ambiguous as error:
-        if bursts is not None:
-            return bursts
-        raise UserError(f"{path}: column 't': {error}: give --rate HZ") from error
-    if repeats.any() and dt > 0.999 * float(steps[~repeats].min()):  # not for being coarse
-        if bursts is not None:
-            return bursts
-        fail(int(np.argmax(repeats)) + 1, "the time stamp repeats")
+        way = f"{AS_THEY_COME}, where they are even" if (steps < 0.0).any() else "give --rate HZ"
+        raise UserError(f"{path}: column 't': {error}: {way}") from error
+    if repeats.any() and dt > 0.999 * float(steps[steps > 0.0].min()):  # not for being coarse
+        fail(int(np.argmax(repeats)) + 1, f"the time stamp repeats: {_ways(time)}")
     if not 0.0 < dt < math.inf:
         raise UserError(f"{path}: column 't' makes no even grid: is it the time?")
-    if rate is not None and bursts is None and on_other_grid(time, 1.0 / rate, missing):
-        raise _disagrees(path, rate)
     return float(f"{1.0 / dt:.10g}"), missing
+
+
+def remarks(clock: Clock) -> list[str]:
+    """A line on stamps that another clock explains as well, or that show no lost sample."""
+    rate, missing, off_grid = clock.rate_hz, clock.missing_before, clock.off_grid_s
+    if off_grid is None or off_grid.size < 3:
+        return []
+    gaps = np.flatnonzero(missing)
+    if gaps.size:
+        other = rate * missing.size / (missing.size + int(missing.sum()))
+        if not in_rhythm(gaps) or other < _NEARLY * rate:
+            return []
+        every = round(1.0 / (1.0 - other / rate))
+        other = float(f"{rate - rate / every:.6g}")
+        told = f"1 sample in {every} is missing, at regular intervals: a slower sensor's stamps are alike"
+        return [f"{told}: --rate {other:g} states that"]
+    steps = np.diff(clock.time_s + off_grid)
+    lattice = common_step(steps, 1e-9 / rate)
+    if _NEARLY < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:
+        other = float(f"{1.0 / lattice:.6g}")
+        told = f"stamps of {lattice:.4g} s: {other:g} Hz that loses 1 sample in {round(1.0 / (1.0 - rate * lattice))}"
+        return [f"{told} has the same: --rate {other:g} states that"]
+    if np.ptp(off_grid) * rate <= 1.0 or float(np.diff(off_grid).std()) * rate <= _NO_GRID:
+        return []
+    told = f"the stamps lie on no grid: their mean rate, {rate:.4g} Hz, is taken; no lost sample shows"
+    return [f"{told}: --rate HZ states another"]
+
+
+def _ways(time: NDArray[np.float64]) -> str:
+    """What to type for stamps that are out of order."""
+    return f"--skip-bad mends such rows and counts them; {AS_THEY_COME}" if mends(time) else AS_THEY_COME
 
 
 def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:
@@ -282,53 +193,3 @@ def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:
 
 def _disagrees(path: object, rate: float) -> UserError:
     return UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
-
-
-def _bursts(
-    time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None
-) -> tuple[float, NDArray[np.int64]] | None:
-    """Rate and missing_before of samples that arrive in bursts and are stamped on arrival; None for other stamps.
-
-    Of such stamps only the count over time is steady: it must follow one line, but for gaps between bursts.
-    """
-    if time.size < 3 * _BURSTS:
-        return None
-    mean = float(np.median(_window_means(time)))
-    short = steps < _SHORT * mean
-    starts = np.flatnonzero(steps > mean) + 1
-    if short.mean() < _SHORT_SHARE or starts.size < _BURSTS:
-        return None
-    size = time.size / (starts.size + 1)
-    apart = float(np.median(np.diff(time[starts])))
-    cuts = np.flatnonzero(steps > _BURST_GAP * apart) + 1
-    edges = np.concatenate(([0], cuts, [time.size]))
-    index = np.arange(time.size, dtype=np.float64)
-    dt = _common_slope(index, time, edges) if rate is None else 1.0 / rate
-    left = time - index * dt
-    levels = []
-    for begin, end in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
-        part = left[begin:end]
-        if float(np.ptp(part)) > _STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt):
-            return None
-        # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
-        reach = max(1, round(10.0 * size))
-        levels.append((float(part[:reach].min()), float(part[-reach:].min())))
-    missing = np.zeros(time.size, np.int64)
-    for cut, before, after in zip(cuts.tolist(), levels[:-1], levels[1:], strict=True):
-        missing[cut] = max(0, round((after[0] - before[1]) / dt))
-    return float(f"{1.0 / dt:.10g}"), missing
-
-
-def _window_means(time: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Mean steps over windows of a twentieth of the record: gaps are in few of them."""
-    at = np.linspace(0, time.size - 1, 21).astype(int)
-    return np.asarray(np.diff(time[at]) / np.diff(at))
-
-
-def _common_slope(index: NDArray[np.float64], time: NDArray[np.float64], edges: NDArray[np.int64]) -> float:
-    """The slope of `time` against `index` by least squares, with a level of its own between any two `edges`."""
-    part = np.repeat(np.arange(edges.size - 1), np.diff(edges))
-    count = np.bincount(part)
-    x = index - (np.bincount(part, index) / count)[part]
-    y = time - (np.bincount(part, time) / count)[part]
-    return float(x @ y / (x @ x))

@@ -1,4 +1,4 @@
-"""A recording as a table that reads back as it was: what `convert` writes.
+"""Recordings as files that `load` reads back, and a recording as a table that reads back as it was, for `convert`.
 
 A row is an instant at which a clock has a sample. `meta` has `clocks`: of each the rate, the start and the columns.
 Where samples are missing, or a clock has not every row, a column `sample` has the place of each on the even grid. Where
@@ -8,19 +8,25 @@ clock they are `sample_1` and `late_1`.
 
 from __future__ import annotations
 
+import gzip
+import json
+import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.base.errors import UserError
+from selfcal.base.errors import UserError, cell
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_COLUMNS, MOST_RATE_HZ
+from selfcal.base.output import together, whole
+from selfcal.logs.loaders import WRITTEN
+from selfcal.logs.loaders.table import meta_place
+from selfcal.logs.recorded import Recording
 from selfcal.logs.timebase import Clock
-
-if TYPE_CHECKING:
-    from selfcal.logs.recording import Recording
 
 Floats = NDArray[np.float64]
 Rows = NDArray[np.int64]
@@ -29,6 +35,8 @@ Rows = NDArray[np.int64]
 SAMPLE, LATE = "sample", "late"
 #: Stamps of several clocks closer than this, as a share of the fastest axes' interval, are one row.
 _ONE_ROW = 0.01
+#: Lines that are written at once; signs that separate columns, and so are none of a heading.
+_LINES, _SIGNS = 10_000, re.compile(r'[,;\t"]')
 #: What `meta` of the log says of the log's own table.
 _OF_TABLE = ("columns", "rows", "rate_hz")
 
@@ -146,3 +154,80 @@ def clocks_of(
             clock = Clock(rate, clock.missing_before, stamps - clock.time_s if late is None else stamps, start)
         found.append((names, clock, rows))
     return found
+
+
+def save(
+    path: Path | str,
+    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    rate_hz: float,
+    meta: Mapping[str, Any] | None = None,
+    t: NDArray[np.float64] | None = None,
+    lsb: Mapping[str, float] | None = None,
+    *,
+    exact: bool = False,
+) -> None:
+    """Write a recording that `load` reads back; the suffix (.csv, .csv.gz, .npz) chooses the form.
+
+    `columns`: name -> (unit, float[n]); a unit "" is none. `t` float[n], s: time stamps; None is an even grid from 0.
+    `meta`: JSON values, kept in the npz or beside the CSV file as LOG.meta.json. `lsb`: name -> size of one LSB in the
+    column's unit: npz stores such a column as whole numbers of it. CSV values carry 9 digits, with `exact` as many as a
+    float64 takes; an empty cell is NaN then. Raises UserError for an unwritable file.
+    """
+    path = Path(path)
+    described: dict[str, Any] = {**(meta or {}), "rate_hz": float(rate_hz)}
+    if path.suffix.lower() == ".npz":
+        _save_npz(path, columns, described, t, lsb or {})
+        return
+    if not path.name.lower().endswith((".csv", ".csv.gz")):
+        raise UserError(f"{path}: a written recording's name ends in {WRITTEN}")
+    n = len(next(iter(columns.values()))[1])
+    stamps = np.arange(n) / rate_hz if t is None else t
+    values = np.column_stack([stamps, *(values for _, values in columns.values())])
+    names = ",".join(["t[s]", *(_SIGNS.sub("_", cell(_heading(name, unit))) for name, (unit, _) in columns.items())])
+    with together(path, meta_place(path)) as (table, beside):
+        if exact:
+            _save_exact(table, names, values)
+        else:
+            np.savetxt(table, values, fmt=["%.12g"] + ["%.9g"] * len(columns), delimiter=",", header=names, comments="")
+        if meta is None:
+            beside.unlink()
+        else:
+            beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
+
+
+def _heading(name: str, unit: str) -> str:
+    return f"{name}[{unit}]" if unit else name
+
+
+def _save_exact(place: Path, header: str, values: NDArray[np.float64]) -> None:
+    """Write values [rows, columns] as CSV by their shortest texts that are read back to the bit."""
+    opened = gzip.open if place.suffix == ".gz" else open
+    with opened(place, "wt", encoding="utf-8") as file:
+        file.write(f"{header}\n")
+        for begin in range(0, len(values), _LINES):
+            lines = values[begin : begin + _LINES].tolist()
+            file.writelines(
+                ",".join("" if math.isnan(cell) else repr(cell).removesuffix(".0") for cell in line) + "\n"
+                for line in lines
+            )
+
+
+def _save_npz(
+    path: Path,
+    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    described: dict[str, Any],
+    t: NDArray[np.float64] | None,
+    lsb: Mapping[str, float],
+) -> None:
+    """Write the columns, whole numbers of an LSB where `lsb` has its size, and `described` as the member `meta`."""
+    arrays: dict[str, NDArray[Any]] = {} if t is None else {"t[s]": np.asarray(t, np.float64)}
+    described["columns"] = {}
+    for name, (unit, values) in columns.items():
+        if name in lsb:
+            counts = np.rint(np.asarray(values, np.float64) / lsb[name])
+            arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
+            described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
+        else:
+            arrays[_heading(name, unit)] = np.asarray(values, np.float64)
+    with whole(path) as temporary, temporary.open("wb") as stream:
+        np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)

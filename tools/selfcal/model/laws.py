@@ -171,6 +171,8 @@ def lost_of(x: float, block: int) -> float:
         return 0.0
     if x == 0.0:
         return (1.0 + 1.0 / block) / 6.0
+    if x > FORGOTTEN * block:
+        return 1.0  # to exp(-x / block): readings that do not correlate, and a process that has hardly any variance
     gain, rest = averaged(x, block)
     return (rest + (1.0 - gain + rest) / (block - 1.0)) / gain
 

@@ -1,6 +1,7 @@
 """Logs of CAN frames by framelog.py, decoded by cantools with the database of `--dbc`: a table a message.
 
-Signals are columns by their names and units. Stamps are the adapter's.
+Signals are columns by their names and units. Stamps are the adapter's. A multiplexed message gives a table for each
+set of signals.
 """
 
 from __future__ import annotations
@@ -27,28 +28,40 @@ def read(path: Path, hints: Hints) -> list[Table]:
     database = cantools.database.load_file(hints["dbc"], strict=False)
     if not isinstance(database, cantools.database.can.Database):
         raise UserError(f"{hints['dbc']}: not a database of CAN messages")
-    messages = {one.frame_id: one for one in database.messages if not one.is_multiplexed()}
-    stamps: dict[int, Any] = {}
-    values: dict[int, Any] = {}
+    messages = {one.frame_id: one for one in database.messages}
+    stamps: dict[tuple[int, tuple[str, ...]], Any] = {}
+    values: dict[tuple[int, tuple[str, ...]], Any] = {}
+    undecoded: set[str] = set()
     with FrameLog(path) as log:
         while (frame := log.recv(0.0)) is not None:
             message = messages.get(frame.arbitration_id)
-            if message is None or frame.is_remote_frame or frame.is_error_frame or len(frame.data) < message.length:
+            if message is None or frame.is_remote_frame or frame.is_error_frame:
                 continue
-            decoded = message.decode(bytes(frame.data), decode_choices=False, scaling=True)
-            assert isinstance(decoded, dict)
-            row = [decoded[signal.name] for signal in message.signals]
-            if all(isinstance(value, int | float) for value in row):
-                stamps.setdefault(frame.arbitration_id, array("d")).append(frame.timestamp)
-                values.setdefault(frame.arbitration_id, array("d")).extend(row)
+            try:
+                decoded = message.decode(bytes(frame.data), decode_choices=False, scaling=True)
+            except cantools.database.DecodeError:  # too short, or of no value that the database has
+                undecoded.add(message.name)
+                continue
+            if isinstance(decoded, dict) and all(isinstance(value, int | float) for value in decoded.values()):
+                of = frame.arbitration_id, tuple(decoded)  # the signals that a multiplexer chose
+                stamps.setdefault(of, array("d")).append(frame.timestamp)
+                values.setdefault(of, array("d")).extend(decoded.values())
     if not stamps:
         raise UserError(f"{path}: no frame in it is a message of {hints['dbc']}")
+    short = f"left out: frames of {', '.join(sorted(undecoded))}, which are shorter than the database states"
+    notes = (short,) if undecoded else ()
     tables = []
-    for number, times in stamps.items():
+    for (number, names), times in stamps.items():
         message = messages[number]
-        rows = np.array(values[number]).reshape(len(times), -1)
-        columns = {"t[s]": np.array(times)}
-        for place, signal in enumerate(message.signals):
-            columns[f"{signal.name}[{signal.unit}]" if signal.unit else signal.name] = rows[:, place]
-        tables.append(of_arrays(message.name, columns, damaged=log.damaged))
+        rows = np.array(values[number, names]).reshape(len(times), -1)
+        unit = {one.name: one.unit for one in message.signals}
+        columns = {f"{name}[{unit[name]}]" if unit[name] else name: rows[:, k] for k, name in enumerate(names)}
+        alone = sum(other == number for other, _ in stamps) == 1
+        source = message.name if alone else f"{message.name}/{_chosen(message, names)}"
+        tables.append(of_arrays(source, {"t[s]": np.array(times), **columns}, notes=notes, damaged=log.damaged))
     return tables
+
+
+def _chosen(message: Any, names: tuple[str, ...]) -> str:
+    """The signals of a multiplexed message that are not in all of its frames."""
+    return " ".join(one.name for one in message.signals if one.name in names and one.multiplexer_ids)

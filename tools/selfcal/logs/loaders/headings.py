@@ -22,6 +22,8 @@ from selfcal.base.options import Scale, parse_pairs
 _LONGEST_NAME = 120
 #: Headings of a time column that states its unit, or holds dates.
 TIMES = ("time", "timestamp")
+#: Name here of a second column of the time, which is added to the first.
+PART = "t+"
 #: Heading of the stamps that a serial monitor puts before a line.
 RECEIVED = "received"
 
@@ -82,6 +84,8 @@ _GYRO = (
 _ACCEL = r"(?:acc|accl|accel|accelerometer|acceleration|lin(?:ear)?[_ ]?acc(?:eleration)?|specific[_ ]?force|a)"
 #: The axis before the sensor: `X Accel`, `Z_GYRO_OUT`.
 _FIRST = rf"{_BEFORE}(?P<axis>[xyz])(?:[ _-]axis)?[ _-]?"
+#: A rate of turn by the axis of a vehicle.
+_VEHICLE = {"roll": "x", "pitch": "y", "yaw": "z"}
 #: Any heading with an axis: its unit tells of which sensor.
 _ANY = (
     r"(?P<source>.*?)[ ._/-]*(?P<axis>[xyz])(?:[ _-]?axis)?",
@@ -147,7 +151,8 @@ FORMS = (
     _Form("", _AXIS, (("Time", "s"),), file="accel"),
     # Everyone else's
     _Form(
-        (f"{_BEFORE}{_GYRO}{_AFTER}", f"{_FIRST}(?!g(?:_|$)|w){_GYRO}{_DATA}{_ENDS}"),
+        (f"{_BEFORE}{_GYRO}{_AFTER}", f"{_FIRST}(?!g(?:_|$)|w){_GYRO}{_DATA}{_ENDS}",
+         f"{_BEFORE}(?P<axis>roll|pitch|yaw)[ _-]?(?:ang(?:ular)?[ _-]?)?rate{_ENDS}"),
         (f"{_BEFORE}{_ACCEL}{_AFTER}", f"{_FIRST}(?!a(?:_|$)){_ACCEL}{_DATA}{_ENDS}"),
         (
             (r"#?time(?:[_ ]?stamp)?(?:_(?P<unit>\w+))?", None), (r"t(?:_(?P<unit>\w+))?", None),
@@ -233,7 +238,7 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
     free = _free(form, keys, taken)
     axes: dict[str, dict[str, Meaning]] = {}
     for letter, key, match, stated in _axes(form, free):
-        axis = match["axis"].lower()
+        axis = _VEHICLE.get(match["axis"].lower(), match["axis"].lower())
         name = letter + (axis if axis in "xyz" else "xyz"[int(axis) - (match[0][match.start("axis") - 1] in ":_")])
         source = (match.groupdict().get("source") or "").strip("/. ")
         axes.setdefault(source, {})[key] = Meaning(
@@ -299,6 +304,16 @@ def _time(form: _Form, keys: Sequence[str], taken: Mapping[str, str], source: st
                 continue
             if (match.groupdict().get("source") or source).strip("/. ") == source:
                 return {key: Meaning("t", stated or unit, form.count)}
+    return _in_two(keys, source)
+
+
+def _in_two(keys: Sequence[str], source: str) -> dict[str, Meaning]:
+    """The whole seconds of a source's time, and the nanoseconds in a column beside them; nothing without both."""
+    whole = {match[1]: key for key in keys if (match := re.fullmatch(r"(.*?)(?:secs?|seconds?)", key, re.IGNORECASE))}
+    for key in keys:
+        match = re.fullmatch(r"(.*?)(?:n|nano)(?:secs?|seconds?)", key, re.IGNORECASE)
+        if match is not None and match[1] in whole and source in match[1]:
+            return {whole[match[1]]: Meaning("t", "s"), key: Meaning(PART, "ns")}
     return {}
 
 

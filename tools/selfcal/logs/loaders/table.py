@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +41,39 @@ class Member:
 
 
 @dataclass(frozen=True)
+class Field:
+    """A column to be read: key in the file, name and unit here, size of its LSB (1 if it is in the unit itself)."""
+
+    key: str
+    name: str
+    unit: str
+    lsb: float
+    #: Nobody asked for it: a fault of it leaves it out.
+    optional: bool = False
+    #: Its cells are dates.
+    dates: bool = False
+
+
+@dataclass(frozen=True)
+class Rows:
+    """What is read of a table: raw `columns` float64[n] of the `fields`, NaN where there is no sample.
+
+    `fail(row, field, what)` raises UserError for a row of the file. `started`: what was taken off the stamps, in their
+    unit. `places` int64[n]: of each row among the lines of a text, some of which were skipped.
+    """
+
+    path: Path
+    fields: Sequence[Field]
+    columns: list[NDArray[np.float64]]
+    fail: Callable[[int, int | None, str], NoReturn]
+    meta: Mapping[str, Any]
+    started: float = 0.0
+    places: NDArray[np.int64] | None = None
+    notes: tuple[str, ...] = ()
+    damaged: Damaged = SOUND
+
+
+@dataclass(frozen=True)
 class Table:
     """Columns of one clock. `members` by heading: `name[unit]`, or a plain name whose unit `meta` has.
 
@@ -52,6 +86,56 @@ class Table:
     meta: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     damaged: Damaged = SOUND
+
+    #: Of a text: its name, headings, the lines before them, their line in messages, and the cells of the first row.
+    name: str = ""
+    headings: Sequence[str] = ()
+    before: Sequence[str] | None = None
+    line: str = ""
+    first: Sequence[str] = ()
+
+    @property
+    def keys(self) -> Sequence[str]:
+        """The headings."""
+        return self.headings or list(self.members)
+
+    @property
+    def where(self) -> str:
+        """What a message puts after the path."""
+        return self.line or (f"{self.source}: " if self.source else "")
+
+    def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
+        """The columns of the fields. Raises UserError."""
+        count = math.prod(self.members[fields[0].key].shape)
+        for one in fields:
+            member, column = self.members[one.key], f"{path}: {self.where}column '{one.name}'"
+            if len(member.shape) != 1:
+                raise UserError(f"{column} has {len(member.shape)} dimensions, not one")
+            if member.dtype.kind not in "iuf":
+                raise UserError(f"{column} holds no numbers (its type is {short(str(member.dtype))})")
+            if member.shape[0] != count:
+                raise UserError(f"{column} has {member.shape[0]} rows, '{fields[0].name}' has {count}")
+        if count < 2:
+            what = "one row only" if count else "no rows"
+            raise UserError(f"{path}: {self.where}{what}, a recording needs two or more")
+        if count * len(fields) > MOST_NUMBERS:
+            raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns")
+
+        def fail(row: int, number: int | None, what: str) -> NoReturn:
+            column = "" if number is None else f"column '{fields[number].name}': "
+            raise UserError(f"{path}: {self.where}row {row + 1}: {column}{what}")
+
+        started, columns = 0.0, list[NDArray[np.float64]]()
+        for one in fields:
+            array = self.members[one.key].read()
+            if one.name == "t" and array.dtype.kind in "iu":
+                # Time since an epoch in ns does not fit a float64; a difference of two int64 fits a uint64.
+                bits = array.astype(np.uint64 if array.dtype.kind == "u" else np.int64).view(np.uint64)
+                back, started = array[1:] < array[:-1], float(array[0])
+                steps = np.where(back, -(bits[:-1] - bits[1:]).astype(float), (bits[1:] - bits[:-1]).astype(float))
+                array = np.append(0.0, np.cumsum(steps)) if back.any() else bits - bits[0]
+            columns.append(array.astype(np.float64))
+        return Rows(path, fields, columns, fail, self.meta, started)
 
 
 def of_arrays(
@@ -84,6 +168,11 @@ def parse_meta(path: Path, text: str) -> Mapping[str, Any]:
     if not isinstance(meta, dict):
         raise UserError(f"{path}: meta: not a JSON mapping")
     return meta
+
+
+def meta_place(path: Path) -> Path:
+    """Where the metadata of a text recording stand: beside it. An npz holds its own."""
+    return path.with_name(path.name + ".meta.json")
 
 
 def content(path: Path) -> bytes:

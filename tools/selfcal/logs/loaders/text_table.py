@@ -15,6 +15,7 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from datetime import UTC, datetime
+from itertools import groupby, pairwise
 from pathlib import Path
 from typing import Any, BinaryIO, NoReturn, cast
 
@@ -35,7 +36,7 @@ from selfcal.base.limits import (
     reading,
 )
 from selfcal.logs.loaders.damage import Damaged
-from selfcal.logs.loaders.headings import RECEIVED
+from selfcal.logs.loaders.headings import RECEIVED, number_of
 
 #: Bytes of a file from which on reading it shows its progress.
 _SLOW_BYTES = 1 << 26
@@ -51,11 +52,16 @@ _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*", re.ASCII)
 #: A number and its unit, in one cell.
 _WITH_UNIT = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)? ([^\W\d_][\w/^]{0,20})\s*", re.ASCII)
 _QUOTED = ' "'
+#: A number in quotes whose thousands commas separate: without a point one comma may be the decimal sign.
+_THOUSANDS = re.compile(r'"[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:,\d{3}){2,})"', re.ASCII)
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 #: A cell that holds no sample.
 _MISSING = re.compile(r"(nan?|#?n/a|#nv|null|none|-+|\?)?", re.ASCII | re.IGNORECASE)
 #: A date with a time of day (ISO 8601), in quotes or not.
-_ISO = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d+)?)?(Z|[-+]\d\d:?\d\d)?", re.ASCII)
+_ISO = re.compile(
+    r"(?:\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?|\d{8}T\d{6}(?:[.,]\d+)?)(?:Z|[-+]\d\d:?\d\d)?",
+    re.ASCII,
+)
 #: A date or a time of day in any form.
 _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)
 #: A time of day with parts of a second; a date of any form before it, and a zone after it, say nothing more.
@@ -80,8 +86,10 @@ _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 #: A sampling rate in a comment, as Xsens writes it.
 _RATE = re.compile(r"(?:sampl\w+|update|output|data)[ _]?rate\W{1,4}(\d+(?:\.\d+)?) ?Hz", re.ASCII | re.IGNORECASE)
 
-#: Rows in which the numbers of several sensors are looked for, and so many sensors at most.
-_LOOKED_AT, _MOST_NUMBERED = 1000, 16
+#: Rows in which the sensors that take turns are looked for, so many sensors at most, and their names.
+_LOOKED_AT, _MOST_NUMBERED, _WORD = 1000, 16, re.compile(r"\w[\w ./:-]{0,59}")
+#: Turns of a sensor at least, its rows in one turn at most, and how many times as many another may have.
+_TURNS, _LONGEST_TURN, _SELDOM = 5, 64, 8
 
 #: What opens a text in an archive: its bytes, and its packed size.
 Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
@@ -94,7 +102,7 @@ class _Bad(Exception):
         self.place, self.what = place, what
 
 
-class TextTable:
+class TextReader:
     """A table being read: `keys` are its headings, `first` the cells of its first row, `where` the header's line."""
 
     def __init__(
@@ -138,6 +146,9 @@ class TextTable:
         headings = self._stated(self._headings(header))
         if len(headings) == len(self._cells(self._batch[0])) + 1 and headings[-1].strip().lower() == _COMMENT_OF_ROWS:
             del headings[-1]  # of LabVIEW, which writes the comment of a row only where there is one
+        cells = self._cells(self._batch[0])
+        if len(cells) == len(headings) + 1 and not cells[-1].strip():
+            headings.append("")  # a separator ends each row
         self.keys = [self._heading(cell, number, place) for place, cell in enumerate(headings)]
         self.first = [cell.strip(' "') for cell in self._cells(self._batch[0])]
 
@@ -158,14 +169,18 @@ class TextTable:
             return 0.0 if math.isnan(self._day[0]) else self._day[0]
         return (self._origin if self._origin.tzinfo else self._origin.replace(tzinfo=UTC)).timestamp()
 
-    def numbers_in(self, key: str) -> list[str]:
-        """The cells of a column among the first rows, each once, where the rows of a few of them take turns."""
-        place = self.keys.index(key)
-        cells = [
-            cells[place].strip(' "') for line in self._batch[:_LOOKED_AT] if len(cells := self._cells(line)) > place
-        ]
-        found = list(dict.fromkeys(cells))
-        return found if 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 and all(map(str.isalnum, found)) else []
+    def in_turn(self) -> list[tuple[str, str]]:
+        """The column by which the rows of several sensors take turns, and its cell for each of them; none of one."""
+        rows = [cells for line in self._batch[:_LOOKED_AT] if len(cells := self._cells(line)) == len(self.keys)]
+        numbering = number_of(self.keys)
+        for place, key in enumerate(self.keys):
+            cells = [row[place].strip(_QUOTED) for row in rows]
+            found = list(dict.fromkeys(cells))
+            if not 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 or not all(map(_WORD.fullmatch, found)):
+                continue
+            if key == numbering or not (any(map(_ROW.fullmatch, found)) or _keeps(cells)):
+                return [(key, cell) for cell in found]
+        return []
 
     def only(self, key: str, cell: str) -> None:
         """Read only the rows that have this cell in a column."""
@@ -307,6 +322,8 @@ class TextTable:
         return found[0] if found else ","
 
     def _cells(self, line: str) -> list[str]:
+        if self._separator == "," and _THOUSANDS.search(line):
+            line = _THOUSANDS.sub(lambda cell: cell[0].replace(",", ""), line)
         return line.split() if self._separator == " " else line.split(self._separator)
 
     def _headings(self, line: str) -> list[str]:
@@ -420,7 +437,7 @@ class TextTable:
         cells = self._cells(line)
         if len(cells) != len(self.keys):
             what = f"{len(cells)} cells where the header has {len(self.keys)}" if line.strip() else "an empty line"
-            raise _Bad(None, what)
+            raise _Bad(None, f"{what}: --skip-bad leaves such lines out")
         return cells
 
     def _value(self, text: str, place: int, dated: bool = False) -> float:
@@ -467,6 +484,20 @@ class TextTable:
             days += _DAY_S
         self._day = (second if math.isnan(first) else first, second, days)
         return second + days - self._day[0]
+
+
+def _keeps(cells: Sequence[str]) -> bool:
+    """Whether the words of a column last for many rows, come seldom, or come at random: they are no sensors."""
+    runs = [len(list(run)) for _, run in groupby(cells)]
+    rows_of = sorted(map(cells.count, set(cells)))
+    if len(runs) < _TURNS or sorted(runs)[len(runs) // 2] > _LONGEST_TURN or rows_of[0] * _SELDOM < rows_of[-1]:
+        return True
+    for word in set(cells):
+        rows = [row for row, cell in enumerate(cells) if cell == word]
+        steps = [b - a for a, b in pairwise(rows)]
+        if len(steps) < _TURNS or sum(step == sorted(steps)[len(steps) // 2] for step in steps) < len(steps) / 2:
+            return True
+    return False
 
 
 def is_date(cell: str) -> bool:
@@ -621,6 +652,8 @@ class _Lines:
         self.stream: BinaryIO | _Wide = stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
+        #: Lines end with CR alone, as on old Macs.
+        self._returns = False
         self._packed, self._unpacked = packed, 0
         self._skip_bad, self.no_text = skip_bad, False
         #: The lines are a serial monitor's, and what separates their columns.
@@ -631,7 +664,9 @@ class _Lines:
         while not self.unfinished:
             with reading(self.path, f"not a whole {'gzip' if self.path.suffix.lower() == '.gz' else 'zip'} file"):
                 block = self._block()
-            data = self._carry + block
+            if self._start and not self._carry:
+                self._returns = b"\r" in block[:-1] and b"\n" not in block
+            data = self._carry + (block.replace(b"\r", b"\n") if self._returns else block)
             end = data.rfind(b"\n") + 1 if block else len(data)
             self.unfinished = not block and bool(data)
             self._carry = data[end:]

@@ -1,17 +1,20 @@
-"""The texts of a recording: a file, or the tables in a zip that a phone's app writes."""
+"""The texts of a recording: a file, or the tables in a zip that a phone's app writes. A text is a table like others."""
 
 from __future__ import annotations
 
+import shlex
 import zipfile
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
-from typing import BinaryIO, cast
+from typing import BinaryIO, NoReturn, cast
 
-from selfcal.base.errors import UserError, printable
-from selfcal.base.limits import MOST_COLUMNS, reading
+from selfcal.base.errors import UserError, printable, shown
+from selfcal.base.limits import MOST_COLUMNS, MOST_META_BYTES, read_text, reading
 from selfcal.logs.loaders import TEXT, ZIP
-from selfcal.logs.loaders.text_table import Opened
+from selfcal.logs.loaders.table import Field, Rows, Table, meta_place, parse_meta
+from selfcal.logs.loaders.text_table import Opened, TextReader
 
 #: Where an app writes a sensor twice, the one to read comes first: what the part measured, before an estimate of it.
 _BETTER = (
@@ -32,6 +35,78 @@ class Text:
     source: str = ""
     optional: bool = False
     open: Opened | None = None
+
+
+#: Of a line of headings whether one of them is known.
+Knows = Callable[[Sequence[str]], bool]
+
+
+@dataclass(frozen=True)
+class TextTable(Table):
+    """A text, or its rows that have a cell `only` in a column. Its columns are read when they are wanted."""
+
+    text: Text = field(default_factory=lambda: Text(Path(), ""))
+    knows: Callable[[Text], Knows] = lambda _: lambda _: False
+    skip_bad: bool = False
+    only: tuple[str, str] | None = None
+
+    def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
+        path = self.text.path
+        meta = dict(self.meta)
+        with ExitStack() as files:
+            reader = TextReader(path, files, self.knows(self.text), skip_bad=self.skip_bad, opened=self.text.open)
+            if self.only is not None:
+                reader.only(*self.only)
+            dated = next((place for place, one in enumerate(fields) if one.dates), None)
+            pairs = [(one.key, one.name) for one in fields]
+            read = reader.columns(pairs, [one.optional for one in fields], dated)
+        fields = [one for one, column in zip(fields, read, strict=True) if column is not None]
+        columns = [column for column in read if column is not None]
+        rows = columns[0].size
+        if meta.get("rows", rows + reader.skipped) != rows + reader.skipped:
+            what = f"{rows} rows where {meta_place(path).name} says {shown(meta['rows'])}"
+            raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
+        skipped = "1 line is no row and was skipped"
+        if reader.skipped > 1:
+            skipped = f"{reader.skipped} lines are no rows and were skipped"
+        if "rate_hz" not in meta and (stated := reader.stated_rate()) is not None:
+            meta["rate_hz"] = stated
+
+        def fail(row: int, number: int | None, what: str) -> NoReturn:
+            if row in reader.restarts:
+                what = (
+                    f"{what.split(':')[0]}, where the header is repeated: the logger began anew; cut the log there, "
+                    f"head -n {reader.line_of(row) - 2} {shlex.quote(path.name)} > first.csv"
+                )
+            reader.fail(row, None if number is None else fields[number].name, what)
+
+        notes = (skipped,) if reader.skipped else ()
+        return Rows(path, fields, columns, fail, meta, reader.origin_s, reader.places, notes, reader.damaged)
+
+
+def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Table]:
+    """The tables of a text, or of the texts in a zip: one for each sensor whose rows take turns. Raises UserError."""
+    found: list[Table] = []
+    for text in texts_in(path):
+        try:
+            with ExitStack() as files:
+                reader = TextReader(text.path, files, knows(text), skip_bad=skip_bad, opened=text.open)
+                turns = reader.in_turn()
+        except UserError:
+            if text.optional:
+                continue
+            raise
+        beside = meta_place(text.path)
+        meta = parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text")) if beside.is_file() else {}
+        for only in turns or (None,):
+            source = "/".join(one for one in (text.source, ":".join(only or ())) if one)
+            found.append(
+                TextTable(
+                    source, {}, meta, name=text.name, headings=reader.keys, before=reader.before, line=reader.where,
+                    first=reader.first, text=text, knows=knows, skip_bad=skip_bad, only=only,
+                )
+            )  # fmt: skip
+    return found
 
 
 def texts_in(path: Path) -> list[Text]:

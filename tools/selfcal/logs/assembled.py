@@ -1,0 +1,262 @@
+"""A table's raw columns become a recording: units, the order of the rows, clocks."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base import units
+from selfcal.base.errors import UserError, short, shown
+from selfcal.base.limits import LONGEST_S, MOST_CLOCKS
+from selfcal.logs import written
+from selfcal.logs.headers import Header, number_in
+from selfcal.logs.loaders.damage import Damaged
+from selfcal.logs.loaders.headings import PART, split
+from selfcal.logs.loaders.table import Rows
+from selfcal.logs.order import few, in_order
+from selfcal.logs.recorded import Column, Recording, bridged, bridged_at
+from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
+
+Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Stamps:
+    """Stamps float64[n], s from the first one; their rounding; the first one, s. Fail raises UserError for a row."""
+
+    time: Floats
+    noise_s: float
+    started_s: float
+    fail: Callable[[int, str], Any]
+
+
+def assembled(rate: float | None, rows: Rows, header: Header, mend: bool) -> Recording:
+    """The recording of the rows of a table; it empties `rows.columns`: no second copy stays. `rate`: as the user states
+    it. `mend`: rows with a damaged stamp are left out, rows out of order are sorted. Raises UserError."""
+    columns: dict[str, Column] = {}
+    count = rows.columns[0].size
+    for number, field in enumerate(rows.fields):
+        raw = rows.columns.pop(0)
+        if np.isinf(raw).any():
+            rows.fail(int(np.argmax(np.isinf(raw))), number, "infinite")
+        with np.errstate(over="ignore"):
+            values = raw * field.lsb if field.lsb != 1.0 else raw
+        if np.isinf(values).any():
+            rows.fail(int(np.argmax(np.isinf(values))), number, f"infinite at {field.lsb:g} {field.unit} an LSB")
+        columns[field.name] = Column(field.name, field.unit, values)
+    _check_truth(rows.path, rows.meta)
+    stamps, part = columns.pop("t", None), columns.pop(PART, None)
+    if stamps is None:
+        rate = rate if rate is not None else _meta_rate(rows.path, rows.meta)
+        if rate is None:
+            mapped = f", map yours with --column t={shlex.quote(header.dated)}" if header.dated else ""
+            raise UserError(f"{rows.path}: there is no time column: add t[s]{mapped} or give --rate HZ")
+        return _on_clocks(rows, rate, columns, count, None, header)
+    if header.written and np.isfinite(stamps.values).all():
+        return _as_written(rows, columns, units.convert(stamps.values, stamps.unit, "s"), header)
+    ordered, kept = _ordered(rows, stamps, part, header, mend)
+    if kept.size < count or (np.diff(kept) < 0).any():
+        columns = {name: replace(one, values=one.values[kept]) for name, one in columns.items()}
+    return _on_clocks(rows, rate, columns, kept.size, ordered, header)
+
+
+def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header, mend: bool) -> tuple[_Stamps, Places]:
+    """The stamps in their order, and the rows of the table that they are of. `part`: what is added to the stamps."""
+    number = [field.name for field in rows.fields].index("t")
+    every = np.arange(stamps.values.size)
+    known = np.flatnonzero(np.isfinite(stamps.values))
+    if known.size < every.size and not (mend and few(every.size - known.size, every.size)):
+        rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
+    values = stamps.values[known] if known.size < every.size else stamps.values
+    tick_s = units.factor(stamps.unit, "s") * rows.fields[number].lsb
+    since = units.convert(values - values[0], stamps.unit, "s")
+    if part is not None:
+        since += units.convert(np.nan_to_num(part.values[known]), part.unit, "s")
+    order = in_order(since, tick_s, mend)
+    kept = known[order.rows]
+    if unknown := every.size - known.size:
+        header.notes.append(f"{unknown} line{'s were' if unknown > 1 else ' was'} skipped, without a time stamp")
+    header.damaged += Damaged(0, order.damaged + unknown)
+    header.notes += order.notes
+    size = np.abs(values).max(keepdims=True)
+    first = float(units.convert(np.array([rows.started + values[0]]), stamps.unit, "s")[0])
+    return (
+        _Stamps(
+            order.time - order.time[0],
+            float(np.abs(units.convert(np.spacing(size), stamps.unit, "s"))[0]),
+            first + float(order.time[0]),
+            lambda row, what: rows.fail(int(kept[row]), number, what),
+        ),
+        kept,
+    )
+
+
+def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: Header) -> Recording:
+    """The recording of columns with NaN, and stamps `t`, s, by the clocks that `meta` states."""
+    path, meta, fields = rows.path, rows.meta, rows.fields
+    marks = {field.key: columns[field.name].values for field in fields if field.name.endswith(" ")}
+    named = {split(field.key)[0]: field.name for field in fields if field.name in columns and field.key not in marks}
+    clocks = [
+        (names, clock, own)
+        for names, clock, own in written.clocks_of(path, meta, t, marks, rows.places)
+        if any(name in named for name in names)
+    ]
+    if not clocks:
+        raise UserError(
+            f"{path}: meta: its clocks are of no column of the table: convert the log again, or give --rate HZ"
+        )
+    _, main, main_rows = clocks[0]
+    of: dict[str, tuple[Clock | None, Places]] = dict.fromkeys(named.values(), (None, main_rows))
+    for names, clock, at in clocks[1:]:
+        other = replace(clock, start_s=clock.start_s - main.start_s)
+        of.update({named[name]: (other, at) for name in names if name in named})
+    made: dict[str, Column] = {}
+    for name in named.values():
+        own, at = of[name]
+        values = _at(columns[name].values, at)
+        if not np.isfinite(values).any():
+            header.notes.append(f"column '{name}' holds no number and is left out")
+            continue
+        if name not in header.sensors:
+            values = bridged(values) if own is None else bridged_at(own, values, main.time_s - main.start_s)
+            own = None
+        made[name] = replace(columns[name], values=values, clock=own)
+    if not any(name in header.sensors for name in made):
+        raise UserError(f"{path}: no sensor column holds a number")
+    started, notes = number_in(meta.get("started_s")), meta.get("notes")
+    of_log = [one for one in notes if isinstance(one, str) and one.isprintable()] if isinstance(notes, list) else []
+    return Recording(
+        path,
+        main.rate_hz,
+        made,
+        main.missing_before,
+        meta,
+        main.off_grid_s,
+        started_s=started if math.isfinite(started) else None,
+        notes=(*of_log, *header.notes, *remarks(main)),
+    )
+
+
+def _on_clocks(
+    rows: Rows, rate: float | None, columns: dict[str, Column], count: int, stamps: _Stamps | None, header: Header
+) -> Recording:
+    """The recording of columns with NaN in `count` rows at their stamps, or at `rate` without any.
+
+    Axes whose samples are spaced regularly, in two rows or more, get a clock of their own; the rows of the others are
+    those in which one of them has a sample.
+    """
+    known = {name: np.isfinite(column.values) for name, column in columns.items()}
+    header.notes += [f"column '{name}' holds no number and is left out" for name, has in known.items() if not has.any()]
+    axes = {name: has for name, has in known.items() if name in header.sensors and has.any()}
+    if not axes:
+        raise UserError(f"{rows.path}: no sensor column holds a number")
+    at, own = _sampled(rows.path, axes)
+    main = _clock_at(rows, rate, at, stamps, count)
+    clocks: dict[int, Clock] = {}
+    made: dict[str, Column] = {}
+    missing: dict[str, int] = {}
+    for name, column in columns.items():
+        has = known[name]
+        if name in own:
+            if (key := id(own[name])) not in clocks:
+                clock = _clock_at(rows, None if stamps is not None else rate, np.flatnonzero(has), stamps, count)
+                clocks[key] = replace(clock, start_s=clock.start_s - main.start_s)
+            made[name] = replace(column, values=column.values[has], clock=clocks[key])
+        elif name in axes:
+            made[name] = replace(column, values=_at(column.values, at))
+            missing[name] = count - int(has.sum())
+        elif has.any():
+            place = np.arange(count, dtype=np.float64) if stamps is None else stamps.time
+            values = column.values if has.all() else np.interp(place, place[has], column.values[has])
+            made[name] = replace(column, values=_at(values, at))
+    told = ", ".join(f"{name} {cells}" for name, cells in missing.items() if cells)
+    if told:
+        header.notes.append(f"of {count} rows cells without a number, taken as missing samples: {told}")
+    return Recording(
+        rows.path,
+        main.rate_hz,
+        made,
+        main.missing_before,
+        rows.meta,
+        main.off_grid_s,
+        started_s=None if stamps is None else stamps.started_s + main.start_s,
+        notes=(*header.notes, *(remarks(main) if rate is None else [])),
+        damaged=header.damaged,
+    )
+
+
+def _sampled(path: Path, axes: Mapping[str, NDArray[np.bool_]]) -> tuple[Places, dict[str, list[str]]]:
+    """The rows of the recording's clock, and for each axis with a clock of its own those that share it. `axes`: where
+    each has a sample, bool[rows]."""
+    patterns: dict[bytes, list[str]] = {}
+    for name, has in axes.items():
+        if not has.all() and has_own_clock(np.flatnonzero(has)):
+            patterns.setdefault(np.packbits(has).tobytes(), []).append(name)
+    if len(patterns) > MOST_CLOCKS:
+        raise UserError(f"{path}: more than {MOST_CLOCKS} patterns of empty cells: no recording has so many rates")
+    own = {name: names for names in patterns.values() for name in names}
+    common = [has for name, has in axes.items() if name not in own]
+    if common:
+        at = np.flatnonzero(np.logical_or.reduce(common))
+    else:  # the fastest of them is the recording's
+        fastest = max(patterns.values(), key=lambda names: int(axes[names[0]].sum()))
+        at = np.flatnonzero(axes[fastest[0]])
+        own = {name: names for name, names in own.items() if names is not fastest}
+    if at.size < 2:
+        what = f"{at.size} row{'s' if at.size > 1 else ''} with a sample"
+        raise UserError(f"{path}: {what}, a recording needs two or more")
+    return at, own
+
+
+def _clock_at(rows: Rows, rate: float | None, at: Places, stamps: _Stamps | None, count: int) -> Clock:
+    """The clock of the samples in the rows `at` of so many."""
+    if stamps is None:
+        assert rate is not None
+        lines = at if rows.places is None else rows.places[at]
+        if lines[-1] / rate > LONGEST_S:
+            what = f"{lines[-1] + 1} rows at {rate:g} Hz: a recording spans at most {LONGEST_S:g} s"
+            raise UserError(f"{rows.path}: {what}")
+        return clock_of_rows(lines, rate)
+    time = stamps.time
+    if count - at.size > 0 and few(count - at.size, count):
+        empty = np.setdiff1d(np.arange(1, count - 1), at)
+        steps = np.diff(time)
+        if empty.size and np.median(np.minimum(steps[empty - 1], steps[empty])) > 0.75 * np.median(steps):
+            # Rows without a sample are of the same clock: their stamps show that a sample is missing.
+            return clock_of(rows.path, time, stamps.noise_s, rate, stamps.fail).of_rows(at, 0.0)
+    return clock_of(rows.path, _at(time, at), stamps.noise_s, rate, lambda row, what: stamps.fail(int(at[row]), what))
+
+
+def _at(values: Floats, rows: Places) -> Floats:
+    """Values in these rows, in order and each once; no copy where they are all."""
+    return values if rows.size == values.size else values[rows]
+
+
+def _meta_rate(path: Path, meta: Mapping[str, Any]) -> float | None:
+    if "rate_hz" not in meta:
+        return None
+    rate = number_in(meta["rate_hz"])
+    if not (np.isfinite(rate) and rate > 0.0):
+        raise UserError(f"{path}: meta: 'rate_hz' must be a number above 0")
+    return rate
+
+
+def _check_truth(path: Path, meta: Mapping[str, Any]) -> None:
+    """What a simulated recording says of itself: by axis, texts and finite numbers."""
+    truth = meta.get("truth", {})
+    if not isinstance(truth, dict) or not all(isinstance(entry, dict) for entry in truth.values()):
+        raise UserError(f"{path}: meta: 'truth' must be a mapping of axes")
+    for axis, entry in truth.items():
+        for key, value in entry.items():
+            if key == "units" or (isinstance(value, str) and len(value) <= 60 and value.isprintable()):
+                continue
+            if not math.isfinite(number_in(value)):
+                raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {shown(value)}")
