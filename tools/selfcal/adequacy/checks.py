@@ -184,7 +184,8 @@ def with_readings(
     `saturation`, if some are clipped: their share, and the `at` of the limit.
     `outliers`, if one value recurs too often: the share of these readings, and the value `at` which.
     `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
-    `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
+    `motion`, if the sensor moved: the share of these readings, and the `intervals` in s. It passes where the noise of
+    averages is the same with them, within its own scatter.
     `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the largest
     change of the sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
     """
@@ -206,7 +207,8 @@ def with_readings(
     if readings.moved is not None:
         share, start_s = float(readings.moving.mean()), readings.recording.start_s
         times = [[a + start_s, b + start_s] for a, b in readings.moved.intervals]
-        checks["motion"] = {"value": share, "limit": 0.0, "passed": False, "intervals": times}
+        passed = not readings.matters(max(1, round(dt_s * readings.recording.rate_hz)))
+        checks["motion"] = {"value": share, "limit": 0.0, "passed": passed, "intervals": times}
     if as_fed:
         if readings.stuck.any():
             checks["stuck"] = {"value": float(readings.stuck.mean()), "limit": 0.0, "passed": False}

@@ -112,7 +112,6 @@ class Cause:
     unsure       words instead where the estimate has `source`: which axis is the source is not shown.
     looks        candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
     most         times at most that the loop names it on an axis; 0: as often as it is found.
-    before_motion  looks that motion must not be taken for: they come before motion.
     slow         a drift of another law may show it: `identify` weighs more laws.
     alike        whether two looks on two axes are one cause with its size on each.
     settle       after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
@@ -147,7 +146,6 @@ class Cause:
     unsure: str = ""
     looks: Looks | None = None
     most: int = 0
-    before_motion: Looks | None = None
     slow: bool = False
     alike: Callable[[Look, Look], bool] = _never
     settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None

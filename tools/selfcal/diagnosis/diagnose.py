@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from selfcal.adequacy.document import parameters_entry, recording_entry, regressors_entry, since
-from selfcal.adequacy.identify import identify_axis, moved_beside
+from selfcal.adequacy.identify import identify_axis
 from selfcal.base.ending import Held, Stopped, abandon
 from selfcal.base.errors import UserError, note, printable
 from selfcal.base.progress import Doing
@@ -28,7 +28,6 @@ from selfcal.diagnosis.verdict import of_checks
 from selfcal.likelihood import work
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
-from selfcal.readings.readings import look
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
@@ -156,9 +155,6 @@ def add_posteriors(document: dict[str, Any], recording: Recording, model: Model,
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     findings = [finding for axis in axes.values() for finding in axis["findings"]]
     moved = [one for finding in findings if finding["cause"] == "motion" for one in finding["estimate"]["intervals"]]
-    for name in axes if moved else ():
-        own = recording.along(name)
-        moved += moved_beside(own, model, name, look(own, name, model.group_of(name)))
     rest = recording.without(moved)
     for name, axis in axes.items():
         axis["posterior"] = None if ending.asked else _posterior(rest, name, model)

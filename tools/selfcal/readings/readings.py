@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
+from selfcal.base.grid import block_means, equal_runs, runs
 from selfcal.logs.recording import Column, Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
@@ -24,7 +25,7 @@ from selfcal.readings.codes import Uneven, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of
 from selfcal.readings.lost_words import Recurring, recurring_of
-from selfcal.readings.motion import Moved, loud
+from selfcal.readings.motion import Moved, loud, moves_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -86,9 +87,6 @@ class Clipped:
 ROUNDED = 1e-5
 #: Share of readings beyond the range from which on the others are no readings of a sensor either.
 MOST_BEYOND = 0.5
-#: An axis moves with others if its mean square is so many standard deviations above that of the rest. A wild reading
-#: counts as so many of it at most.
-LOUDER_SD, WILD = 6.0, 30.0
 
 
 @dataclass(frozen=True)
@@ -141,28 +139,14 @@ class Readings:
         noise = float(np.diff(values).std()) / math.sqrt(2.0) if values.size > 2 else 0.0
         return float(np.spacing(largest)) / noise if noise > 0.0 and np.isfinite(largest) else 0.0
 
-    def without(self, moved: Sequence[Sequence[float]]) -> Readings:
-        """The same where other axes show that the sensor moved: stretches, seconds of the whole recording. An axis that
-        shows no motion of its own must be louder in them than in the rest."""
-        time, mask = self.recording.start_s + self.recording.time_s, self.moving.copy()
-        for begin_s, end_s in moved:
-            mask |= (time >= begin_s) & (time < end_s)
-        if not moved or (self.moved is None and not self._louder(mask)):
-            return self
-        working, times = np.where(mask, np.nan, self.working), tuple(_intervals(self.recording, mask))
-        found = Moved(times, 0.0, 0.0) if self.moved is None else replace(self.moved, intervals=times)
-        return replace(self, moving=mask, working=working, moved=found)
-
-    def _louder(self, mask: Mask) -> bool:
-        """Whether differences of neighbours are larger inside a mask [n] than outside, beyond chance."""
-        square = np.diff(self.working) ** 2
-        inside, outside = square[mask[1:]], square[~mask[1:]]
-        inside, outside = inside[np.isfinite(inside)], outside[np.isfinite(outside)]
-        if not inside.size or not outside.size:
-            return False
+    def matters(self, block: int) -> bool:
+        """Whether the readings that moved change the noise of means of `block` readings by more than its scatter."""
+        square = np.diff(block_means(np.where(self.stuck, np.nan, self.values), block)) ** 2
+        moved = block_means(self.moving.astype(np.float64), block) > 0.0
+        rest = square[np.isfinite(square) & ~(moved[1:] | moved[:-1])]
         # A squared difference of normal noise scatters by 1.7 times its mean: the two neighbours share a reading.
-        least = 1.0 + LOUDER_SD * math.sqrt(3.0 / inside.size)
-        return bool(np.minimum(inside, WILD * outside.mean()).mean() > least * outside.mean())
+        most = (1.0 + math.sqrt(3.0 / max(rest.size, 1))) * float(np.mean(rest)) if rest.size else 0.0
+        return float(np.nanmean(square)) > most
 
     @property
     def intervals(self) -> list[list[float]]:
@@ -180,10 +164,7 @@ def look(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis at the part's own rate. O(n log n)."""
     even, changes = evened(recording)
     own, found = thinned(even, (axis,))
-    seen = replace(readings_of(own, axis, group), held=found, changes=changes)
-    times = () if seen.moved is None else seen.moved.intervals
-    recording.motion_seen[axis] = [[a + own.start_s, b + own.start_s] for a, b in times]
-    return seen
+    return replace(readings_of(own, axis, group), held=found, changes=changes)
 
 
 def within(values: NDArray[np.floating[Any]], group: Group) -> Mask:
@@ -229,7 +210,7 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
     clipped = _clipped(sound, lattice)
     whole = sound if clipped is None else _unclipped(sound, clipped, lattice)[1]
-    moving, moved = _moving(recording, whole, lattice)
+    moving, moved = _moving(recording, axis, whole, lattice)
     if moving.any():
         sound = np.where(moving, np.nan, sound)
         clipped = _clipped(sound, lattice)
@@ -252,21 +233,15 @@ def _known(values: NDArray[Any]) -> NDArray[Any]:
     return values if finite.all() else values[finite]
 
 
-def _stretches(mask: Mask) -> list[tuple[int, int]]:
-    """First row and the row after the last of every stretch of a mask [n]."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
 def _intervals(recording: Recording, mask: Mask) -> list[tuple[float, float]]:
     """Start and end of every stretch of a mask [n], s."""
     time, step = recording.time_s, 1.0 / recording.rate_hz
-    return [(float(time[a]), float(time[b - 1]) + step) for a, b in _stretches(mask)]
+    return [(float(time[a]), float(time[b - 1]) + step) for a, b in runs(mask)]
 
 
-def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
-    """Rows [n] in which values [n], NaN where they are none, show that the sensor moved, and its motion. A gap is no
-    longer than those that matter."""
+def _moving(recording: Recording, axis: str, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
+    """Rows [n] in which the sensor moved, by the energy of all axes and by the level of `values` [n], NaN where they
+    are none; and the motion of the axis. A gap is no longer than those that matter."""
     rate = recording.rate_hz
     place: Rows | None = None
     even = values
@@ -275,14 +250,20 @@ def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tup
         place -= place[0]
         even = np.full(int(place[-1]) + 1, np.nan)
         even[place] = values
-    found = loud(even, rate, lattice.step if lattice is not None else 0.0)
-    if found is None:
+    away = loud(even, rate, lattice.step if lattice is not None else 0.0)
+    loudest = moves_of(recording).get(axis)
+    found = [one for one in (away, loudest) if one is not None]
+    if not found:
         return np.zeros(values.size, bool), None
     mask = np.zeros(even.size, bool)
-    for begin_s, end_s in found.intervals:
+    for begin_s, end_s in away.intervals if away is not None else ():
         mask[round(begin_s * rate) : round(end_s * rate)] = True
     mask = mask if place is None else mask[place]
-    return mask, replace(found, intervals=tuple(_intervals(recording, mask)))
+    time = recording.time_s
+    for begin_s, end_s in loudest.intervals if loudest is not None else ():
+        mask |= (time >= begin_s) & (time < end_s)
+    times = tuple(_intervals(recording, mask))
+    return mask, Moved(times, sum(one.nats for one in found), max(one.net for one in found))
 
 
 # ------------------------------------------------------------------------------------------------------ change of rate
@@ -437,8 +418,7 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     in its middle; the share of repeats; their share among readings after a repeat, since a dead band has more.
     """
     n = values.size
-    change = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
-    lengths = np.diff(change, append=n)
+    change, lengths = equal_runs(values)
     none = np.zeros(n, bool)
     if lengths.max(initial=0) < 4:
         return none, 0.0
@@ -645,11 +625,11 @@ def _quiet_window(y: Array) -> int:
     """Readings over which the mean of a record [n] is quietest: the averaging length of the least Allan variance. It is
     all of them where the longest that the record shows is the best."""
     best, least, length = 2 * AROUND, math.inf, 2 * AROUND
-    means = y[: y.size // length * length].reshape(-1, length).mean(axis=1)
+    means = block_means(y, length)
     while means.size >= 8:
         variance = 0.5 * float((np.diff(means) ** 2).mean())
         if variance < least:
             best, least = length, variance
-        means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
+        means = block_means(means, 2)
         length *= 2
     return y.size if 2 * best >= length else best

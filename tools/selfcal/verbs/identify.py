@@ -104,7 +104,7 @@ def identify(
     from rich.progress import Progress
 
     from selfcal.adequacy.document import Identified, to_document
-    from selfcal.adequacy.identify import chosen_axes, identify_axis, left_out_together, stretch_of, with_reasons
+    from selfcal.adequacy.identify import chosen_axes, identify_axis, stretch_of, with_reasons
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.base.results import Identification
@@ -158,7 +158,6 @@ def identify(
                 )
             except UserError as error:
                 found[name] = error
-        left_out_together(found, recording, loaded_model, engine, decimate, draw=plot is not None)
         with_reasons(found, recording, loaded_model)
         document = to_document(recording, found, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)

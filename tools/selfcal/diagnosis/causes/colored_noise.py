@@ -93,7 +93,6 @@ CAUSE = Cause(
     "The white noise has memory: neighbouring samples are correlated.",
     "Record at the sensor's full rate with its filter off.",
     looks=looks,
-    before_motion=looks,
     slow=True,
     pictures=shown("correlation"),
     least=_least,

@@ -302,7 +302,6 @@ CAUSE = Cause(
     "A periodic disturbance of one frequency is in the readings.",
     "Record at another rate: a line that moves is an alias.",
     looks=looks,
-    before_motion=looks,
     alike=_alike,
     settle=_settle,
     pictures=_pictures,
