@@ -244,9 +244,7 @@ def test_the_recipe_of_a_cause_makes_one(base: Path, tmp_path: Path, monkeypatch
     for name, module in list(sys.modules.items()):
         if name.startswith("selfcal.") and getattr(module, "CAUSES", None) is CAUSES:
             monkeypatch.setattr(module, "CAUSES", added)
-    looks = (toy.__dict__["CAUSE"].looks, *loop.LOOKS)
-    defaults = tuple(looks if one is loop.LOOKS else one for one in loop._rounds.__defaults__ or ())
-    monkeypatch.setattr(loop._rounds, "__defaults__", defaults)
+    monkeypatch.setattr(loop, "LOOKS", (toy.__dict__["CAUSE"].looks, *loop.LOOKS))
     log, model = tmp_path / "log.npz", tmp_path / "model.yaml"
     simulate(base, log, 3, ["toy:axis=gx,coefficient=0.04"])
     for again in (False, True):

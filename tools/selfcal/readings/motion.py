@@ -40,14 +40,14 @@ LEVEL, SQUARES = 9, 1.29
 #: Longest window, s. Its sides are so many times as long each, s at least, and squares at least.
 WINDOW_S, SIDE, SIDE_S, SIDE_SQUARES = 32.0, 8, 10.0, 30
 #: Probability, a record, that axes at rest move together, and that one moves alone.
-SHARE = 5e-4
+SHARE = 1e-3
 #: Share of its windows by which an axis' own loudness counts: of an axis alone at most the rest may be loud.
 OWN = 0.9
 #: Quantiles of the means of windows that show their spread without the loud ones: the median, and one sd below it.
 QUIETER = (0.1587, 0.5)
 #: Nats by which the search over windows costs all axes together less than as many windows apart: of 250 clean records
 #: of 300 to 3600 s at 1 to 100 Hz the largest of one is 2.1 to 2.9 less in the median, and 2.4 to 3.7 in a tenth.
-FEWER = 2.0
+FEWER = 3.0
 #: Part of the evidence that each of several stretches of all axes shows at least.
 PART = 0.25
 #: Nats from which on an axis is in a stretch of others: ln 20.
@@ -217,9 +217,10 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         nats, inside, wide = _nats(energy, begin, length, wide)
         own = np.quantile(nats, OWN, axis=2, keepdims=True) / math.log(0.5 / (1.0 - OWN))
         nats = nats / np.maximum(1.0, own)
+        nats, as_one = nats[:-1], nats[-1]
         loudest = nats.max(axis=1)
         alone = np.where(inside, loudest, 0.0)
-        together = np.max([_together(nats[:, band]) for band in used], axis=0)
+        together = np.max([_together(nats[:, band], as_one[band]) for band in used], axis=0)
         looks = math.log(used.size * pieces / length)
         singly = alone.max(axis=0) - looks - math.log(axes * len(lengths))
         for net, several in ((together - looks + FEWER, True), (singly, False)):
@@ -232,7 +233,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     for net, first, length, which in sorted(found, key=lambda one: -one[0]):
         if not taken[first : first + length].any():
             a, b = _ends(energy, first, first + length, which)
-            nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:, :, 0].max(axis=1)
+            nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
             if np.count_nonzero(which) > 1:
                 which = _sharing(energy, a, b, which) & (nats > TOGETHER)  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
@@ -241,11 +242,12 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     return [one for one in apart if max(one.net, together * (one.axes.sum() > 1)) > -math.log(SHARE)]
 
 
-def _together(nats: Array) -> Array:
+def _together(nats: Array, as_one: Array) -> Array:
     """ln of one over the chance of the nats [axes, windows] of all axes but the loudest: those of the next ones, as
-    many as make it least. Each is exponential at rest, and so many have the gamma distribution."""
+    many as make it least, or what all `as_one` [windows] have beyond it. Each is exponential at rest, and so many have
+    the gamma distribution."""
     axes, windows = nats.shape
-    least, total = np.zeros(windows), np.zeros(windows)
+    least, total = np.maximum(as_one - nats.max(axis=0), 0.0) * (axes > 1), np.zeros(windows)
     for k, more in enumerate(np.sort(nats, axis=0)[-2::-1]):
         total += more
         tail = np.log(np.sum([total**j / math.factorial(j) for j in range(k + 1)], axis=0))
@@ -254,8 +256,8 @@ def _together(nats: Array) -> Array:
 
 
 def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
-    """Nats of windows of a length over their louder side [axes, bands, windows]; whether an axis has both sides [axes,
-    windows]; and how much wider than those of white noise the means lie, `wide` at least [axes, bands]."""
+    """Nats of windows of a length over their louder side [axes and all as one, bands, windows]. Whether an axis has
+    both sides [axes, windows]. How much wider than of white noise the means lie, `wide` at least [axes, bands]."""
     sums, counts = (np.pad(np.cumsum(one, axis=2), ((0, 0), (0, 0), (1, 0))) for one in (energy.sums, energy.counts))
     pieces = energy.sums.shape[2]
     each = counts[..., -1:] / pieces
@@ -273,12 +275,15 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
     level = np.maximum(np.where(there[0], left, 0.0), np.where(there[1], right, 0.0))
     beside = np.maximum(np.where(there[0], n_left, 0.0), np.where(there[1], n_right, 0.0))
     known = (level > 0.0) & (n > 0.0)
-    ratio = np.maximum(np.where(known, own / np.maximum(level, STILL**2), 1.0), 1.0)
+    ratio = np.where(known, own / np.maximum(level, STILL**2), 1.0)
     wide = np.maximum(
         wide, [[_spread(*row) for row in zip(*rows, strict=True)] for rows in zip(own, n, known, strict=True)]
     )
-    own_free, side_free = (np.maximum(one / (SQUARES * wide[..., None]), 0.5) for one in (n, beside))
-    nats = np.where(known, 0.5 * own_free * (ratio - 1.0 - np.log(ratio)), 0.0)
+    own_free, side_free = (np.maximum(one * known / (SQUARES * wide[..., None]), 0.5) for one in (n, beside))
+    ratio = np.concatenate([ratio, [(ratio * own_free).sum(axis=0) / own_free.sum(axis=0)]])
+    own_free, side_free = (np.concatenate([one, [one.sum(axis=0)]]) for one in (own_free, side_free))
+    ratio = np.maximum(ratio, 1.0)
+    nats = 0.5 * own_free * (ratio - 1.0 - np.log(ratio))
     near = nats > 1.0
     nats[near] = -np.log(np.maximum(fdtrc(own_free[near], side_free[near], ratio[near]), TINY))
     return nats, (there[0] & there[1]).any(axis=1), wide
