@@ -26,7 +26,7 @@ from selfcal.model.file import Model
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
 from selfcal.model.tables import make_tables
 from selfcal.readings.gate import gated
-from selfcal.readings.readings import look, mostly_beyond
+from selfcal.readings.readings import copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
 
 if TYPE_CHECKING:
@@ -84,6 +84,9 @@ def identify_axis(
     regressors = offered(model, name)
     if most := mostly_beyond(recording.in_unit(name, group.unit), group):
         raise UserError(most)
+    before = [one for one in model.axes[: model.axes.index(name)] if one in recording.columns]
+    if reason := copied(recording, name, before):
+        raise UserError(reason)
     readings = look(recording, name, group)
     recording = readings.recording
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)

@@ -131,6 +131,16 @@ def recurring(record: Record, axis: str) -> Look | None:
     return Look("outliers", nats, nats, estimate, {}, when=(float(times[0]), float(times[-1])))
 
 
+def misread(record: Record, axis: str) -> Look | None:
+    """Readings that a map of the firmware or the logger has changed."""
+    readings = record.readings.get(axis)
+    if readings is None or readings.misread is None:
+        return None
+    found = readings.misread
+    share = interval(found.share, math.sqrt(found.share / readings.values.size), "1")
+    return Look("misread", found.nats, found.nats, {"kind": found.kind, "fraction": share}, {})
+
+
 def stuck(record: Record, axis: str) -> Look | None:
     """Stretches of equal readings that are no chance."""
     readings = record.readings.get(axis)

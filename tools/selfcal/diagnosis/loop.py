@@ -21,6 +21,8 @@ from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
+#: What the readings of an axis show by themselves.
+READ = (integrity.misread, integrity.held_samples, integrity.stuck, integrity.recurring)
 #: Why an axis is not done.
 INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/README.md): there may be more causes"
@@ -115,7 +117,7 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
     for name, one in found.items():
         others = tuple(other for other in found if other != name)
         one.findings.extend(Finding(look, 0, one.state, one.state, shared_with=others) for look in changed)
-        for found_at in (look(record, name) for look in (integrity.held_samples, integrity.stuck, integrity.recurring)):
+        for found_at in (look(record, name) for look in READ):
             if found_at is not None:
                 one.findings.append(Finding(found_at, 0, one.state, one.state))
         if name in handled:  # the motion that is left out already spoilt the first state

@@ -11,13 +11,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from selfcal.base.grid import noise_of
-from selfcal.readings.lattice import Lattice
+from selfcal.readings.budget import nats_of
+from selfcal.readings.lattice import Lattice, lattice_of
 
 Array = NDArray[np.float64]
 
@@ -33,14 +35,28 @@ VALUES_MOST, POINTS = 200, 16
 COARSEST = 1.2
 #: Factors of the noise of a reading that are tried, and steps of a level, in noises.
 FACTORS, LEVEL_STEP = np.geomspace(0.3, 3.0, 25), 0.1
-#: Net evidence, nats, from which on a map is one; chance of a reading that no map makes.
-NATS, ODD = 25.0, 1e-6
+#: Chance of a reading that no map makes.
+ODD = 1e-6
+
+
+#: What may have happened, by kind.
+MISREAD = MappingProxyType(
+    {
+        "sign_lost": "the sign of values between -1 and 0 is lost in printing",
+        "truncated": "a cast truncates towards zero, round before it",
+        "digits_lost": "zeros behind the point are lost in printing",
+        "unsigned": "a signed count is read as unsigned; undone here",
+        "overflow": "the count runs over; undone here",
+        "torn": "bytes of two readings are joined, read them at once; undone here",
+        "range_change": "the range of the part changes, the readings are right",
+    }
+)
 
 
 @dataclass(frozen=True)
 class Misread:
-    """The `kind` of a map, the `share` of the readings that it has changed, and its `nats`. `undone` [n]: the readings
-    before it, None where that is lost."""
+    """The `kind` of a map, the `share` of the readings that it has changed (of a change of the range: until it, or from
+    it on), and its `nats`. `undone` [n]: the readings before it, None where that is lost."""
 
     kind: str
     share: float
@@ -48,8 +64,8 @@ class Misread:
     undone: Array | None = None
 
 
-def spans_of(values: Array, lattice: Lattice | None) -> Misread | None:
-    """Readings [n] to which whole spans were added; NaN are none of them. O(n)."""
+def spans_of(values: Array, rate_hz: float) -> Misread | None:
+    """Readings [n] at `rate_hz` to which whole spans were added; NaN are none of them. O(n)."""
     known = np.flatnonzero(np.isfinite(values))
     y = values[known]
     if y.size < PIECE:
@@ -57,10 +73,11 @@ def spans_of(values: Array, lattice: Lattice | None) -> Misread | None:
     steps = np.diff(y)
     size = np.abs(steps)
     # A quarter of the differences of normal noise is below 0.45 of its sd.
-    noise = max(float(np.quantile(size, 0.25)) / 0.45, 0.3 * lattice.step if lattice is not None else 0.0)
+    noise = float(np.quantile(size, 0.25)) / 0.45
     far = size[size > JUMP * noise]
     if far.size < JUMPS_LEAST or not noise > 0.0:
         return None
+    lattice = lattice_of(y, rate_hz)
     span = float(np.median(far))
     span = float(far[np.abs(far / span - 1.0) < OFF * noise / span].mean())
     if lattice is not None:
@@ -71,7 +88,8 @@ def spans_of(values: Array, lattice: Lattice | None) -> Misread | None:
     turns = np.concatenate([[0], np.cumsum(np.rint(steps / span))])
     found, often = np.unique(turns, return_counts=True)
     own = float(found[np.argmax(often)])
-    if float(np.ptp(y)) < span + 2.0 * noise:  # of two levels each has its noise on both sides
+    if float(np.ptp(y)) < span + 2.0 * noise:  # two levels have the whole of their noise on either side
+        span = float(np.ptp(y)) + float(np.diff(np.unique(y)).min())  # both ends are met
         kind = "unsigned" if float(y.min()) > -noise else "overflow"
         if kind == "unsigned":  # the true ones are about zero
             own = -float(np.rint(np.median(y - span * turns) / span)) or 0.0
@@ -103,7 +121,7 @@ def range_change_of(values: Array, lattice: Lattice | None) -> Misread | None:
             nats = size * math.log(factor) - 2.0 * math.log(y.size)
             if nats > best.nats and off.size > size * ODD and np.unique(part[:size]).size > factor:
                 best = Misread("range_change", size / y.size, nats)
-    return best if best.nats > NATS else None
+    return best if best.nats > nats_of("misread") else None
 
 
 def _truncated(x: Array, step: float) -> Array:
@@ -129,10 +147,12 @@ def _maps(y: Array, noise: float, step: float) -> list[tuple[str, Callable[[Arra
     def printed(x: Array) -> Array:
         return _no_zeros(step * np.rint(x / step) if step > 0.0 else x)
 
-    found = [("digits_lost", printed)]
+    found: list[tuple[str, Callable[[Array], Array]]] = [("digits_lost", printed)]
     if gap > noise:
         found += [("sign_lost", unsigned), ("digits_lost", lambda x: printed(unsigned(x)))]
-    return [*found, ("truncated", lambda x: _truncated(x, step))] if step > 0.0 else found
+    if step > 0.0:
+        found.append(("truncated", lambda x: _truncated(x, step)))
+    return found
 
 
 def about_zero(values: Array, lattice: Lattice | None) -> Misread | None:
@@ -186,4 +206,9 @@ def about_zero(values: Array, lattice: Lattice | None) -> Misread | None:
     tried = [(kind, fitted(read)) for kind, read in _maps(y, noise, step)]
     kind, best = max(tried, key=lambda one: one[1][0])
     nats = min(best[0] - plain[0], best[1] - plain[1]) - math.log(len(tried))
-    return Misread(kind, best[2], nats) if nats > NATS else None
+    return Misread(kind, best[2], nats) if nats > nats_of("misread") else None
+
+
+def misread_of(values: Array, lattice: Lattice | None) -> Misread | None:
+    """How readings [n], NaN where there are none, were misread; None where they were not."""
+    return range_change_of(values, lattice) or about_zero(values, lattice)

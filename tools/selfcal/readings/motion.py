@@ -22,6 +22,7 @@ from scipy.special import bdtrc, fdtrc, gammaincinv
 
 from selfcal.base.grid import MEDIAN_SD, block_means, runs
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
+from selfcal.readings.budget import SHARES
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -40,7 +41,7 @@ LEVEL, SQUARES = 9, 1.29
 #: Longest window, s. Its sides are so many times as long each, s at least, and squares at least.
 WINDOW_S, SIDE, SIDE_S, SIDE_SQUARES = 32.0, 8, 10.0, 30
 #: Probability, a record, that axes at rest move together, and that one moves alone.
-SHARE = 1e-3
+SHARE = SHARES["motion"]
 #: Share of its windows by which an axis' own loudness counts: of an axis alone at most the rest may be loud.
 OWN = 0.9
 #: Quantiles of the means of windows that show their spread without the loud ones: the median, and one sd below it.
@@ -49,13 +50,15 @@ QUIETER = (0.1587, 0.5)
 #: of 300 to 3600 s at 1 to 100 Hz the largest of one is 2.1 to 2.9 less in the median, and 2.4 to 3.7 in a tenth.
 FEWER = 3.0
 #: Part of the evidence that each of several stretches of all axes shows at least.
-PART = 0.25
+PART = 0.5
 #: Nats from which on an axis is in a stretch of others: ln 20.
 TOGETHER = 3.0
 #: Least probability whose logarithm is taken.
 TINY = 1e-300
 #: Correlation of axes at rest from which on they share a source, beyond chance.
 SHARED = 0.05
+#: Standard deviations of a correlation by chance from which on axes depend on each other, and that of a copy.
+CORRELATED, COPY = 5.0, 0.999
 
 #: Lengths of a block, s: a knock is short, and a hand that turns slowly shows in long ones alone. With fewer samples
 #: than `BLOCK_LEAST` in it each sample is a block: no median leaves one out.
@@ -151,24 +154,57 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     piece_s = max(PIECE_S, 1.0 / max(clock.rate_hz for clock in clocks), length_s / PIECES_MOST)
     count = math.ceil(length_s / piece_s - 1e-6)
     sums, counts = np.zeros((2, len(names), 1 + len(BANDS_S), count))
+    there = [np.isfinite(recording.columns[name].values) for name in names]
+    tame = [_tame(recording.columns[name].values[each]) for name, each in zip(names, there, strict=True)]
+    rows = _apart_from_each_other([own for own, _ in tame])
     readings = []
-    for k, (name, clock) in enumerate(zip(names, clocks, strict=True)):
-        there = np.isfinite(recording.columns[name].values)
-        time = clock.time_s[there]
-        own, most = _tame(recording.columns[name].values[there])
+    for k, (clock, own) in enumerate(zip(clocks, rows, strict=True)):
+        time = clock.time_s[there[k]]
         for band, size in enumerate([1, *(round(band_s * clock.rate_hz) for band_s in BANDS_S)]):
             if band and not BAND_LEAST <= size <= own.size // SIDE_SQUARES:
                 continue
             means, at = block_means(own, size), block_means(time, size)
-            apart = means - _level(means)
-            noise = float(np.median(np.abs(apart))) / MEDIAN_SD
-            scaled = apart / noise if noise > 0.0 else np.zeros(0)  # most are alike: below the lattice, or bridged
+            scaled = _scaled(means)
             piece = np.minimum((at[: scaled.size] / piece_s + 1e-6).astype(np.int64), count - 1)
-            sums[k, band] = np.bincount(piece, np.minimum(scaled**2, most), minlength=count)
+            sums[k, band] = np.bincount(piece, np.minimum(scaled**2, tame[k][1]), minlength=count)
             counts[k, band] = np.bincount(piece, minlength=count)
             if not band:
-                readings.append((scaled, piece))
+                readings.append((_scaled(tame[k][0]), piece))
     return Energy(piece_s, sums, counts, tuple(readings))
+
+
+def _scaled(y: Array) -> Array:
+    """Values [n] about their level over their noise; empty where most are alike: below the lattice, or bridged."""
+    apart = y - _level(y)
+    noise = float(np.median(np.abs(apart))) / MEDIAN_SD if apart.size else 0.0
+    return apart / noise if noise > 0.0 else np.zeros(0)
+
+
+def _apart_from_each_other(rows: Sequence[Array]) -> list[Array]:
+    """Readings of axes, [n] each, that are independent at rest: those of one clock that correlate in the nearest units
+    that do not. Of a copy nothing is left."""
+    found = list(rows)
+    scaled = [_scaled(row) for row in rows]
+    for size in {one.size for one in scaled} - {0}:
+        own = [k for k, one in enumerate(scaled) if one.size == size]
+        together = np.atleast_2d(np.corrcoef(np.clip([scaled[k] for k in own], -WILD[0], WILD[0])))
+        copies = (np.abs(np.tril(together, -1)) > COPY).any(axis=1)
+        for k in np.flatnonzero(copies).tolist():
+            found[own[k]] = np.zeros(size)
+        own = [k for k, copy in zip(own, copies, strict=True) if not copy]
+        together = together[np.ix_(~copies, ~copies)]
+        if np.abs(together - np.eye(len(own))).max(initial=0.0) > CORRELATED / math.sqrt(size):
+            values, vectors = np.linalg.eigh(together)
+            noise = [float(np.median(np.abs(rows[k] - _level(rows[k])))) for k in own]
+            mixed = (
+                vectors
+                / np.sqrt(np.maximum(values, 1.0 - COPY))
+                @ vectors.T
+                @ [rows[k] / n for k, n in zip(own, noise, strict=True)]
+            )
+            for k, row in zip(own, mixed, strict=True):
+                found[k] = row
+    return found
 
 
 def _level(y: Array) -> Array:
@@ -247,7 +283,8 @@ def _together(nats: Array, as_one: Array) -> Array:
     many as make it least, or what all `as_one` [windows] have beyond it. Each is exponential at rest, and so many have
     the gamma distribution."""
     axes, windows = nats.shape
-    least, total = np.maximum(as_one - nats.max(axis=0), 0.0) * (axes > 1), np.zeros(windows)
+    total = np.zeros(windows)
+    least: Array = np.maximum(as_one - nats.max(axis=0), 0.0) * float(axes > 1)
     for k, more in enumerate(np.sort(nats, axis=0)[-2::-1]):
         total += more
         tail = np.log(np.sum([total**j / math.factorial(j) for j in range(k + 1)], axis=0))
@@ -338,7 +375,7 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
     values, piece = np.array([part for part, _ in parts]), parts[0][1]
     inside = np.any([(piece >= one.begin) & (piece < one.end) for one in moved], axis=0)
     together = np.corrcoef(np.clip(values[:, ~inside], -WILD[0], WILD[0]))
-    if np.abs(together - np.eye(len(parts))).max() < SHARED + 4.0 / math.sqrt(values.shape[1]):
+    if np.abs(together - np.eye(len(parts))).max() < SHARED + CORRELATED / math.sqrt(values.shape[1]):
         return False
     size, vectors = np.linalg.eigh(together)
     loud_ones = vectors / np.sqrt(np.maximum(size, TINY)) @ vectors.T @ values[:, inside]

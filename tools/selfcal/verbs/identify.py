@@ -164,15 +164,16 @@ def identify(
         doubtful = [name for name, axis in found.items() if isinstance(axis, Identified) and not axis.adequate]
         if doubtful and suspicion:
             from selfcal.diagnosis.suspicion import suspicions, weigh_more_laws, with_added_laws
+            from selfcal.readings.tests import TESTS
 
             progress.update(task, description="strongest suspicion")
             suspected = suspicions(recording, loaded_model, doubtful)
             for name, shown in suspected.items():
                 document["axes"][name]["suspicion"] = shown.cause
             for name in doubtful:
-                for cause in ("held_samples", "outliers", "saturation", "motion"):  # shown by the readings themselves
-                    if cause in document["axes"][name]["checks"]:
-                        document["axes"][name]["suspicion"] = cause
+                for test in TESTS:  # shown by the readings themselves
+                    if test.name in document["axes"][name]["checks"]:
+                        document["axes"][name]["suspicion"] = test.name
             if model is None:
                 progress.update(task, description="more laws")
                 again = with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)
