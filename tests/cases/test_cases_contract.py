@@ -82,7 +82,10 @@ def forms_of(cause: str) -> tuple[str, ...]:
 
 
 #: In `make test` the first form of a cause, in `make cases` every form.
-PAIRS = [(cause, form) for cause in CAUSES for form in forms_of(cause)[: None if CASE_RECORDS else 1]]
+#: `misread` has no recipe: it is the log that is wrong (test_cases_misread.py has its kinds).
+PAIRS = [
+    (cause, form) for cause in CAUSES if cause != "misread" for form in forms_of(cause)[: None if CASE_RECORDS else 1]
+]
 
 
 @pytest.fixture(scope="module")

@@ -25,6 +25,8 @@ Array = NDArray[np.float64]
 
 #: Noises of a jump at least, jumps at least, the share of them that have one size, and how far off they are, in noises.
 JUMP, JUMPS_LEAST, ALIKE, OFF = 12.0, 5, 0.9, 6.0
+#: Noise of the readings that are a span off, over that of all, at least.
+LIKE_NOISE = 0.3
 #: Share of the readings that bytes of two readings are at most.
 TORN_MOST = 0.25
 #: Pieces of a record that have a level each, at most, and readings in one at least.
@@ -34,7 +36,9 @@ VALUES_MOST, POINTS = 200, 16
 #: Steps of the lattice in the noise of a reading at most: beyond, skewed noise looks like a map.
 COARSEST = 1.2
 #: Factors of the noise of a reading that are tried, and steps of a level, in noises.
-FACTORS, LEVEL_STEP = np.geomspace(0.3, 3.0, 25), 0.1
+FACTORS, LEVEL_STEP = np.geomspace(0.1, 3.0, 36), 0.1
+#: Shares of the readings that are one value, which is tried in place of a map.
+SHARES_OF_ONE = np.geomspace(0.005, 0.4, 10)
 #: Chance of a reading that no map makes.
 ODD = 1e-6
 
@@ -82,6 +86,7 @@ def spans_of(values: Array, rate_hz: float) -> Misread | None:
     span = float(far[np.abs(far / span - 1.0) < OFF * noise / span].mean())
     if lattice is not None:
         span = lattice.step * round(span / lattice.step)
+        noise = max(noise, LIKE_NOISE * lattice.step)
     off = np.abs(far / span - np.rint(far / span)) * span
     if span < 2.0 * JUMP * noise or np.mean(off < OFF * noise) < ALIKE:
         return None
@@ -100,6 +105,8 @@ def spans_of(values: Array, rate_hz: float) -> Misread | None:
         if abs(upper - span) > OFF * noise or sum(sides) > TORN_MOST or min(sides) < ODD + 0.1 * max(sides):
             return None
         kind, span = "torn", upper
+    if float(y[turns != own].std()) < LIKE_NOISE * noise:
+        return None  # a word that the logger shows for lost ones has no noise
     undone = values.copy()
     undone[known] = y - span * (turns - own)
     nats = far.size * math.log(span / (2.0 * OFF * noise))
@@ -183,14 +190,17 @@ def about_zero(values: Array, lattice: Lattice | None) -> Misread | None:
     edges = np.arange(-2 * most, 2 * most + 1) * 0.5 * width
     points = edges[:-1, None] + 0.5 * width * (np.arange(POINTS) + 0.5) / POINTS
 
-    def fitted(read: Callable[[Array], Array]) -> tuple[float, float, float]:
-        """ln likelihood with one noise, with a noise of each piece, and the share of readings that change."""
+    def cells(read: Callable[[Array], Array]) -> tuple[Array, Array]:
+        """Chance [values, cells] that a reading of a cell is shown as a value, and that it is changed [cells]."""
         shown = read(points)
         to = np.zeros((many, len(points)))
         cell = np.floor(shown / width + shift).astype(np.int64) - first
         inside = (cell >= 0) & (cell < many)
         np.add.at(to, (cell[inside], np.nonzero(inside)[0]), 1.0 / POINTS)
-        moved = np.mean(np.floor(points / width + shift) != np.floor(shown / width + shift), axis=1)
+        return to, np.mean(np.floor(points / width + shift) != np.floor(shown / width + shift), axis=1)
+
+    def fitted(to: Array, changed: Array) -> tuple[float, float, float]:
+        """ln likelihood with one noise, with a noise of each piece, and the share of readings that change."""
         level = np.arange(edges[0], edges[-1], max(LEVEL_STEP * noise, 0.25 * width))
         best, each, share = -math.inf, np.full(len(count), -math.inf), 0.0
         for sigma in noise * FACTORS:
@@ -199,14 +209,27 @@ def about_zero(values: Array, lattice: Lattice | None) -> Misread | None:
             own = ln.max(axis=1)
             each = np.maximum(each, own)
             if own.sum() > best:
-                best, share = float(own.sum()), float(count.sum(axis=1) @ (moved @ true)[ln.argmax(axis=1)]) / y.size
+                best = float(own.sum())
+                share = float(count.sum(axis=1) @ (changed @ true)[ln.argmax(axis=1)]) / y.size
         return best, float(each.sum()), share
 
-    plain = fitted(lambda x: x)
-    tried = [(kind, fitted(read)) for kind, read in _maps(y, noise, step)]
+    as_it_is = cells(lambda x: x)
+    plain = fitted(*as_it_is)
+    maps = _maps(y, noise, step)
+    tried = [(kind, fitted(*cells(read))) for kind, read in maps]
     kind, best = max(tried, key=lambda one: one[1][0])
     nats = min(best[0] - plain[0], best[1] - plain[1]) - math.log(len(tried))
-    return Misread(kind, best[2], nats) if nats > nats_of("misread") else None
+    if nats < nats_of("misread"):
+        return None
+    # Values that hold more than their own: lost words, and limits.
+    total = count.sum(axis=0)
+    for one in {-first, 0, many - 1, int(np.argmax(total))} & set(range(many)):
+        for share in SHARES_OF_ONE:
+            to = (1.0 - share) * as_it_is[0]
+            to[one] += share
+            if fitted(to, as_it_is[1])[0] > best[0] + nats_of("outliers"):
+                return None
+    return Misread(kind, best[2], nats)
 
 
 def misread_of(values: Array, lattice: Lattice | None) -> Misread | None:

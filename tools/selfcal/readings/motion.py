@@ -270,8 +270,9 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         if not taken[first : first + length].any():
             a, b = _ends(energy, first, first + length, which)
             nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
-            if np.count_nonzero(which) > 1:
-                which = _sharing(energy, a, b, which) & (nats > TOGETHER)  # noqa: PLW2901
+            of_others = np.count_nonzero(which) == 1
+            more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else TOGETHER))
+            which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
     together = sum(one.net for one in [*known, *apart] if one.axes.sum() > 1)

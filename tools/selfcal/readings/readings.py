@@ -209,6 +209,9 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     lattice = lattice_of(_known(sound), recording.rate_hz)
     if misread is None and (lattice is None or not lattice.carried):
         misread = misread_of(sound, lattice)
+        limited = _clipped(sound, lattice) if misread is not None and misread.kind != "range_change" else None
+        if limited is not None and abs(limited.limit) > float(np.nanstd(sound)):
+            misread = None  # it ends at a limit of the part, and not at zero
     recurring = recurring_of(sound, recording.rate_hz) if misread is None else None
     if recurring is not None and ((lattice is not None and lattice.carried) or uneven_of(sound, lattice) is not None):
         recurring = None  # the codes of a counter recur; a dead band takes its counts from its neighbours
@@ -501,7 +504,8 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     least = min(limit, stated) if stated > 0 else limit
     stuck = lengths >= least
     if not stuck.any():
-        near = lattice is not None and lattice.step > HELD_COARSEST * float(np.nanstd(np.diff(values))) / math.sqrt(2.0)
+        noise = float(np.nanstd(np.diff(values))) / math.sqrt(2.0)
+        near = lattice is not None and (lattice.too_coarse or lattice.step > HELD_COARSEST * noise)
         return (none, 0.0) if near else _many_runs(values, change, lengths)
     frozen = values[change[stuck]]
     again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
