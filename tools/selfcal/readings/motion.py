@@ -229,8 +229,10 @@ def stretches(energy: Energy) -> list[Stretch]:
     found: list[Stretch] = []
     while more := _loud_windows(energy, found):
         sums, counts = energy.sums.copy(), energy.counts.copy()
+        margin = math.ceil(MARGIN_S / energy.piece_s)
         for one in more:
-            sums[..., one.begin : one.end] = counts[..., one.begin : one.end] = 0.0
+            gone = slice(max(0, one.begin - margin), one.end + margin)
+            sums[..., gone] = counts[..., gone] = 0.0
         found += more
         energy = replace(energy, sums=sums, counts=counts)
     together = [one for one in found if one.axes.sum() > 1]
@@ -268,7 +270,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     apart: list[Stretch] = []
     for net, first, length, which in sorted(found, key=lambda one: -one[0]):
         if not taken[first : first + length].any():
-            a, b = _ends(energy, first, first + length, which)
+            a, b = _ends(energy, *_ends(energy, first, first + length, which), which)
             nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
             of_others = np.count_nonzero(which) == 1
             more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else TOGETHER))

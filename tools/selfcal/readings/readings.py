@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
-from selfcal.base.grid import block_means, equal_runs, runs
+from selfcal.base.grid import block_means, equal_runs, noise_of, runs
 from selfcal.logs.recording import Column, Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
@@ -92,8 +92,9 @@ class Clipped:
 ROUNDED = 1e-5
 #: Share of readings beyond the range from which on the others are no readings of a sensor either.
 MOST_BEYOND = 0.5
-#: Share of readings beyond the range from which on they count as clipped: the noise of the others is too small.
-BEYOND_MOST = 0.01
+#: Share of readings beyond the range from which on they count as clipped, and noises to the range at most: the noise of
+#: the others is too small.
+BEYOND_MOST, BEYOND_SD = 0.01, 8.0
 
 
 @dataclass(frozen=True)
@@ -204,7 +205,8 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         return Readings(recording, values, values, values, None, none, none)
     beyond = float(np.mean(~inside & np.isfinite(values)))
     sound = values if inside.all() else np.where(inside, values, np.nan)
-    if beyond > BEYOND_MOST:
+    near = group.range - abs(float(np.median(_known(sound)))) < BEYOND_SD * noise_of(values)
+    if beyond > BEYOND_MOST and near:
         values = sound = np.clip(values, -group.range, group.range)
     lattice = lattice_of(_known(sound), recording.rate_hz)
     if misread is None and (lattice is None or not lattice.carried):
