@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,15 +16,16 @@ from scipy.stats import binom
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.base.errors import UserError
-from selfcal.diagnosis import integrity, words
+from selfcal.base.grid import block_means
+from selfcal.diagnosis import words
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
-from selfcal.diagnosis.record import Record, of_recording
+from selfcal.diagnosis.record import of_recording
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Column, Recording, save
 from selfcal.model.file import Model
-from selfcal.readings.motion import loud
+from selfcal.readings.motion import loud, moves_of
 from selfcal.readings.readings import look
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -174,24 +176,20 @@ def test_a_source_that_axes_share_moves_none() -> None:
             rows[:, place : place + 5] *= loudness
             source[place : place + 5] *= 1.0 if alone else 6.0
         rows += np.outer([0.8, 0.6, 0.5], source)
-        axes = {name: state_of(row, 1.0, name).refit() for name, row in zip(("ax", "ay", "az"), rows, strict=True)}
-        found, mask = integrity.motion(Record(1.0, axes, {}, {}, np.ones(4000, bool)), {})
-        assert sorted(found) == (["ax", "ay", "az"] if alone else [])
-        assert mask.any() == alone
+        recording = a_recording(1.0, *rows)
+        found = moves_of(recording)
+        assert sorted(found) == (["gx", "gy", "gz"] if alone else [])
 
 
 @pytest.mark.parametrize("run", ["run1", "run2"])
 def test_the_square_wave_of_the_real_runs_is_no_motion(run: str) -> None:
     """The square wave's jitter at 1 Hz. Truth: no surrogate of the runs shows a common burst (shared data, README)."""
-    from selfcal.diagnosis.loop import _provisional, _wild
-
-    if not case_records(0, 1):
-        pytest.skip("one of the long ones: make cases")
-    record = of_recording(shared_recording(f"adis16405_{run}.npz"), MODEL, 1.0)
-    states = {name: _provisional(state.refit(), record, lambda text: None) for name, state in record.axes.items()}
-    wild = {name: _wild(state, record) for name, state in states.items()}
-    moved = Record(1.0, states, {}, {}, record.present)
-    assert integrity.motion(moved, wild)[0] == {}
+    recorded = shared_recording(f"adis16405_{run}.npz")
+    size = round(recorded.rate_hz)
+    rows = {name: replace(one, values=block_means(one.values, size)) for name, one in recorded.columns.items()}
+    n = next(iter(rows.values())).values.size
+    means = replace(recorded, rate_hz=1.0, columns=rows, missing_before=np.zeros(n, np.int64), off_grid_s=None)
+    assert not moves_of(means)
 
 
 def rested(random: np.random.Generator, kind: str) -> tuple[Diagnosed, float, float]:

@@ -217,7 +217,7 @@ def test_an_axis_without_a_result_leaves_the_others(tmp_path: Path, capsys: pyte
     rng = np.random.default_rng(3)
     log = tmp_path / "log.csv"
     stuck, noise = np.full(500, 0.3), 0.04 * rng.standard_normal(500)
-    save(log, {"gx": ("deg/s", stuck), "gy": ("deg/s", noise), "ax": ("g", 0.001 * noise)}, 1.0, {})
+    save(log, {"gx": ("deg/s", stuck), "gy": ("deg/s", noise), "ax": ("g", 4e-5 * rng.standard_normal(500))}, 1.0, {})
     document = identify(log, json=tmp_path / "out.json", export=("kalibr", tmp_path / "k.yaml"))
     assert set(document["axes"]["gx"]) == {"error"}
     assert document["axes"]["gx"]["error"].startswith("all 500 averages are equal (0.3 deg/s)")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from selfcal.logs.recording import Recording
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
 from selfcal.readings.readings import CLOCK_LEAST, Readings
+from selfcal.readings.tests import TESTS
 
 #: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
 CHECK_LIMIT = 4.0
@@ -181,12 +182,12 @@ def with_readings(
     `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
     noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the
     rate of means whose remainders are white.
-    `saturation`, if some are clipped: their share, and the `at` of the limit.
-    `outliers`, if one value recurs too often: the share of these readings, and the value `at` which.
-    `held_samples`, if rows repeat at random: their share. The rate of the part is known but for readings never read.
-    `motion`, if the sensor moved: the share of these readings, and the `intervals` in s.
-    `as_fed`: the engine took every reading as it was, in float32. Then the share of stuck ones, the largest
-    change of the sampling rate, and the `float_spacing`, steps of float32 in the noise of a reading, count too.
+    The tests of the readings (readings/tests.py), if they name something: the share of readings that it is about.
+    `misread` has its `kind`, `saturation` the `at` of the limit, `outliers` the value `at` which they recur, `stuck`
+    and `motion` their `intervals` in s. `motion` passes where the noise of averages is the same with it, within its own
+    scatter.
+    `as_fed`: the engine took every reading as it was, in float32. Then the largest change of the sampling rate, and the
+    `float_spacing`, steps of float32 in the noise of a reading, count too.
     """
     factor = units.factor(group.unit, unit)
     checks: dict[str, dict[str, Any]] = {}
@@ -195,21 +196,22 @@ def with_readings(
         told = {"value": found.coarseness, "limit": found.most, "passed": not found.too_coarse_over(dt_s)}
         white = {"counter_hz": found.white_hz} if found.carried and not told["passed"] else {}
         checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct, **white}
-    if readings.clipped is not None:
-        share = float(readings.clipped.mask.mean())
-        checks["saturation"] = {"value": share, "limit": 0.0, "passed": False, "at": readings.clipped.limit * factor}
-    if readings.recurring is not None:
-        often = readings.recurring
-        checks["outliers"] = {"value": often.share, "limit": 0.0, "passed": False, "at": often.value * factor}
-    if readings.held is not None and not readings.held.even:
-        checks["held_samples"] = {"value": 1.0 - 1.0 / readings.held.ratio, "limit": 0.0, "passed": False}
-    if readings.moved is not None:
-        share, start_s = float(readings.moving.mean()), readings.recording.start_s
-        times = [[a + start_s, b + start_s] for a, b in readings.moved.intervals]
-        checks["motion"] = {"value": share, "limit": 0.0, "passed": False, "intervals": times}
+    start_s = readings.recording.start_s
+    more: dict[str, Callable[[], dict[str, Any]]] = {
+        "misread": lambda: {"kind": readings.misread and readings.misread.kind},
+        "saturation": lambda: {"at": readings.clipped and readings.clipped.limit * factor},
+        "outliers": lambda: {"at": readings.recurring and readings.recurring.value * factor},
+        "stuck": lambda: {"intervals": [[a + start_s, b + start_s] for a, b in readings.intervals]},
+        "motion": lambda: {
+            "passed": not readings.matters(max(1, round(dt_s * readings.recording.rate_hz))),
+            "intervals": [[a + start_s, b + start_s] for a, b in readings.moved.intervals] if readings.moved else [],
+        },
+    }
+    for test in TESTS:
+        if test.statistic(readings) > 0.0:
+            told = {"value": float(np.mean(test.mask(readings))), "limit": 0.0, "passed": False}
+            checks[test.name] = {**told, **more.get(test.name, dict)()}
     if as_fed:
-        if readings.stuck.any():
-            checks["stuck"] = {"value": float(readings.stuck.mean()), "limit": 0.0, "passed": False}
         if readings.changes:
             ratio = max((one.after_hz / one.before_hz - 1.0 for one in readings.changes), key=abs)
             checks["rate_change"] = {"value": ratio, "limit": CLOCK_LEAST, "passed": False}

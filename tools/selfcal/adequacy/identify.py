@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -27,7 +26,7 @@ from selfcal.model.file import Model
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
 from selfcal.model.tables import make_tables
 from selfcal.readings.gate import gated
-from selfcal.readings.readings import Readings, look, mostly_beyond
+from selfcal.readings.readings import copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
 
 if TYPE_CHECKING:
@@ -42,25 +41,6 @@ def stretch_of(recording: Recording, model: Model, start_s: float | None, end_s:
     """The part of a recording that a verb looks at: `--start`, `--end`, `--gate`."""
     stretch = recording.between(start_s, end_s)
     return gated(stretch, model) if gate else stretch
-
-
-def left_out_together(
-    found: dict[str, Identified | UserError],
-    recording: Recording,
-    model: Model,
-    engine: str,
-    decimate: float | None,
-    *,
-    draw: bool,
-) -> None:
-    """Identify axes anew that hardly show a movement of which two others or more show that it is one."""
-    checks = {name: one.judged.checks for name, one in found.items() if isinstance(one, Identified)}
-    moved = {name: each["motion"]["intervals"] for name, each in checks.items() if "motion" in each}
-    times = [one for each in moved.values() for one in each]
-    for name in found if len(moved) > 1 else ():
-        if name not in moved:
-            with suppress(UserError):
-                found[name] = identify_axis(recording, name, model, engine, decimate, draw=draw, moved=times)
 
 
 def with_reasons(found: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
@@ -95,19 +75,19 @@ def identify_axis(
     advance: Callable[[], object] = lambda: None,
     *,
     draw: bool = False,
-    moved: Sequence[Sequence[float]] = (),
 ) -> Identified:
     """One axis by one engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that
     is too coarse. Readings that are none are left out (`readings.py`). With regressors every subset of them is scored;
-    `advance` is called after each. `draw`: with the Allan deviation of the samples. `moved`: stretches in which other
-    axes moved, seconds of the recording."""
+    `advance` is called after each. `draw`: with the Allan deviation of the samples."""
     recording = recording.along(name)
     group, unit = model.group_of(name), recording.columns[name].unit
     regressors = offered(model, name)
     if most := mostly_beyond(recording.in_unit(name, group.unit), group):
         raise UserError(most)
+    before = [one for one in model.axes[: model.axes.index(name)] if one in recording.columns]
+    if reason := copied(recording, name, before):
+        raise UserError(reason)
     readings = look(recording, name, group)
-    readings = readings.without([*moved, *moved_beside(recording, model, name, readings)])
     recording = readings.recording
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
     values, offset = readings.working, 0.0
@@ -210,21 +190,6 @@ def identify_axis(
         halved_after(inside, group, *at),
         next(filter(None, more_laws), {}),
     )
-
-
-def moved_beside(recording: Recording, model: Model, name: str, own: Readings) -> list[list[float]]:
-    """When the axes moved that moved together with an axis: stretches, seconds of the recording. Each axis shows a part
-    of a movement of the sensor. `own`: the readings of the axis."""
-    found: list[list[float]] = []
-    for other in model.axes if own.moved is not None else ():
-        if other == name or other not in recording.columns:
-            continue
-        if other not in recording.motion_seen:
-            look(recording, other, model.group_of(other))
-        times = recording.motion_seen[other]
-        if any(a < end and begin < b for a, b in times for begin, end in recording.motion_seen[name]):
-            found += times
-    return found
 
 
 def may_act(model: Model, recording: Recording, name: str) -> list[str]:

@@ -18,12 +18,13 @@ from selfcal.base.errors import UserError, first_line, printable
 from selfcal.base.output import whole
 from selfcal.batch.spread import Job, Row, spread
 from selfcal.batch.table import Unit
+from selfcal.readings.tests import TESTS
 
 #: What is kept of an axis of `identify`, and of one of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
 #: Checks of the readings themselves, and of the innovations; a mark is one so many standard deviations off.
-READINGS = ("saturation", "outliers", "held_samples", "motion", "stuck")
+READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
 #: Distinct readings from which on their lattice is known.
@@ -138,7 +139,6 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     failed = {name: one for name, one in checks.items() if not one["passed"]}
     marks = [name for name in failed if name in READINGS]
     marks += [name for name, one in failed.items() if name in INNOVATIONS and _far(one)]
-    marks += ["stuck"] if axis["samples_kept_out"].get("stuck", 0) else []
     lattice = checks.get("lattice", {})
     known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= LEAST_DISTINCT else {}
     return {"marks": list(dict.fromkeys(marks)), **known}

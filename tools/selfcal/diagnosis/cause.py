@@ -114,7 +114,6 @@ class Cause:
     at           the look at it with a known shape, on an axis that it is known to act on.
     of_means     slow: means show all of it, and the look at every sample takes it from them.
     most         times at most that the loop names it on an axis; 0: as often as it is found.
-    before_motion  looks that motion must not be taken for: they come before motion.
     slow         a drift of another law may show it: `identify` weighs more laws.
     source       where it comes from: surroundings, handling, sensor, read-out or model.
     alike        whether two looks of it are one event or source: the same time, line, channel or law.
@@ -154,7 +153,6 @@ class Cause:
     at: Callable[[State, Record, Sequence[float]], Look] | None = None
     of_means: bool = False
     most: int = 0
-    before_motion: Looks | None = None
     slow: bool = False
     source: str = "model"
     alike: Callable[[Look, Look], bool] = _never

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from selfcal.adequacy.document import Identified, parameters_entry, recording_entry, regressors_entry
-from selfcal.adequacy.identify import identify_axis, moved_beside
+from selfcal.adequacy.identify import identify_axis
 from selfcal.base.ending import Held, Stopped, abandon
 from selfcal.base.errors import UserError, note
 from selfcal.base.progress import Doing
@@ -27,7 +27,6 @@ from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
-from selfcal.readings.readings import look
 
 #: Why an axis has no result.
 BELOW_LATTICE = "its noise is below the lattice of its readings: record with a finer range"
@@ -168,9 +167,6 @@ def add_posteriors(
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     findings = [finding for axis in axes.values() for finding in axis["findings"]]
     moved = [one for finding in findings if finding["cause"] == "motion" for one in finding["estimate"]["intervals"]]
-    for name in axes if moved else ():
-        own = recording.along(name)
-        moved += moved_beside(own, model, name, look(own, name, model.group_of(name)))
     rest = recording.without(moved)
     known: dict[str, Identified | None] = {}
     for name, axis in axes.items():

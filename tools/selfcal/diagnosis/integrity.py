@@ -1,47 +1,24 @@
-"""Findings that need little or no fit: of the readings and of the clock, missing samples, motion."""
+"""Findings that need little or no fit: of the readings and of the clock, missing samples."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import median_filter
 from scipy.special import ndtr, pdtrc
 
 from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, Look, State, interval
-from selfcal.likelihood.statemodel import Array, Mask
-from selfcal.readings.motion import Moved
+from selfcal.likelihood.statemodel import Mask
 from selfcal.readings.readings import Readings
 
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
 #: Readings at most of which a log's means show by their lattice.
 AVERAGED_MOST = 20
-#: Motion: the piece of time that rests or moves, s; variances over the resting one's; mean lengths, s, and the shares
-#: of pieces in which a motion begins.
-PIECE_S = 0.5
-MOTION_RATIOS = (1.25, 1.6, 2.2, 3.5, 6.0, 12.0)
-MOTION_S = (1.0, 4.0, 16.0)
-MOTION_BEGINS = (2e-4, 1e-3, 5e-3)
-#: Samples of which the level of an axis takes means at least: the median of single squares is off by 10 % at 1 Hz, and
-#: two axes that are both taken for too quiet look moved.
-LEVEL_BLOCK = 20
-#: How much of the others' energy an axis may show where it moves.
-SENSITIVITIES = (1.0, 0.5, 0.25)
-#: Nats that speak for motion of the gyroscopes, or of the accelerometers, where the others move. The bursts are those
-#: in which all together are loudest.
-KIND_LEAST = 2.0
-#: Axes whose innovations correlate by more than this, beyond chance, share a source.
-SHARED_LEAST = 0.05
-#: Pieces at most: they take 3 KB each.
-PIECES_MOST = 40_000
-#: ln of the evidence for motion that is told. Of 264 clean records at 1 Hz one shows more than 2: 4.4.
-MOTION_LEAST = 4.5
 
 
 def missing(record: Record) -> tuple[dict[str, Look], Mask]:
@@ -154,6 +131,16 @@ def recurring(record: Record, axis: str) -> Look | None:
     return Look("outliers", nats, nats, estimate, {}, when=(float(times[0]), float(times[-1])))
 
 
+def misread(record: Record, axis: str) -> Look | None:
+    """Readings that a map of the firmware or the logger has changed."""
+    readings = record.readings.get(axis)
+    if readings is None or readings.misread is None:
+        return None
+    found = readings.misread
+    share = interval(found.share, math.sqrt(found.share / readings.values.size), "1")
+    return Look("misread", found.nats, found.nats, {"kind": found.kind, "fraction": share}, {})
+
+
 def stuck(record: Record, axis: str) -> Look | None:
     """Stretches of equal readings that are no chance."""
     readings = record.readings.get(axis)
@@ -225,202 +212,6 @@ def uneven(record: Record, axis: str) -> tuple[Look, State] | None:
         return look, state
     y = np.where(np.isfinite(state.y), record.alike[axis], np.nan)
     return look, state.refit(y=y, redrawn=True, **look.changes)
-
-
-def motion(record: Record, wild: Mapping[str, float]) -> tuple[dict[str, Moved], Mask]:
-    """Bursts of energy on two axes or more at once, 0.5 to 16 s long, against each axis' own level about it, and the
-    samples [n] in which any moves.
-
-    `wild`: share of the samples that are outliers beyond doubt, by axis."""
-    # On a lattice coarser than the noise a rare change of code looks like a burst.
-    names = [name for name, state in record.axes.items() if state.lsb < 1.5 * state.best.sigma]
-    n = record.present.size
-    mask = np.zeros(n, bool)
-    if len(names) < 2:
-        return {}, mask
-    rate = record.rate_hz
-    power = _power([record.axes[name].whitened for name in names], rate)
-    share = np.array([wild.get(name, 0.0) for name in names])
-    whole, bursts = _moving(power, rate, share)
-    if bursts and whole >= MOTION_LEAST:
-        whole, bursts = _of_several_sources(record, names, bursts, rate, share) or (whole, bursts)
-    if not bursts or whole < MOTION_LEAST or sum(b - a for a, b in bursts) > 0.25 * n:
-        return {}, mask
-    joined = _joined_bursts(bursts, round(2.0 * rate))
-    pad = max(1, round(0.5 * rate))
-    found: dict[str, Moved] = {}
-    for k, name in enumerate(names):
-        kind = np.array([record.axes[other].unit == record.axes[name].unit for other in names])
-        if _louder(power, joined, kind) < KIND_LEAST or _louder(power, joined, np.arange(len(names)) == k) < 0.0:
-            continue
-        shown = [(a, b) for a, b in joined if _shares(power[:, a:b], k)] or joined
-        times = tuple((a / rate, b / rate) for a, b in shown)
-        found[name] = Moved(times, sum(_burst(power[k, a:b]) for a, b in joined), whole)
-    if len(found) < 2:
-        return {}, mask
-    for a, b in joined:
-        mask[max(0, a - pad) : b + pad] = True
-    return found, mask
-
-
-def _power(whitened: Sequence[Array], rate: float) -> Array:
-    """Squared innovations over the level of their axis about them [axes, n]; 1 where there is none."""
-    squares = []
-    for w in whitened:
-        filled = np.where(np.isfinite(w), w * w, 1.0)
-        around = max(3, min(w.size // 3, round(600.0 * rate)))
-        level = _robust_level(filled, max(LEVEL_BLOCK, round(rate)), around)
-        squares.append(np.minimum(filled / level, 25.0))
-    return np.array(squares)
-
-
-def _of_several_sources(
-    record: Record, names: Sequence[str], bursts: list[tuple[int, int]], rate: float, wild: Array
-) -> tuple[float, list[tuple[int, int]]] | None:
-    """`_moving` of the sources that axes of one kind share in place of these axes; None where none share any.
-
-    A source that several axes show is loud on all of them by itself: its bursts are its own, and no motion. The first
-    source is the direction in which the bursts are loudest, in units of the axes' joint noise at rest."""
-    inside = np.zeros(record.present.size, bool)
-    for a, b in bursts:
-        inside[a:b] = True
-    whitened = np.array([record.axes[name].whitened for name in names])
-    known = np.isfinite(whitened).all(axis=0)
-    shared = False
-    for unit in {record.axes[name].unit for name in names}:
-        own = np.array([k for k, name in enumerate(names) if record.axes[name].unit == unit])
-        rest = np.clip(whitened[own][:, known & ~inside], -3.0, 3.0)
-        together = np.atleast_2d(np.corrcoef(rest))
-        if np.abs(together - np.eye(own.size)).max() < SHARED_LEAST + 4.0 / math.sqrt(rest.shape[1]):
-            continue
-        values, vectors = np.linalg.eigh(together)
-        apart = vectors / np.sqrt(np.maximum(values, 1e-6)) @ vectors.T @ whitened[own]
-        burst = apart[:, known & inside]
-        whitened[own] = np.linalg.eigh(burst @ burst.T)[1].T @ apart
-        wild = np.where(np.isin(np.arange(len(names)), own), wild[own].max(), wild)
-        shared = True
-    return _moving(_power(list(whitened), rate), rate, wild) if shared else None
-
-
-def _moving(power: Array, rate: float, wild: Array) -> tuple[float, list[tuple[int, int]]]:
-    """ln of the evidence that the sensor moves now and then, and when (samples). `power` [axes, n]: squared innovations
-    over the level of their axis, at `rate`, Hz. `wild` [axes]: share of the samples that are outliers beyond doubt.
-
-    In every piece all rests, one axis alone is loud (a jump, an outlier, its own noise), or the
-    sensor moves: all axes are louder by one ratio, for as long as it lasts. Beside that an axis of many outliers is
-    loud by itself in their share of the pieces. The evidence is the likelihood of this hidden Markov model over that of
-    the one without motion, each the mean over lengths and shares: without motion it exceeds e^x with a probability
-    below e^-x.
-    """
-    axes, n = power.shape
-    piece = max(1, round(PIECE_S * rate), n // PIECES_MOST)
-    count = n // piece
-    energy = power[:, : count * piece].reshape(axes, count, piece).sum(axis=2)
-    ratio = np.array(MOTION_RATIOS)
-    louder = energy.T[:, :, None] * 0.5 * (1.0 - 1.0 / ratio) - 0.5 * piece * np.log(ratio)
-    share_wild = np.minimum(0.5, wild * piece)[:, None]
-    with np.errstate(divide="ignore"):
-        outlier = np.log(share_wild) + np.logaddexp.reduce(louder, axis=2, keepdims=True) - math.log(ratio.size)
-    # Over rest's likelihood, which holds the axis' outliers as well.
-    alone = np.logaddexp(np.log1p(-share_wild) + louder, outlier)
-    alone -= np.logaddexp(np.log1p(-share_wild), outlier)
-    together = alone.sum(axis=1)
-    like = np.exp(np.minimum(np.hstack([together, alone.reshape(count, -1)]), 600.0))
-    share = 0.5 / np.repeat([ratio.size, axes * ratio.size], [ratio.size, axes * ratio.size])
-    ln_with, moving = _forward_backward(like, share, ratio.size, piece / rate)
-    ln_without, _ = _forward_backward(like[:, ratio.size :], share[ratio.size :], 0, piece / rate)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], (moving > 0.5).astype(int), [0]])))
-    return ln_with - ln_without, [(int(a) * piece, int(b) * piece) for a, b in edges.reshape(-1, 2)]
-
-
-def _forward_backward(like: Array, share: Array, moved: int, piece_s: float) -> tuple[float, Array]:
-    """ln of the mean likelihood over lengths and shares, and the probability [pieces] of the first `moved` states.
-
-    `like` [pieces, states]: likelihood of each state over rest's; `share` [states] of what begins; `piece_s`, s."""
-    begins, lasts = (grid.ravel()[:, None] for grid in np.meshgrid(MOTION_BEGINS, MOTION_S))
-    ends = np.minimum(1.0, piece_s / lasts)
-    count = len(like)
-    rest, loud = np.ones((begins.size, 1)), np.zeros((begins.size, share.size))
-    ln_evidence = np.zeros(begins.size)
-    ahead = np.empty((count if moved else 0, begins.size, share.size + 1))
-    for k in range(count):
-        rest, loud = (
-            rest * (1.0 - begins * share.sum()) + ends * loud.sum(axis=1, keepdims=True),
-            (loud * (1.0 - ends) + rest * begins * share) * like[k],
-        )
-        total = rest + loud.sum(axis=1, keepdims=True)
-        rest, loud = rest / total, loud / total
-        ln_evidence += np.log(total[:, 0])
-        if moved:
-            ahead[k, :, :1], ahead[k, :, 1:] = rest, loud
-    weight = np.exp(ln_evidence - ln_evidence.max())
-    probability = np.zeros(count)
-    rest, loud = np.ones((begins.size, 1)), np.ones((begins.size, share.size))
-    for k in range(count - 1, -1, -1) if moved else ():
-        both = ahead[k] * np.hstack([rest, loud])
-        here = both[:, 1 : 1 + moved].sum(axis=1) / both.sum(axis=1)
-        probability[k] = float(weight @ here) / float(weight.sum())
-        after = loud * like[k]
-        rest, loud = (
-            rest * (1.0 - begins * share.sum()) + begins * (after @ share)[:, None],
-            after * (1.0 - ends) + rest * ends,
-        )
-        largest = np.maximum(rest, loud.max(axis=1, keepdims=True))
-        rest, loud = rest / largest, loud / largest
-    return float(np.logaddexp.reduce(ln_evidence)) - math.log(begins.size), probability
-
-
-def _joined_bursts(bursts: list[tuple[int, int]], apart: int) -> list[tuple[int, int]]:
-    """In order of time; those closer than `apart` are one."""
-    ordered = sorted(bursts)
-    found = [ordered[0]]
-    for a, b in ordered[1:]:
-        if a - found[-1][1] < apart:
-            found[-1] = (found[-1][0], max(b, found[-1][1]))
-        else:
-            found.append((a, b))
-    return found
-
-
-def _excess(mean: Array) -> Array:
-    """Twice the gain, a sample, of a variance `mean` above the stated one."""
-    return np.where(mean > 1.0, mean - 1.0 - np.log(np.maximum(mean, 1e-12)), 0.0)
-
-
-def _burst(power: Array) -> float:
-    return 0.5 * power.size * float(_excess(power.mean()))
-
-
-def _louder(power: Array, bursts: list[tuple[int, int]], own: Mask) -> float:
-    """ln of the likelihood that the axes `own` are louder in the bursts, in proportion to the others [axes, n], over
-    that of rest; infinite without others."""
-    if own.all():
-        return math.inf
-    mean = np.array([power[own, a:b].mean() for a, b in bursts])
-    others = np.array([max(1.0, float(power[~own, a:b].mean())) for a, b in bursts])
-    size = np.array([b - a for a, b in bursts])
-    ratio = 1.0 + np.outer(SENSITIVITIES, others - 1.0)
-    return 0.5 * float(own.sum()) * float(((mean * (1.0 - 1.0 / ratio) - np.log(ratio)) @ size).max())
-
-
-def _shares(power: Array, k: int) -> bool:
-    """Whether axis `k` is rather as loud as all [axes, n] are together than at rest."""
-    ratio = max(1.0, float(power.mean()))
-    return bool(power[k].mean() * (1.0 - 1.0 / ratio) > math.log(ratio)) and ratio > 1.0
-
-
-def _robust_level(square: Array, block: int, around: int) -> Array:
-    """Local level of squared innovations: the running median of block means, over its own median's ratio."""
-    count = square.size // block
-    if count < 8:
-        return np.full(square.size, max(1e-9, float(np.median(square)) / 0.4549))
-    means = square[: count * block].reshape(count, block).mean(axis=1)
-    size = max(3, min(count, around // block) | 1)
-    middle = median_filter(means, size, mode="reflect")
-    # The median of a mean of `block` squares of normals, against its mean of 1 (Wilson and Hilferty).
-    ratio = (1.0 - 2.0 / (9.0 * block)) ** 3
-    level: Array = np.interp(np.arange(square.size), (np.arange(count) + 0.5) * block, middle / ratio)
-    return np.maximum(level, 1e-9)
 
 
 def masked(state: State, mask: Mask) -> State:

@@ -13,7 +13,7 @@ import numpy as np
 from selfcal.base.ending import Stopped
 from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
-from selfcal.diagnosis.causes import CAUSES, motion, outliers, step, tilt
+from selfcal.diagnosis.causes import CAUSES, motion, step, tilt
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.record import Record, carried
 from selfcal.diagnosis.statistics import judged
@@ -27,11 +27,8 @@ from selfcal.readings.motion import Moved
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
 #: Those of a round at every sample, after one at means.
 QUICK: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and not cause.of_means)
-#: Those that motion must not be taken for, and what they must show to be taken first.
-STATIONARY: tuple[Looks, ...] = tuple(cause.before_motion for cause in CAUSES.values() if cause.before_motion)
-CERTAIN = 25.0
-#: Looks of a cause at an axis of a record, by the record's states: these stay alive with it.
-Seen = dict[tuple[Looks, tuple[int, ...]], tuple[list[Look], Record]]
+#: What the readings of an axis show by themselves.
+READ = (integrity.misread, integrity.held_samples, integrity.stuck, integrity.recurring)
 #: Why an axis is not done.
 INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/README.md): there may be more causes"
@@ -74,8 +71,7 @@ def diagnose_record(
     for name in axes:
         if name not in left_out:
             found[name] = Diagnosed(spoilt.get(name, states[name]), states[name], record, unfinished=INTERRUPTED)
-    seen: dict[str, Seen] = {name: {} for name in states}
-    record = _integrity(record, found, handled, advance, works, seen)
+    record = _integrity(record, found, handled)
     record = _of_means(record, found, means) if means else _together(record, found, advance)
 
     def walk(name: str) -> None:
@@ -84,10 +80,7 @@ def diagnose_record(
         with suppress(Stopped):
             try:
                 with work.within(works[name]):
-                    if name in means:
-                        _rounds(record, one, advance, QUICK, seen=seen[name])
-                    else:
-                        _rounds(record, one, advance, seen=seen[name])
+                    _rounds(record, one, advance, name in means)
             except work.Spent:
                 spent = SPENT
             _end(one, advance)
@@ -146,68 +139,21 @@ def _measured(finding: Finding, final: State) -> Finding:
     return replace(finding, look=finding.look.measured(beside))
 
 
-def _provisional(
-    state: State,
-    record: Record,
-    advance: Callable[[str], None],
-    causes: tuple[Looks, ...] = STATIONARY,
-    seen: Seen | None = None,
-) -> State:
-    """The state with the lines, the colour and the changes of noise beyond doubt: motion stands out of those."""
-    one = Diagnosed(state, state, record)
-    with suppress(work.Spent):
-        _rounds(record, one, advance, causes, CERTAIN, seen, provisional=True)
-    return one.state
-
-
-def _wild(state: State, record: Record) -> float:
-    """Share of the samples that are outliers beyond doubt: they make an axis loud by itself."""
-    looks = outliers.mixed(state, record)
-    return float(looks[0].estimate["fraction"]["median"]) if looks and looks[0].net >= CERTAIN else 0.0
-
-
-def _integrity(
-    record: Record,
-    found: Mapping[str, Diagnosed],
-    handled: Mapping[str, Moved],
-    advance: Callable[[str], None],
-    works: Mapping[str, work.Work],
-    seen: Mapping[str, Seen],
-) -> Record:
-    """What needs no model beyond the first. `handled`: motion that is left out of the record already. `seen`: takes the
-    looks that the rounds need not repeat."""
+def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[str, Moved]) -> Record:
+    """What needs no model beyond the first. `handled`: motion that is left out of the record already."""
     gone, held = integrity.missing(record)
     if held.any():
         masked = {name: integrity.masked(state, held).refit() for name, state in record.axes.items()}
         record = replace(record, axes=masked)
     states = dict(record.axes)
-
-    def quieted(name: str) -> State:
-        with work.within(works[name]):
-            return _provisional(states[name], record, advance, seen=seen[name])
-
-    quiet = dict(zip(states, work.each(quieted, states), strict=True))
-    wild = {name: _wild(state, record) for name, state in quiet.items()}
-    moved, mask = integrity.motion(replace(record, axes=quiet), wild)
-    if moved:
-        # A jump of several axes is loud on them as well. Motion is loud beside the jump that fits it best.
-        quiet |= {name: _provisional(quiet[name], record, advance, (step.looks,)) for name in moved}
-        moved, mask = integrity.motion(replace(record, axes=quiet), wild)
-    for name in states if moved else ():
-        states[name] = integrity.masked(states[name], mask).refit()
     changed = integrity.rate_changes(record)
     for name, one in found.items():
         one.findings.extend(Finding(look, 0, one.state, one.state) for look in changed)
-        for found_at in (look(record, name) for look in (integrity.held_samples, integrity.stuck, integrity.recurring)):
+        for found_at in (look(record, name) for look in READ):
             if found_at is not None:
                 one.findings.append(Finding(found_at, 0, one.state, one.state))
-        parts = [each[name] for each in (handled, moved) if name in each]
-        look = motion.look_of(parts) if parts else None
-        if look is not None:
-            # Motion that is left out already spoilt the first state.
-            known = None if name in handled else score.gain(look, one.state, states[name], record)
-            if known is None or not known.harms:
-                one.findings.append(Finding(look, 0, one.first, states[name], held_out=known))
+        if name in handled:  # the motion that is left out already spoilt the first state
+            one.findings.append(Finding(motion.look_of(handled[name]), 0, one.first, states[name]))
         if name in gone:
             one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
@@ -317,31 +263,25 @@ def _stretched(column: Regressor, means: Record, state: State, record: Record) -
     return replace(column, values=step.raised(n, begin, end))
 
 
-def _rounds(
-    record: Record,
-    one: Diagnosed,
-    advance: Callable[[str], None],
-    causes: tuple[Looks, ...] = LOOKS,
-    least: float = NET_LEAST,
-    seen: Seen | None = None,
-    provisional: bool = False,
-) -> None:
+def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], quick: bool = False) -> None:
+    """Name what is worth it until nothing is. `quick`: what means show is known."""
+    causes = QUICK if quick else LOOKS
     number = 1 + max((finding.round for finding in one.findings), default=0)
     idle: set[Looks] = set()
     while number <= ROUNDS and not one.state.below_lattice:
         advance(f"{one.state.axis}: round {number}")
         waiting = [cause for cause in causes if cause in idle]
-        looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle], least, seen)
+        looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle])
         harms = True
         while harms:  # the state stays, and so do the other looks at it
-            if waiting and (not looks or looks[0].net < least):
-                more, unworthy = _looked(one, record, waiting, least, seen)
+            if waiting and (not looks or looks[0].net < NET_LEAST):
+                more, unworthy = _looked(one, record, waiting)
                 looks, idle, waiting = _by_worth([*looks, *more]), idle | unworthy, []
-            if not looks or looks[0].net < least:
+            if not looks or looks[0].net < NET_LEAST:
                 return
             best, after = looks[0], one.state.refit(**looks[0].changes)
             before = best.before or one.state
-            known = None if provisional else score.gain(best, before, after, record)
+            known = score.gain(best, before, after, record)
             harms = known is not None and known.harms
             if harms:
                 one.harmful.append(best)
@@ -367,31 +307,19 @@ def _gone(finding: Finding, state: State) -> bool:
     )
 
 
-def _looked(
-    one: Diagnosed,
-    record: Record,
-    causes: Sequence[Looks],
-    least: float,
-    seen: Seen | None,
-) -> tuple[list[Look], set[Looks]]:
-    """The looks of `causes`, the most worth first, and the causes of which none is worth `least`.
-
-    A state that is the record's own has been looked at for motion: those looks are `seen`."""
+def _looked(one: Diagnosed, record: Record, causes: Sequence[Looks]) -> tuple[list[Look], set[Looks]]:
+    """The looks of `causes`, the most worth first, and the causes of which none is worth naming."""
     named = Counter(finding.look.cause for finding in one.findings)
     found: list[Look] = []
     idle: set[Looks] = set()
-    axes = tuple(map(id, record.axes.values()))
-    known = seen if seen is not None and record.axes.get(one.state.axis) is one.state else {}
     for cause in causes:
-        if (cause, axes) not in known:
-            known[cause, axes] = cause(one.state, record), record
         looks = [
             look
-            for look in known[cause, axes][0]
+            for look in cause(one.state, record)
             if named[look.cause] < (CAUSES[look.cause].most or ROUNDS) and not any(map(look.repeats, one.harmful))
         ]
         found += looks
-        if all(look.net < least for look in looks):
+        if all(look.net < NET_LEAST for look in looks):
             idle.add(cause)
     return _by_worth(found), idle
 

@@ -23,6 +23,7 @@ from selfcal.readings.readings import (
     RateChange,
     Readings,
     Rows,
+    copied,
     evened,
     look,
     mostly_beyond,
@@ -35,8 +36,6 @@ from selfcal.readings.readings import (
 LEAST, MOST = 200, 10_000_000
 #: Readings so many times beyond the sensor's range are no readings: the unit is wrong, or the file.
 BEYOND = 100.0
-#: Two axes whose steps correlate this well are one, but for a factor, an offset and the rounding of numbers.
-SAME = 1.0 - 1e-7
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
 SLOWEST = 0.99
 #: A stated line whose sine stays below this is at half the rate, where the sine is rounding of the frequency.
@@ -192,7 +191,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         values = recording.in_unit(name, group.unit)
         if _beyond(values[np.isfinite(values)], group) or mostly_beyond(values, group) or clock.rate_hz * dt < SLOWEST:
             continue
-        if _original(recording, name, tuple(states)) is not None:
+        if copied(recording, name, tuple(states)):
             continue
         whole = recording.columns[name].clock is None and bool(np.isfinite(values).all())
         rows = own_rows(recording, name) if whole and held is None else None
@@ -253,7 +252,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     for cause, (column, unit) in SIDE_CHANNELS.items():
         if column in recording.columns:
             values = recording.in_unit(column, unit)
-            if np.ptp(values) > 0.0 and _original(recording, column, tuple(states)) is None:
+            if np.ptp(values) > 0.0 and not copied(recording, column, tuple(states)):
                 channels[cause] = bridged(on_grid(recording.clock, values)[0])
                 names[cause] = column
     return Record(
@@ -307,27 +306,11 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
     own = recording.clock_of(name).rate_hz
     if own < SLOWEST * recording.rate_hz:
         return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"
-    original = _original(recording, name, [one for one in model.axes if one in recording.columns and one != name])
-    if original is not None:
-        return f"its readings are those of {original}, but for a factor and an offset: which column is {name}?"
+    if told := copied(recording, name, [one for one in model.axes if one in recording.columns and one != name]):
+        return told
     if _varies(values):
         return "too few of its readings are none that stick or are clipped"
     return "every reading is the same"
-
-
-def _original(recording: Recording, name: str, others: Sequence[str]) -> str | None:
-    """The axis of `others` that this column is a copy of: no noise of its own."""
-    own = np.diff(recording.columns[name].values)
-    for other in others:
-        theirs = np.diff(recording.columns[other].values)
-        if own.size != theirs.size:
-            continue
-        both = np.isfinite(own) & np.isfinite(theirs)
-        a, b = own[both], theirs[both]
-        size = float(np.dot(a, a)) * float(np.dot(b, b))
-        if both.sum() >= LEAST and size > 0.0 and abs(float(np.dot(a, b))) >= SAME * math.sqrt(size):
-            return other
-    return None
 
 
 def _varies(values: Array) -> bool:

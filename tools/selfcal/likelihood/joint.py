@@ -98,7 +98,7 @@ def bridged_rows(y: Array) -> Array:
 
 
 def without_lines(y: Array, least: float = CLEAR_LINE) -> tuple[Array, Mask]:
-    """Records [m, n] without gaps less their lines of `least` times the level, and the frequencies [n // 2 + 1] at which
+    """Records [m, n] without gaps less their lines of `least` times the level, and where [n // 2 + 1] of the spectrum
     that was done.
 
     A line is taken to 0 Hz and its slow amplitude out. The amplitude goes on as its mirror at the ends, so that one

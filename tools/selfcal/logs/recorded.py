@@ -88,8 +88,8 @@ class Recording:
         return round((self.since_power_on_s + self.start_s) * self.rate_hz)
 
     @cached_property
-    def motion_seen(self) -> dict[str, list[list[float]]]:
-        """By axis the stretches of motion, seconds of the recording, of each one that was looked at (readings.py)."""
+    def motion_seen(self) -> dict[str, Any]:
+        """By axis its motion, once it was looked at (readings/motion.py)."""
         return {}
 
     @property

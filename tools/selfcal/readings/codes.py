@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from selfcal.readings.budget import nats_of
 from selfcal.readings.lattice import Lattice
 
 Array = NDArray[np.float64]
@@ -38,8 +39,8 @@ WIDE = tuple(float(2.0**k) for k in np.linspace(-2.0, 1.6, 13))
 SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
 #: Readings beyond a dead band on either side, at least: a limit has none on one.
 BEYOND = 3
-#: Net evidence from which on codes are unequal, nats, and standard deviations by which the neighbours' counts lack.
-NATS, LACKING = 10.0, 4.0
+#: Standard deviations by which the neighbours' counts lack at least.
+LACKING = 4.0
 #: Cells in the noise of readings on no lattice, and readings of one value, and their share, at least.
 CELLS, PILE, PILE_SHARE = 4.0, 20, 0.01
 #: Times that it is commoner than the next one, at least.
@@ -174,18 +175,18 @@ def uneven_of(values: Array, lattice: Lattice | None) -> Uneven | None:
         read = max(_near(read), key=lambda one: _gain(count, fit, one.to))
     fit = _fit(count, read.to, fit.sigma)
     nats = fit.value - alike.value - math.log(many * (SHARES.size + WIDTHS))
-    if nats < NATS:
+    if nats < nats_of("quantization"):
         return None
     total, expected = count.sum(axis=0), fit.chance @ count.sum(axis=1)
     lost = float(expected[read.places].sum()) - float(total[read.places].sum())
     if lost < LACKING * math.sqrt(float(expected[read.places].sum())):
         return None  # readings come from everywhere: a word that the logger shows for lost ones
-    if _of_all(count, alike, total, read) > fit.value - NATS:
+    if _of_all(count, alike, total, read) > fit.value - nats_of("quantization"):
         return None
     # Noise that comes and goes piles up as well: where each piece has its own, it must not.
     nats = _of_pieces(count, read.to, fit.sigma) - _of_pieces(count, np.eye(many), fit.sigma)
     nats -= math.log(many * (SHARES.size + WIDTHS))
-    if nats < NATS:
+    if nats < nats_of("quantization"):
         return None
     if read.inner >= 0:
         inside = range(read.place - read.inner - 1, read.place + read.inner + 2)

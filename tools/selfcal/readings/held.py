@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
 from selfcal.logs.sampling import followed_phase
+from selfcal.readings.budget import nats_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,9 +35,9 @@ ONE_EACH = 0.75
 SMEARED, LEFT = 0.25, 0.35
 #: Share of readings that are equal by chance from which on a row may be; rows that repeat at no beat, at most.
 CHANCE, RUN_MOST = 0.01, 5
-#: Rows to a reading in a stretch at most, net evidence of a stretch, nats, and stretches at most. The chance that a row
+#: Rows to a reading in a stretch at most, and stretches at most. The chance that a row
 #: of it does not repeat, and equal readings that are supposed among those of a stretch.
-RATIO_MOST, STRETCH_NATS, STRETCHES, MISSED, SUPPOSED = 5, 12.0, 8, 0.02, 2.0
+RATIO_MOST, STRETCHES, MISSED, SUPPOSED = 5, 8, 0.02, 2.0
 #: Of a channel that is read anew each period: rows of one at least, changes at least, and their evidence, nats.
 PERIOD_LEAST, CHANGES_LEAST, PERIOD_NATS = 2.5, 8, 20.0
 #: Rows in a bin of the phase, and bins at most.
@@ -104,7 +105,7 @@ def slower(values: Array) -> list[Slower]:
     found: list[Slower] = []
     while len(found) < STRETCHES:
         best = max((_slower(same, ratio, chance) for ratio in range(2, RATIO_MOST + 1)), key=lambda one: one.nats)
-        if best.nats < STRETCH_NATS:
+        if best.nats < nats_of("held_samples"):
             break
         found.append(best)
         same[best.rows] = False

@@ -14,15 +14,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import ndtr
 
+from selfcal.readings.budget import nats_of
 from selfcal.readings.lattice import Lattice, lattice_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: Readings that are one value: how many at least, the evidence, nats, and the share up to which they are left out.
+#: Readings that are one value: how many at least, and the share up to which they are left out.
 #: Of a value with more, either the value or the others may be the noise. Then most averages have too few readings too,
 #: and a bias that walks is lost between the others.
-LEAST, NATS, MOST = 5, 16.0, 0.5
+LEAST, MOST = 5, 0.5
 #: Share of the readings from which on the commonest value has no part in the steps that show the noise, and ln of its
 #: count over the expected one then, at least: on a lattice near the noise unequal codes have less.
 COMMON, COMMON_EXCESS = 0.2, 0.7
@@ -146,7 +147,7 @@ def _far(y: Array, sigma: float, rate_hz: float) -> tuple[float, float] | None:
         cells = 2.0 * width / lattice.step if lattice is not None else 20.0
         expected = (np.count_nonzero(np.abs(others - value) < width) + 1.0) / cells
         nats = count * math.log(count / expected) - count + expected - math.log(unique.size)
-        if count > expected and nats > NATS and (best is None or nats > best[1]):
+        if count > expected and nats > nats_of("outliers") and (best is None or nats > best[1]):
             best = value, float(nats)
     return best
 
@@ -206,7 +207,11 @@ def _within(y: Array, sigma: float, lattice: Lattice | None) -> tuple[float, flo
     nats = float(worth[top]) - math.log(unique.size)
     own = y == value[top]
     size = int(np.count_nonzero(own))
-    if nats < NATS or y.size - size < 8 * AROUND or (size > COMMON * y.size and excess[top] < COMMON_EXCESS):
+    if (
+        nats < nats_of("outliers")
+        or y.size - size < 8 * AROUND
+        or (size > COMMON * y.size and excess[top] < COMMON_EXCESS)
+    ):
         return None
     smooth = float(expected[top])
     if codes:

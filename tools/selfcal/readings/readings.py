@@ -17,14 +17,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
+from selfcal.base.grid import block_means, equal_runs, noise_of, runs
 from selfcal.logs.recording import Column, Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
+from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import Uneven, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of
 from selfcal.readings.lost_words import Recurring, recurring_of
-from selfcal.readings.motion import Moved, loud
+from selfcal.readings.misread import Misread, misread_of, spans_of
+from selfcal.readings.motion import Moved, loud, moves_of
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -39,16 +42,19 @@ COMMON_S, COMMON_OFF = 1.0, 3e-3
 #: Longest gap that motion is looked for across, s.
 GAP_MOST_S = 240.0
 #: ln of the probability, a record, of a run of equal readings that is no chance.
-LN_STUCK = math.log(1e-9)
+LN_STUCK = -nats_of("stuck")
+#: Readings in a piece of the record that shows how common a code is, at least; longest runs that are counted; times
+#: that there are as many as chance makes, at least. Beyond so many steps in the noise chance is not well known.
+HELD_PIECE, HELD_MOST, HELD_TIMES, HELD_COARSEST = 64, 64, 1.5, 0.8
 #: Samples on either side that make the level of one.
 AROUND = 32
-#: Readings at a limit are told of from this evidence on, nats: as a look of the diagnosis.
-CLIPPED_LEAST = -math.log(5e-4)
 #: On a lattice coarser than the noise: the evidence in nats, pieces of a record that have a level each, and codes, at
 #: most.
 PILED_LEAST, PIECES, CODES_MOST = 30.0, 200, 40
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
+#: Two axes whose steps correlate this well are one, but for a factor, an offset and the rounding of numbers.
+SAME = 1.0 - 1e-7
 #: Steps of EM at most, and the change of the noise at which it has settled.
 ITERATIONS, SETTLED = 200, 1e-6
 
@@ -86,9 +92,9 @@ class Clipped:
 ROUNDED = 1e-5
 #: Share of readings beyond the range from which on the others are no readings of a sensor either.
 MOST_BEYOND = 0.5
-#: An axis moves with others if its mean square is so many standard deviations above that of the rest. A wild reading
-#: counts as so many of it at most.
-LOUDER_SD, WILD = 6.0, 30.0
+#: Share of readings beyond the range from which on they count as clipped, and noises to the range at most: the noise of
+#: the others is too small.
+BEYOND_MOST, BEYOND_SD = 0.01, 8.0
 
 
 @dataclass(frozen=True)
@@ -111,6 +117,7 @@ class Readings:
     stuck_nats: float = 0.0
     clipped: Clipped | None = None
     recurring: Recurring | None = None
+    misread: Misread | None = None
     moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held: Held | None = None
@@ -120,7 +127,7 @@ class Readings:
     @cached_property
     def uneven(self) -> Uneven | None:
         """How the codes of the readings are unequal."""
-        return uneven_of(self.values, self.lattice)
+        return None if self.misread is not None else uneven_of(self.values, self.lattice)
 
     @property
     def held_hz(self) -> float | None:
@@ -141,28 +148,14 @@ class Readings:
         noise = float(np.diff(values).std()) / math.sqrt(2.0) if values.size > 2 else 0.0
         return float(np.spacing(largest)) / noise if noise > 0.0 and np.isfinite(largest) else 0.0
 
-    def without(self, moved: Sequence[Sequence[float]]) -> Readings:
-        """The same where other axes show that the sensor moved: stretches, seconds of the whole recording. An axis that
-        shows no motion of its own must be louder in them than in the rest."""
-        time, mask = self.recording.start_s + self.recording.time_s, self.moving.copy()
-        for begin_s, end_s in moved:
-            mask |= (time >= begin_s) & (time < end_s)
-        if not moved or (self.moved is None and not self._louder(mask)):
-            return self
-        working, times = np.where(mask, np.nan, self.working), tuple(_intervals(self.recording, mask))
-        found = Moved(times, 0.0, 0.0) if self.moved is None else replace(self.moved, intervals=times)
-        return replace(self, moving=mask, working=working, moved=found)
-
-    def _louder(self, mask: Mask) -> bool:
-        """Whether differences of neighbours are larger inside a mask [n] than outside, beyond chance."""
-        square = np.diff(self.working) ** 2
-        inside, outside = square[mask[1:]], square[~mask[1:]]
-        inside, outside = inside[np.isfinite(inside)], outside[np.isfinite(outside)]
-        if not inside.size or not outside.size:
-            return False
+    def matters(self, block: int) -> bool:
+        """Whether the readings that moved change the noise of means of `block` readings by more than its scatter."""
+        square = np.diff(block_means(np.where(self.stuck, np.nan, self.values), block)) ** 2
+        moved = block_means(self.moving.astype(np.float64), block) > 0.0
+        rest = square[np.isfinite(square) & ~(moved[1:] | moved[:-1])]
         # A squared difference of normal noise scatters by 1.7 times its mean: the two neighbours share a reading.
-        least = 1.0 + LOUDER_SD * math.sqrt(3.0 / inside.size)
-        return bool(np.minimum(inside, WILD * outside.mean()).mean() > least * outside.mean())
+        most = (1.0 + math.sqrt(3.0 / max(rest.size, 1))) * float(np.mean(rest)) if rest.size else 0.0
+        return float(np.nanmean(square)) > most
 
     @property
     def intervals(self) -> list[list[float]]:
@@ -180,10 +173,7 @@ def look(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis at the part's own rate. O(n log n)."""
     even, changes = evened(recording)
     own, found = thinned(even, (axis,))
-    seen = replace(readings_of(own, axis, group), held=found, changes=changes)
-    times = () if seen.moved is None else seen.moved.intervals
-    recording.motion_seen[axis] = [[a + own.start_s, b + own.start_s] for a, b in times]
-    return seen
+    return replace(readings_of(own, axis, group), held=found, changes=changes)
 
 
 def within(values: NDArray[np.floating[Any]], group: Group) -> Mask:
@@ -206,13 +196,25 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis of an evened and thinned recording."""
     values = recording.in_unit(axis, group.unit)
     none = np.zeros(values.size, bool)
-    # Readings beyond the part's range are none: the engines leave them out.
+    misread = spans_of(values, recording.rate_hz)
+    if misread is not None and misread.undone is not None:
+        values = misread.undone
+    # Readings beyond the part's range are none: the engines leave them out. Of many it is known that they are beyond.
     inside = within(values, group)
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
         return Readings(recording, values, values, values, None, none, none)
+    beyond = float(np.mean(~inside & np.isfinite(values)))
     sound = values if inside.all() else np.where(inside, values, np.nan)
+    near = group.range - abs(float(np.median(_known(sound)))) < BEYOND_SD * noise_of(values)
+    if beyond > BEYOND_MOST and near:
+        values = sound = np.clip(values, -group.range, group.range)
     lattice = lattice_of(_known(sound), recording.rate_hz)
-    recurring = recurring_of(sound, recording.rate_hz)
+    if misread is None and (lattice is None or not lattice.carried):
+        misread = misread_of(sound, lattice)
+        limited = _clipped(sound, lattice) if misread is not None and misread.kind != "range_change" else None
+        if limited is not None and abs(limited.limit) > float(np.nanstd(sound)):
+            misread = None  # it ends at a limit of the part, and not at zero
+    recurring = recurring_of(sound, recording.rate_hz) if misread is None else None
     if recurring is not None and ((lattice is not None and lattice.carried) or uneven_of(sound, lattice) is not None):
         recurring = None  # the codes of a counter recur; a dead band takes its counts from its neighbours
     if recurring is not None:
@@ -227,12 +229,13 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         repeats[one.rows] = True
     if stretches:
         values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
-    clipped = _clipped(sound, lattice)
+    folded = misread is not None and misread.undone is None and misread.kind != "range_change"  # ends at zero
+    clipped = None if folded else _clipped(sound, lattice)
     whole = sound if clipped is None else _unclipped(sound, clipped, lattice)[1]
-    moving, moved = _moving(recording, whole, lattice)
+    moving, moved = _moving(recording, axis, whole, lattice)
     if moving.any():
         sound = np.where(moving, np.nan, sound)
-        clipped = _clipped(sound, lattice)
+        clipped = None if folded else _clipped(sound, lattice)
     working = drawn = values
     if clipped is not None:
         working, drawn = _unclipped(sound, clipped, lattice)
@@ -242,8 +245,22 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     counts = {"saturated": lost, "stuck": int((stuck | repeats).sum())}
     if recurring is not None:
         counts["outliers"] = int(recurring.mask.sum())
-    found = Readings(recording, values, working, drawn, lattice, stuck, moving, nats, clipped, recurring, moved, counts)
-    return replace(found, slower=stretches)
+    return Readings(
+        recording,
+        values,
+        working,
+        drawn,
+        lattice,
+        stuck,
+        moving,
+        stuck_nats=nats,
+        clipped=clipped,
+        recurring=recurring,
+        misread=misread,
+        moved=moved,
+        kept_out=counts,
+        slower=stretches,
+    )
 
 
 def _known(values: NDArray[Any]) -> NDArray[Any]:
@@ -252,21 +269,15 @@ def _known(values: NDArray[Any]) -> NDArray[Any]:
     return values if finite.all() else values[finite]
 
 
-def _stretches(mask: Mask) -> list[tuple[int, int]]:
-    """First row and the row after the last of every stretch of a mask [n]."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
-
-
 def _intervals(recording: Recording, mask: Mask) -> list[tuple[float, float]]:
     """Start and end of every stretch of a mask [n], s."""
     time, step = recording.time_s, 1.0 / recording.rate_hz
-    return [(float(time[a]), float(time[b - 1]) + step) for a, b in _stretches(mask)]
+    return [(float(time[a]), float(time[b - 1]) + step) for a, b in runs(mask)]
 
 
-def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
-    """Rows [n] in which values [n], NaN where they are none, show that the sensor moved, and its motion. A gap is no
-    longer than those that matter."""
+def _moving(recording: Recording, axis: str, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
+    """Rows [n] in which the sensor moved, by the energy of all axes and by the level of `values` [n], NaN where they
+    are none; and the motion of the axis. A gap is no longer than those that matter."""
     rate = recording.rate_hz
     place: Rows | None = None
     even = values
@@ -275,14 +286,20 @@ def _moving(recording: Recording, values: Array, lattice: Lattice | None) -> tup
         place -= place[0]
         even = np.full(int(place[-1]) + 1, np.nan)
         even[place] = values
-    found = loud(even, rate, lattice.step if lattice is not None else 0.0)
-    if found is None:
+    away = loud(even, rate, lattice.step if lattice is not None else 0.0)
+    loudest = moves_of(recording).get(axis)
+    found = [one for one in (away, loudest) if one is not None]
+    if not found:
         return np.zeros(values.size, bool), None
     mask = np.zeros(even.size, bool)
-    for begin_s, end_s in found.intervals:
+    for begin_s, end_s in away.intervals if away is not None else ():
         mask[round(begin_s * rate) : round(end_s * rate)] = True
     mask = mask if place is None else mask[place]
-    return mask, replace(found, intervals=tuple(_intervals(recording, mask)))
+    time = recording.time_s
+    for begin_s, end_s in loudest.intervals if loudest is not None else ():
+        mask |= (time >= begin_s) & (time < end_s)
+    times = tuple(_intervals(recording, mask))
+    return mask, Moved(times, sum(one.nats for one in found), max(one.net for one in found))
 
 
 # ------------------------------------------------------------------------------------------------------ change of rate
@@ -429,6 +446,36 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
 # ------------------------------------------------------------------------------------------------------- stuck readings
 
 
+def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]:
+    """Repeats [n] in runs of equal readings of which there are more than the lattice makes, and the evidence in nats.
+
+    By chance a code of the share p of its piece of the record makes n (1 - p) p^k runs longer than k. A dependence of
+    neighbours raises every p alike: as much as the repeats that are single say."""
+    n, none = values.size, np.zeros(values.size, bool)
+    size = max(HELD_PIECE, -(-n // PIECES))
+    longest = int(lengths.max(initial=0))
+    if longest < 3 or n < 2 * size:
+        return none, 0.0
+    piece = np.minimum(np.arange(n) // size, n // size - 1)
+    _, code = np.unique(values, return_inverse=True)  # NaN are one code, and in no run
+    _, counts = np.unique(piece * np.int64(n) + code, return_counts=True)
+    p = counts / size
+    pairs, single = float((p * counts).sum()), float(np.count_nonzero(lengths == 2))
+    p = np.minimum(p * max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0)), 1.0 - 1.0 / n)
+    best, least = 0.0, 0
+    for length in range(3, min(longest, HELD_MOST) + 1):
+        expected = float((counts * (1.0 - p) * p ** (length - 1)).sum()) + 1.0
+        seen = float(np.count_nonzero(lengths >= length))
+        nats = seen * math.log(seen / expected) - seen + expected if seen > HELD_TIMES * expected else 0.0
+        if nats > best:
+            best, least = nats, length
+    if best < -LN_STUCK:
+        return none, 0.0
+    held = np.repeat(lengths >= least, lengths)
+    held[starts] = False
+    return held, best
+
+
 def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, float]:
     """Whole runs of equal readings [n] that are no chance, and the evidence in nats. `stated`: a length from which on a
     run is stuck whatever the chance; 0: none.
@@ -437,8 +484,7 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     in its middle; the share of repeats; their share among readings after a repeat, since a dead band has more.
     """
     n = values.size
-    change = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
-    lengths = np.diff(change, append=n)
+    change, lengths = equal_runs(values)
     none = np.zeros(n, bool)
     if lengths.max(initial=0) < 4:
         return none, 0.0
@@ -460,7 +506,9 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     least = min(limit, stated) if stated > 0 else limit
     stuck = lengths >= least
     if not stuck.any():
-        return none, 0.0
+        noise = float(np.nanstd(np.diff(values))) / math.sqrt(2.0)
+        near = lattice is not None and (lattice.too_coarse or lattice.step > HELD_COARSEST * noise)
+        return (none, 0.0) if near else _many_runs(values, change, lengths)
     frozen = values[change[stuck]]
     again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
     if again > 1 and 2 * int(lengths[stuck].sum()) > n:
@@ -520,7 +568,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
         else:
             # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
             worth = max(worth, (count - 2) * math.log(100.0))
-        if worth < CLIPPED_LEAST or count < 0.5 * expected:
+        if worth < nats_of("saturation") or count < 0.5 * expected:
             continue
         mask = np.zeros(values.size, bool)
         mask[rows[at_edge]] = True
@@ -645,11 +693,29 @@ def _quiet_window(y: Array) -> int:
     """Readings over which the mean of a record [n] is quietest: the averaging length of the least Allan variance. It is
     all of them where the longest that the record shows is the best."""
     best, least, length = 2 * AROUND, math.inf, 2 * AROUND
-    means = y[: y.size // length * length].reshape(-1, length).mean(axis=1)
+    means = block_means(y, length)
     while means.size >= 8:
         variance = 0.5 * float((np.diff(means) ** 2).mean())
         if variance < least:
             best, least = length, variance
-        means = means[: means.size // 2 * 2].reshape(-1, 2).mean(axis=1)
+        means = block_means(means, 2)
         length *= 2
     return y.size if 2 * best >= length else best
+
+
+# ------------------------------------------------------------------------------------------------------ copied columns
+
+
+def copied(recording: Recording, name: str, others: Sequence[str]) -> str:
+    """What to say of a column that is a copy of one of the `others`: no noise of its own. Empty where it is none."""
+    own = np.diff(recording.columns[name].values)
+    for other in others:
+        theirs = np.diff(recording.columns[other].values)
+        if own.size != theirs.size:
+            continue
+        both = np.isfinite(own) & np.isfinite(theirs)
+        a, b = own[both], theirs[both]
+        size = float(np.dot(a, a)) * float(np.dot(b, b))
+        if both.sum() >= PIECES and size > 0.0 and abs(float(np.dot(a, b))) >= SAME * math.sqrt(size):
+            return f"its readings are those of {other}, but for a factor and an offset: which column is {name}?"
+    return ""

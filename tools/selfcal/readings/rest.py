@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from selfcal.base.grid import runs
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
@@ -65,13 +66,10 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
     length_s = piece / recording.rate_hz
     start = recording.start_s
 
-    def runs(mask: NDArray[np.bool_]) -> list[tuple[float, float]]:
-        edges = np.flatnonzero(np.diff(np.concatenate([[0], mask.astype(np.int8), [0]])))
-        return [(start + float(a) * length_s, start + float(b) * length_s) for a, b in edges.reshape(-1, 2)]
+    def times(mask: NDArray[np.bool_]) -> list[tuple[float, float]]:
+        return [(start + a * length_s, start + b * length_s) for a, b in runs(mask)]
 
-    quiet = runs(~moving)
-    longest = max(quiet, key=lambda run: run[1] - run[0], default=None)
-    return Rest(tuple(runs(moving)), longest)
+    return Rest(tuple(times(moving)), max(times(~moving), key=lambda run: run[1] - run[0], default=None))
 
 
 def _loudest(square: NDArray[np.float64], piece: int) -> float:

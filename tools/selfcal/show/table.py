@@ -20,6 +20,7 @@ from selfcal.base.errors import called, printable
 from selfcal.base.output import TABLE_WIDTH, console_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
+from selfcal.readings.misread import MISREAD
 
 #: Laws of smaller probability are not spoken of where the grid does not bear them.
 TOLD_OF = 0.01
@@ -152,10 +153,14 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
         case "held_samples":
             share = f"{100.0 * value:.2g} % of the rows repeat the one before at no fixed rate"
             return f"held_samples: {share}: log at the sensor's own rate"
-        case "motion":
+        case "misread":
+            return f"misread ({outcome['kind']}): {100.0 * value:.2g} % of the readings: {MISREAD[outcome['kind']]}"
+        case "quantization":
+            return f"quantization: {100.0 * value:.2g} % of the readings are read as another code: a dead band?"
+        case "motion" | "stuck":
             times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in outcome["intervals"][:TIMES_MOST])
             more = len(outcome["intervals"]) - TIMES_MOST
-            return f"motion, left out: {times}{f' and {more} more' if more > 0 else ''}"
+            return f"{check}, left out: {times}{f' and {more} more' if more > 0 else ''}"
         case "channel":
             told = f"{outcome['column']} ({outcome['form']}) explains {nats} nats of it"
             return f"channel: {told}: N, K and the bias include that"

@@ -105,7 +105,7 @@ def identify(
 
     from selfcal.adequacy.checks import against
     from selfcal.adequacy.document import Identified, to_document
-    from selfcal.adequacy.identify import chosen_axes, identify_axis, left_out_together, stretch_of, with_reasons
+    from selfcal.adequacy.identify import chosen_axes, identify_axis, stretch_of, with_reasons
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.batch.fail_on import check
@@ -159,7 +159,6 @@ def identify(
                 )
             except UserError as error:
                 found[name] = error
-        left_out_together(found, recording, loaded_model, engine, decimate, draw=plot is not None)
         with_reasons(found, recording, loaded_model)
         document = to_document(recording, found, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)
@@ -170,15 +169,16 @@ def identify(
         ]
         if doubtful and suspicion:
             from selfcal.diagnosis.suspicion import suspicions, weigh_more_laws, with_added_laws
+            from selfcal.readings.tests import TESTS
 
             progress.update(task, description="strongest suspicion")
             suspected = suspicions(recording, loaded_model, doubtful)
             for name, shown in suspected.items():
                 document["axes"][name]["suspicion"] = shown.cause
             for name in doubtful:
-                for cause in ("held_samples", "outliers", "saturation"):  # shown by the readings themselves
-                    if cause in document["axes"][name]["checks"]:
-                        document["axes"][name]["suspicion"] = cause
+                for test in TESTS:  # shown by the readings themselves
+                    if test.name in document["axes"][name]["checks"]:
+                        document["axes"][name]["suspicion"] = test.name
             if model is None:
                 progress.update(task, description="more laws")
                 again = with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)

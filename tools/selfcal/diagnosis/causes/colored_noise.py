@@ -95,7 +95,6 @@ CAUSE = Cause(
     source="read-out",
     alike=lambda a, b: True,
     looks=looks,
-    before_motion=looks,
     slow=True,
     pictures=shown("correlation"),
     least=_least,

@@ -1,21 +1,18 @@
-"""The sensor was moved or shaken. `readings.motion` finds the stretches of one axis in the raw readings, before any
-fit; `integrity.motion` the quieter ones afterwards, by energy that several axes share."""
+"""The sensor was moved or shaken. `readings.motion` finds the stretches in the raw readings, before any fit."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from selfcal.diagnosis.cause import Cause, Key, counted, shown
 from selfcal.likelihood.state import Look
-from selfcal.readings.motion import Moved, joined
+from selfcal.readings.motion import Moved
 
 
-def look_of(parts: Sequence[Moved]) -> Look:
+def look_of(moved: Moved) -> Look:
     """The finding of one axis."""
-    intervals = [[a, b] for a, b in joined([each for one in parts for each in one.intervals])]
-    nats, worth = sum(one.nats for one in parts), sum(one.net for one in parts)
-    return Look("motion", nats, worth, {"intervals": intervals}, {}, when=(intervals[0][0], intervals[-1][1]))
+    intervals = [list(each) for each in moved.intervals]
+    return Look("motion", moved.nats, moved.net, {"intervals": intervals}, {}, when=(intervals[0][0], intervals[-1][1]))
 
 
 def _seconds(value: float) -> str:

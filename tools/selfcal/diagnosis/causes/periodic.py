@@ -316,7 +316,6 @@ CAUSE = Cause(
     source="surroundings",
     looks=looks,
     at=at,
-    before_motion=looks,
     alike=_alike,
     settle=_settle,
     pictures=_pictures,

@@ -243,7 +243,6 @@ CAUSE = Cause(
     alike=_alike,
     looks=looks,
     most=3,
-    before_motion=once,
     pictures=shown("marked_level"),
     once="a change of the noise is an event of its recording",
     no_carry=lambda look: "" if look.when else "the bank's noise level follows no channel",

@@ -1,0 +1,45 @@
+"""Values on an even grid: runs of a mask, runs of equal values, means of blocks, noise from differences."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+
+#: Median absolute deviation of a normal with the standard deviation 1.
+MEDIAN_SD = 0.6745
+
+
+def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:
+    """First row and the row after the last of every run of true values of a mask [n]. Runs with a gap of at most
+    `apart` rows are one."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))).reshape(-1, 2)
+    new = np.flatnonzero(edges[1:, 0] - edges[:-1, 1] > apart) + 1
+    return [(int(some[0, 0]), int(some[-1, 1])) for some in np.split(edges, new) if some.size]
+
+
+def equal_runs(values: Array) -> tuple[Rows, Rows]:
+    """First row [k] and length [k] of every run of equal values [n]; NaN is like no other."""
+    first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
+    return first, np.diff(first, append=values.size)
+
+
+def block_means(values: Array, size: int) -> Array:
+    """Means of whole blocks of `size` values [n], [n // size]; NaN where one is."""
+    return np.asarray(values[: values.size // size * size].reshape(-1, size).mean(axis=1))
+
+
+def noise_of(values: Array) -> float:
+    """White noise of values [n] by the median of their differences. On a lattice coarser than it most of them are
+    none: then by the 60 % quantile. A walk that is slower than the noise has no part in it, nor have rare jumps."""
+    steps = np.abs(np.diff(values))
+    steps = steps[np.isfinite(steps)]
+    if not steps.size:
+        return 0.0
+    middle, upper = np.quantile(steps, [0.5, 0.6])
+    return max(float(middle) / MEDIAN_SD, float(upper) / 0.8416) / math.sqrt(2.0)
