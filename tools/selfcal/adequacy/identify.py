@@ -193,8 +193,11 @@ def identify_axis(
 
 
 def may_act(model: Model, recording: Recording, name: str) -> list[str]:
-    """The columns that may act on an axis: the side channels and the other axes."""
+    """The columns that may act on an axis: the side channels and the other axes, but for those that the model file has
+    move together with it."""
     known = {*model.axes, *(column for column, _ in SIDE_CHANNELS.values())} - {name}
+    if model.hidden_input is not None and name in model.hidden_input.loadings:
+        known -= model.hidden_input.loadings.keys()
     return [column for column in recording.columns if column in known]
 
 

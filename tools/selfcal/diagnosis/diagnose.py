@@ -125,7 +125,8 @@ def less_stated(one: Diagnosed, model: Model) -> Diagnosed:
 def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
     """Axes without a cause must pass the checks of `identify`, whose bank has the whole model."""
     for name, one in found.items():
-        if one.findings or one.state.below_lattice or model.beyond:
+        # Beside a hidden quantity other axes explain one as it does.
+        if one.findings or one.hidden is not None or one.state.below_lattice or model.beyond:
             continue
         with suppress(UserError):  # no report, no checks
             look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)

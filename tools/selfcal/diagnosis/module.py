@@ -14,7 +14,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import logsumexp
 
 from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
@@ -44,6 +44,8 @@ MEANS_S = 1.0
 LEAST, GAPS = 600, 0.3
 #: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
 CERTAIN = 25.0
+#: A mean so many deviations of the noise off the median of this many is left out: a spike is no event that lasts.
+SPIKE, SPIKE_OF = 7.0, 5
 #: Events of a module at most, those of one axis among them.
 MOST = 16
 #: Slow columns whose drift is fitted anew beside them: the one that was fitted without has swallowed a part of them.
@@ -430,6 +432,8 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     scale = np.array([np.nanstd(np.diff(row)) for row in y]) / math.sqrt(2.0)
     y = (y - np.nanmean(y, axis=1)[:, None]) / scale[:, None]
     span = block * dt
+    whole = bridged_rows(y)
+    y = np.where(np.abs(whole - median_filter(whole, (1, SPIKE_OF))) < SPIKE, y, np.nan)
     whole, kept_out = without_lines(bridged_rows(y))
     y = np.where(np.isfinite(y), whole, np.nan)
     side = {cause: blocks(values, block) for cause, values in channels.items()}

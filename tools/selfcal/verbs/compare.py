@@ -92,7 +92,10 @@ def compare(
     curves: dict[str, dict[str, Any]] = {}
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
     part |= reading
-    names = [str(one) if isinstance(one, Path | str) else str(one.path) for one in logs]
+    names = [
+        str(one if isinstance(one, Path | str) else getattr(one, "path", f"arrays {number}"))
+        for number, one in enumerate(logs, 1)
+    ]
     for log, place in zip(logs, names, strict=True):
         known = identify(log, suspicion=False, **part)
         identified = known["axes"]
