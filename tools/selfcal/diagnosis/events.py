@@ -376,8 +376,9 @@ def _before_and_after(one: Diagnosed, unit: str, known: Identified | None) -> di
 
 
 def small(findings: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-    """Those of a document that change no number by as much as matters, and are named."""
-    return (one for one in findings if not one["material"] and one["cause"] != UNEXPLAINED)
+    """Those of a document that change no number by as much as matters, and are named. What moves several axes and was
+    not recorded is told in any case: the next record can have it."""
+    return (one for one in findings if not one["material"] and one["cause"] not in (UNEXPLAINED, hidden.ID))
 
 
 def times_of(finding: Mapping[str, Any]) -> list[float]:
