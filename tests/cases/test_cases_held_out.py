@@ -173,7 +173,8 @@ def test_after_a_look_that_harms_the_next_one_is_taken(monkeypatch: pytest.Monke
     causes = tuple(looks_of(cause, 50.0 - k) for k, cause in enumerate(known))
     monkeypatch.setattr(score, "gain", lambda look, *_: SimpleNamespace(harms=known[look.cause]))
     one = Diagnosed(state, state, record)
-    loop._rounds(record, one, lambda _: None, causes)
+    monkeypatch.setattr(loop, "LOOKS", causes)
+    loop._rounds(record, one, lambda _: None)
     assert [finding.look.cause for finding in one.findings] == ["ramp"]
     assert [look.cause for look in one.harmful] == ["step", "pulse"]
     assert looked == [*known, *known]  # a round that takes one, and one that finds no more

@@ -194,15 +194,14 @@ def test_a_table_that_lacks_a_number_states_it(tmp_path: Path, capsys: pytest.Ca
     assert "bias instability not identified: gx: the Allan deviation has no minimum up to half the record" in said
 
 
-def test_a_narrow_terminal_loses_intervals_and_no_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_narrow_terminal_loses_intervals_and_no_number(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     y = 0.002 * np.cumsum(np.random.default_rng(1).standard_normal(3000))
     save(log, {"gx": ("deg/s", y + 0.04 * np.random.default_rng(2).standard_normal(3000))}, 1.0, {})
     document = identify(log)
     for width, intervals in ((160, 2), (80, 1), (60, 0)):
         console = Console(width=width, force_terminal=True, record=True, color_system=None)
-        monkeypatch.setattr(table, "Console", lambda console=console, **_: console)
-        table.show(document)
+        table.show(document, console=console)
         line = next(line for line in console.export_text().splitlines() if "ARW" in line)
         assert line.count("[") == intervals
         assert "°/s/√Hz" in line and line.rstrip().endswith("°/√h")
