@@ -49,7 +49,7 @@ def extended(
     if sensor is not None:
         tree["sensor"]["name"] = remark(sensor)[:LONGEST_TEXT]
     readings = {name: record.readings[name] for name in found if name in record.readings}
-    said = read_out(tree, model, readings, stated=sensor is None)
+    said = read_out(tree, model, readings, stated=sensor is None) if readings else ""
     kept = _regressors(model, record, found)
     if kept:
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]
