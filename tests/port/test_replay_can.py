@@ -24,7 +24,6 @@ from test_replay import SHIPPED, part_of_shipped
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
-from selfcal.show import table
 from selfcal.show.table import show
 from selfcal.verbs.demo import demo
 from selfcal.verbs.monitor import monitor
@@ -212,13 +211,10 @@ def test_a_signal_takes_the_emulator_and_the_folders_along(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("width", [80, 100, 120, 200])
-def test_the_final_table_fits_the_terminal(
-    monkeypatch: pytest.MonkeyPatch, width: int, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_final_table_fits_the_terminal(width: int, capsys: pytest.CaptureFixture[str]) -> None:
     """Nothing wrapped, nothing cut: a narrow one shows medians where there is no room for their intervals."""
     document = _document()
-    monkeypatch.setattr(table, "Console", lambda **_: Console(width=width, force_terminal=True))
-    show(document)
+    show(document, console=Console(width=width, force_terminal=True))
     plain = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
     rows = plain.splitlines()
     assert all(len(row.rstrip()) <= width and "…" not in row for row in rows)
