@@ -142,7 +142,7 @@ def test_an_event_of_several_axes_has_their_names(cause: str, shape: Any, nats: 
 def test_a_recorded_temperature_comes_before_a_hidden_quantity() -> None:
     """A temperature that wanders and moves five axes by 3 N a sd."""
     random = np.random.default_rng(4)
-    n = 3600
+    n = 1800
     temperature = np.cumsum(random.normal(size=n))
     temperature = (temperature - temperature.mean()) / temperature.std()
     y = drawn(1, n)
