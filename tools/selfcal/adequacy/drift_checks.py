@@ -15,6 +15,7 @@ import numpy as np
 
 from selfcal.bank.blocks import Blocks
 from selfcal.bank.result import AxisResult
+from selfcal.base.grid import half_means
 from selfcal.likelihood.fit import Series, run, shifts
 from selfcal.likelihood.state import net
 from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Terms
@@ -126,10 +127,7 @@ def _series(blocks: Blocks, tables: Tables) -> tuple[Series, int]:
     y, m = blocks.mean - np.nanmean(blocks.mean), blocks.mean.size
     cells = max(1, math.ceil(m / MOST))
     count = m // cells
-    rows = y[: count * cells].reshape(count, cells)
-    there = np.isfinite(rows)
-    used = there.sum(axis=1)
-    mean = np.where(2 * used >= cells, np.where(there, rows, 0.0).sum(axis=1) / np.maximum(used, 1), np.nan)
+    mean, used = half_means(y, cells)
     r = blocks.r[: count * cells].reshape(count, cells).mean(axis=1) * cells / np.maximum(used, 1)
     return Series(mean, tables.dt_s * cells, r, np.ones((1, count)), block=tables.block * cells), cells
 

@@ -34,6 +34,15 @@ def block_means(values: Array, size: int) -> Array:
     return np.asarray(values[: values.size // size * size].reshape(-1, size).mean(axis=1))
 
 
+def half_means(values: Array, size: int) -> tuple[Array, Rows]:
+    """Means of whole blocks of `size` values [n], [n // size], of those that are there; NaN where half are missing. And
+    how many are there, [n // size]."""
+    cells = values[: values.size // size * size].reshape(-1, size)
+    there = np.isfinite(cells)
+    used: Rows = there.sum(axis=1)
+    return np.where(2 * used >= size, np.where(there, cells, 0.0).sum(axis=1) / np.maximum(used, 1), np.nan), used
+
+
 def noise_of(values: Array) -> float:
     """White noise of values [n] by the median of their differences. On a lattice coarser than it most of them are
     none: then by the 60 % quantile. A walk that is slower than the noise has no part in it, nor have rare jumps."""

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.base import units as unit_module
+from selfcal.base.grid import half_means
 from selfcal.diagnosis.model_tree import digits
 from selfcal.likelihood.fit import best
 from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES
@@ -159,16 +160,6 @@ class Hidden:
         return float(self.model.correlation[at[0], at[1]])
 
 
-def blocks(residual: Array, block: int) -> Array:
-    """Means [k] of blocks; NaN where half are missing."""
-    k = residual.size // block
-    cells = residual[: k * block].reshape(k, block)
-    there = np.isfinite(cells)
-    total = np.where(there, cells, 0.0).sum(axis=1)
-    count = there.sum(axis=1)
-    return np.where(2 * count >= block, total / np.maximum(count, 1), np.nan)
-
-
 def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
     """The model of records y [m, n] with the quantity; None: it is not worth its numbers. `null`: without it."""
     m = len(y)
@@ -283,7 +274,7 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     if not set(hidden.names) <= states.keys():
         return None
     block = max(1, round(hidden.dt / states[hidden.names[0]].dt))
-    y = np.array([blocks(states[name].y, block) - events.get(name, 0.0) for name in hidden.names])
+    y = np.array([half_means(states[name].y, block)[0] - events.get(name, 0.0) for name in hidden.names])
     y /= hidden.scale[:, None]
     y = np.where(np.isfinite(y), without_lines(bridged_rows(y), LINE)[0], np.nan)
     scores = [np.nansum(course(model, y).scores(), axis=1) for model in (hidden.null, hidden.model)]

@@ -17,11 +17,12 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import logsumexp
 
+from selfcal.base.grid import half_means
 from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SLOW, LN_SMOOTHINGS, LONGEST_LAG
-from selfcal.diagnosis.hidden import Hidden, blocks, of_model, weighed
+from selfcal.diagnosis.hidden import Hidden, of_model, weighed
 from selfcal.likelihood.joint import (
     Act,
     Course,
@@ -140,7 +141,9 @@ class Seen:
 
     def filtered(self, model: Joint, y: Array) -> Course:
         """The filter of a model over `coarse` means of records [m, n]."""
-        return course(model.of_means(self.coarse), np.array([blocks(row, self.coarse) for row in y]), smooth=True)
+        return course(
+            model.of_means(self.coarse), np.array([half_means(row, self.coarse)[0] for row in y]), smooth=True
+        )
 
     @property
     def edge(self) -> int:
@@ -331,7 +334,7 @@ def channels(seen: Seen) -> Iterator[Candidate]:
 def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
     """Slow columns. Beside the best ones the drifts are fitted anew."""
     columns = np.array([one[2] / max(float(np.std(one[2])), 1e-300) for one in shapes])
-    means = np.array([blocks(one, seen.coarse) for one in columns])
+    means = np.array([half_means(one, seen.coarse)[0] for one in columns])
     score = means @ seen.slow.weights
     known = information(seen.model.of_means(seen.coarse), seen.slow, means)
     gain = full(score, known)
@@ -436,7 +439,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     y = np.where(np.abs(whole - median_filter(whole, (1, SPIKE_OF))) < SPIKE, y, np.nan)
     whole, kept_out = without_lines(bridged_rows(y))
     y = np.where(np.isfinite(y), whole, np.nan)
-    side = {cause: blocks(values, block) for cause, values in channels.items()}
+    side = {cause: half_means(values, block)[0] for cause, values in channels.items()}
     null = fitted(bins_of(bridged_rows(y)), span, False)
     search = Search(y, span, side, kept_out, since_s, null, y)
     search.go(CERTAIN)
@@ -485,4 +488,4 @@ def sharpened(times: Sequence[float], states: Sequence[State], span: float) -> t
 
 def _means(state: State, block: int) -> Array:
     """Means [k] of the readings less the columns of the model; NaN where half are missing."""
-    return blocks(state.y - state.best.c @ state.series.columns, block)
+    return half_means(state.y - state.best.c @ state.series.columns, block)[0]

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import half_means
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, at_jump, raised, scan
 from selfcal.diagnosis.forms import LN_SLOW
@@ -152,9 +153,7 @@ def blocks(state: State, longest_s: float = math.inf) -> tuple[Series, int]:
     def cut(values: Array) -> Array:
         return values[..., : m * block].reshape(*values.shape[:-1], m, block)
 
-    y = cut(state.y)
-    used = np.isfinite(y).sum(axis=1)
-    mean = np.where(2 * used >= block, np.nansum(y, axis=1) / np.maximum(used, 1), np.nan)
+    mean, used = half_means(state.y, block)
     r = cut(state.r).mean(axis=1) * block / np.maximum(used, 1)
     columns = np.ascontiguousarray(cut(state.series.columns).mean(axis=2))
     return Series(mean, state.dt * block, r, columns), block
