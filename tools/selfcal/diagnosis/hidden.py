@@ -27,7 +27,6 @@ from selfcal.likelihood.joint import (
     Joint,
     ahead,
     bins_of,
-    bridged_rows,
     course,
     fitted,
     without_each,
@@ -89,7 +88,7 @@ class Hidden:
     @cached_property
     def halves(self) -> tuple[tuple[Joint, Course], tuple[Joint, Course]]:
         """Models of the first half, without the quantity and with it, and their filters over all."""
-        bins = bins_of(bridged_rows(self.y[:, : self.y.shape[1] // 2]))
+        bins = bins_of(self.y[:, : self.y.shape[1] // 2])
         null = fitted(bins, self.dt, False, self.null)
         models = (null, fitted(bins, self.dt, True, null))
         return (models[0], course(models[0], self.y)), (models[1], course(models[1], self.y))
@@ -152,7 +151,7 @@ class Hidden:
     @cached_property
     def bins(self) -> Bins:
         """Spectra of the records."""
-        return bins_of(bridged_rows(self.y))
+        return bins_of(self.y)
 
     def correlation(self, one: str, two: str) -> float:
         """Of the white noise of two axes."""
@@ -165,7 +164,7 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
     m = len(y)
     if m < LEAST_AXES:
         return None
-    bins = bins_of(bridged_rows(y))
+    bins = bins_of(y)
     model = fitted(bins, dt, True, null)
     if net(model.value - null.value, m + 1, LN_LOOKS) < NET_LEAST:
         return None
@@ -178,7 +177,7 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
 
 def of_model(names: Sequence[str], model: Joint, y: Array, scale: Array, dt: float) -> Hidden:
     """What is known of the quantity in a model of records y [m, n] less what was found in them."""
-    null = fitted(bins_of(bridged_rows(y)), dt, False, model)
+    null = fitted(bins_of(y), dt, False, model)
     gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
     at = range(len(names))
     columns = np.array([_of_others(model, y, [k for k in at if k != one]) for one in at])
@@ -276,7 +275,7 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     block = max(1, round(hidden.dt / states[hidden.names[0]].dt))
     y = np.array([half_means(states[name].y, block)[0] - events.get(name, 0.0) for name in hidden.names])
     y /= hidden.scale[:, None]
-    y = np.where(np.isfinite(y), without_lines(bridged_rows(y), LINE)[0], np.nan)
+    y, _ = without_lines(y, LINE)
     scores = [np.nansum(course(model, y).scores(), axis=1) for model in (hidden.null, hidden.model)]
     more = course(hidden.model, y).ln_likelihood - course(hidden.null, y).ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())

@@ -33,6 +33,7 @@ from selfcal.likelihood.joint import (
     course,
     fitted,
     information,
+    refitted,
     without_lines,
 )
 from selfcal.likelihood.state import NET_LEAST, State
@@ -165,10 +166,15 @@ class Seen:
 
 def full(score: Array, known: Array) -> Array:
     """Gain [...] of ln likelihood by scores [..., m] on all axes."""
+    found: Array = 0.5 * (score * sizes(score, known)).sum(axis=-1)
+    return found
+
+
+def sizes(score: Array, known: Array) -> Array:
+    """Best sizes [..., m] of a column on all axes."""
     least = 1e-9 * np.trace(known, axis1=-2, axis2=-1) + 1e-300  # of nothing known, nothing
     firm = known + least[..., None, None] * np.eye(score.shape[-1])
-    found: Array = 0.5 * (score * np.linalg.solve(firm, score[..., None])[..., 0]).sum(axis=-1)
-    return found
+    return np.asarray(np.linalg.solve(firm, score[..., None])[..., 0])
 
 
 def _best(score: Array, known: Array, apart: int) -> list[int]:
@@ -342,13 +348,7 @@ def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
         if gain[k] < NET_LEAST:
             return
         cause, theta, _, price = shapes[k]
-        size = np.linalg.solve(known[k] + 1e-9 * np.trace(known[k]) * np.eye(len(seen.y)), score[k])
-        model = fitted(
-            bins_of(bridged_rows(seen.y - np.outer(size, columns[k]))),
-            seen.dt,
-            bool(seen.model.loading.any()),
-            seen.model,
-        )
+        model = refitted(seen.model, seen.y - np.outer(sizes(score[k], known[k]), columns[k]), seen.dt)
         beside = seen.filtered(model, seen.y)
         less = min(0.0, beside.ln_likelihood - seen.slow.ln_likelihood)
         own = information(model.of_means(seen.coarse), beside, means[[k]])[0]
@@ -393,7 +393,7 @@ class Search:
             if not self._is_own(found):
                 (self.several if len(found.act.axes) > 1 else self.single).append(found)
                 self.rest = self.rest - found.effect
-                self.refit()
+                self.model = refitted(self.model, self.rest, self.dt)
                 seen = None
             elif found.cause in JUMPS:
                 for time in found.theta:
@@ -414,11 +414,6 @@ class Search:
             self.rest = self.rest + one.effect
         self.several = [one for one in self.several if not self._is_own(one)]
 
-    def refit(self, f: bool | None = None) -> None:
-        """The model of what is left."""
-        f = bool(self.model.loading.any()) if f is None else f
-        self.model = fitted(bins_of(bridged_rows(self.rest)), self.dt, f, self.model)
-
 
 def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s: float = 0.0) -> Module | None:
     """What acts on several axes of one grid; None: there are too few axes or means to tell.
@@ -437,10 +432,9 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     span = block * dt
     whole = bridged_rows(y)
     y = np.where(np.abs(whole - median_filter(whole, (1, SPIKE_OF))) < SPIKE, y, np.nan)
-    whole, kept_out = without_lines(bridged_rows(y))
-    y = np.where(np.isfinite(y), whole, np.nan)
+    y, kept_out = without_lines(y)
     side = {cause: half_means(values, block)[0] for cause, values in channels.items()}
-    null = fitted(bins_of(bridged_rows(y)), span, False)
+    null = fitted(bins_of(y), span, False)
     search = Search(y, span, side, kept_out, since_s, null, y)
     search.go(CERTAIN)
     model = weighed(search.model, search.rest, span)
@@ -450,7 +444,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     of = None
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
         y = y - sum(one.effect for one in search.several)
-        model = fitted(bins_of(bridged_rows(y)), span, True, search.model)
+        model = refitted(search.model, y, span)
         of = of_model(tuple(found), model, y, scale, span)
     return Module(tuple(found), span, tuple(search.several), of, scale)
 

@@ -23,6 +23,7 @@ from scipy.special import logsumexp, softmax
 
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Mask
+from selfcal.logs.recording import bridged
 
 #: Axes that a common quantity takes at least: two that go together are noise that they share.
 LEAST_AXES = 3
@@ -90,20 +91,16 @@ def _lines(power: Array, least: float = LINE) -> Mask:
 
 def bridged_rows(y: Array) -> Array:
     """Records [m, n] with their gaps bridged."""
-    found = np.array(y)
-    for row in found:
-        there = np.flatnonzero(np.isfinite(row))
-        row[:] = np.interp(np.arange(row.size), there, row[there])
-    return found
+    return np.array([bridged(row) for row in y])
 
 
 def without_lines(y: Array, least: float = CLEAR_LINE) -> tuple[Array, Mask]:
-    """Records [m, n] without gaps less their lines of `least` times the level, and where [n // 2 + 1] of the spectrum
+    """Records [m, n] (NaN: missing) less their lines of `least` times the level, and where [n // 2 + 1] of the spectrum
     that was done.
 
     A line is taken to 0 Hz and its slow amplitude out. The amplitude goes on as its mirror at the ends, so that one
     whose frequency wanders does not ring there."""
-    n = y.shape[1]
+    n, present, y = y.shape[1], np.isfinite(y), bridged_rows(y)
     where = np.any([_lines(np.abs(row) ** 2, least) for row in np.fft.rfft(np.diff(y, axis=1), axis=1)], axis=0)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], where, [False]]).astype(int)))
     found, pad = y - y.mean(axis=1)[:, None], n // 8
@@ -113,12 +110,12 @@ def without_lines(y: Array, least: float = CLEAR_LINE) -> tuple[Array, Mask]:
         slow[:, np.abs(np.fft.fftfreq(slow.shape[1])) > 0.5 * (end - first) / (n - 1)] = 0.0
         found = found - 2.0 * (np.fft.ifft(slow, axis=1)[:, pad : pad + n] * turn).real
     place = np.minimum(np.rint(np.arange(n // 2 + 1) * (where.size - 1) / (n // 2)), where.size - 1)
-    return found, where[place.astype(int)]
+    return np.where(present, found, np.nan), where[place.astype(int)]
 
 
 def bins_of(y: Array) -> Bins:
-    """Of records y [m, n] without gaps, in units of their white noise. Bins with a line on any axis are left out."""
-    difference = np.diff(y, axis=1)
+    """Of records y [m, n] in units of their white noise, gaps bridged. Bins with a line on any axis are left out."""
+    difference = np.diff(bridged_rows(y), axis=1)
     n = difference.shape[1]
     where = math.pi * (np.arange(n) + 0.5) / n
     z = np.stack([np.fft.rfft(difference * np.sin(k * where), axis=1) for k in range(1, TAPERS + 1)])
@@ -152,9 +149,10 @@ class Joint:
         """Standard deviations [m] of the white noise."""
         return np.exp(self.own[:, 0])
 
-    def without_f(self) -> Joint:
-        """The same model less f."""
-        return replace(self, loading=np.zeros_like(self.loading))
+    @property
+    def has_f(self) -> bool:
+        """Whether f moves any axis."""
+        return bool(self.loading.any())
 
     def of_means(self, block: int) -> Joint:
         """The same of means of so many samples, for columns that are slow beside them."""
@@ -287,7 +285,7 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     own = np.clip(own, *np.array(bounds[:OWN]).T)
     head = np.concatenate([own.ravel(), root[_lower(m)]])
     tries = [head]
-    if f and start is not None and start.loading.any():
+    if f and start is not None and start.has_f:
         tries = [np.concatenate([head, start.loading / start.white, [math.log(start.rate)]])]
     elif f:
         vector = _together(bins, own)
@@ -298,6 +296,11 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     )
     own, _, correlation, loading, ln_rate = cost.parts(best.x)
     return Joint(own, correlation, loading * np.exp(own[:, 0]), math.exp(ln_rate), -float(best.fun))
+
+
+def refitted(model: Joint, y: Array, dt: float) -> Joint:
+    """The model of records [m, n] near another one, with f if that has it."""
+    return fitted(bins_of(y), dt, model.has_f, model)
 
 
 def without_each(bins: Bins, model: Joint) -> Array:
