@@ -43,6 +43,11 @@ def half_means(values: Array, size: int) -> tuple[Array, Rows]:
     return np.where(2 * used >= size, np.where(there, cells, 0.0).sum(axis=1) / np.maximum(used, 1), np.nan), used
 
 
+def regridded(values: Array, dt: float, n: int, to_dt: float) -> Array:
+    """Means of `dt` s [k] on a grid of n samples `to_dt` s apart that begins where they do, by straight lines."""
+    return np.asarray(np.interp((np.arange(n) + 0.5) * to_dt, (np.arange(values.size) + 0.5) * dt, values))
+
+
 def noise_of(values: Array) -> float:
     """White noise of values [n] by the median of their differences. On a lattice coarser than it most of them are
     none: then by the 60 % quantile. A walk that is slower than the noise has no part in it, nor have rare jumps."""

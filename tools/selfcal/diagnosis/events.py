@@ -15,6 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 from selfcal.adequacy.document import Identified
 from selfcal.bank.result import HALF_90
@@ -24,7 +25,7 @@ from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
-from selfcal.likelihood.heldout import HARM_SD
+from selfcal.likelihood.heldout import HARM_SD, in_sd
 from selfcal.likelihood.state import interval
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
@@ -346,17 +347,13 @@ def _on(event: Event, axis: str) -> dict[str, Any]:
         for key, value in member.entry["estimate"].items()
         if isinstance(value, Mapping) and value["unit"] not in OF_ALL
     }
-    net = min(700.0, max(member.finding.look.net for member in own))
-    return {"estimate": sizes, "probability": 1.0 / (1.0 + math.exp(-net))}
+    return {"estimate": sizes, "probability": float(expit(max(member.finding.look.net for member in own)))}
 
 
 def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
     """Whether held-out time of all axes confirms it beyond 2 sd; None: none is defined."""
-    scores = [gain["log_score_per_sample"] for gain in gains if gain]
-    if not scores:
-        return None
-    more = sum((one["after"] - one["before"]) * one["samples"] for one in scores)
-    return bool(more > HARM_SD * math.hypot(*(one["sd"] * one["samples"] for one in scores)))
+    known = [gain for gain in gains if gain]
+    return in_sd(known) > HARM_SD if known else None
 
 
 def _before_and_after(one: Diagnosed, unit: str, known: Identified | None) -> dict[str, dict[str, Any]]:

@@ -13,12 +13,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.special import expit
 
 from selfcal.base import units as unit_module
-from selfcal.base.grid import half_means
+from selfcal.base.grid import half_means, regridded
 from selfcal.diagnosis.model_tree import digits
 from selfcal.likelihood.fit import best
-from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES
+from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES, in_sd
 from selfcal.likelihood.joint import (
     LEAST_AXES,
     LINE,
@@ -38,8 +39,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: Its name in the document.
 ID = "hidden_input"
-#: Probability, before the record, that the quantity moves an axis.
-P_ACTS = 0.5
 #: What an axis that the quantity moves must show, nats.
 ACTS = 3.0
 #: Samples of which an error ahead is taken, at least.
@@ -63,17 +62,24 @@ class On:
 
 @dataclass(frozen=True)
 class Hidden:
-    """What the axes share: `names` in the order of the models, with and without the quantity, of records `y` [m, k] of
-    means `dt` s long in units of `scale` [m]. `gain` in nats; `columns` [m, k]: the quantity as the others show it."""
+    """What the axes share: `names` in the order of the `model` with the quantity, of records `y` [m, k] of means `dt` s
+    long in units of `scale` [m], less what was found in them."""
 
     names: tuple[str, ...]
     model: Joint
-    null: Joint
     y: Array
     scale: Array
     dt: float
-    gain: float
-    columns: Array
+
+    @cached_property
+    def null(self) -> Joint:
+        """The model without the quantity."""
+        return fitted(self.bins, self.dt, False, self.model)
+
+    @cached_property
+    def gain(self) -> float:
+        """Nats by the quantity."""
+        return self.course.ln_likelihood - course(self.null, self.y).ln_likelihood
 
     @property
     def net(self) -> float:
@@ -128,17 +134,14 @@ class Hidden:
     def on(self, state: State) -> On:
         """What it does to an axis, by the quantity as the other axes show it."""
         state = state.without({ID})
-        values = self.columns[self.names.index(state.axis)] / self.step
-        middle = (np.arange(values.size) + 0.5) * self.dt
-        column = np.interp((np.arange(state.y.size) + 0.5) * state.dt, middle, values)
+        column = regridded(self.of_others[state.axis] / self.step, self.dt, state.y.size, state.dt)
         fits = [state.fitted_with(terms, column) for terms in state.near()]
         free = [state.fitted_with(terms, np.empty((0, column.size))) for terms in state.near()]
         fit = best(fits)
         size, sd = float(fit.c[-1]), float(fit.sd[-1])
         gain = fit.ln_likelihood - best(free).ln_likelihood
-        ln_odds = math.log(P_ACTS / (1.0 - P_ACTS)) + gain - math.log1p(abs(size) / sd)
-        probability = 1.0 / (1.0 + math.exp(-max(-700.0, min(700.0, ln_odds))))
-        return On(size, sd, probability, Regressor(ID, ID, column, "1", {}))
+        # Before the record it acts on an axis as likely as not.
+        return On(size, sd, float(expit(gain - math.log1p(abs(size) / sd))), Regressor(ID, ID, column, "1", {}))
 
     def explains(self, one: str, two: str, upto_hz: float) -> bool:
         """Whether noise that two axes share below a frequency is the quantity's: beside it their white noise does not
@@ -147,6 +150,15 @@ class Hidden:
             return False
         at = [self.names.index(name) for name in (one, two)]
         return without_pair(self.bins, self.model, at[0], at[1]) < NET_LEAST
+
+    @cached_property
+    def of_others(self) -> dict[str, Array]:
+        """By axis the quantity [k] as the other ones show it."""
+        found = {}
+        for name in self.names:
+            others = [k for k, other in enumerate(self.names) if other != name]
+            found[name] = course(self.model.of(others), self.y[others], smooth=True).states[:, 0]
+        return found
 
     @cached_property
     def bins(self) -> Bins:
@@ -173,19 +185,6 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
         return None
     gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
     return model if net(gain, m + 1, LN_LOOKS) >= NET_LEAST else None
-
-
-def of_model(names: Sequence[str], model: Joint, y: Array, scale: Array, dt: float) -> Hidden:
-    """What is known of the quantity in a model of records y [m, n] less what was found in them."""
-    null = fitted(bins_of(y), dt, False, model)
-    gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
-    at = range(len(names))
-    columns = np.array([_of_others(model, y, [k for k in at if k != one]) for one in at])
-    return Hidden(tuple(names), model, null, y, scale, dt, gain, columns)
-
-
-def _of_others(model: Joint, y: Array, others: Sequence[int]) -> Array:
-    return course(model.of(others), y[list(others)], smooth=True).states[:, 0]
 
 
 def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, Any]:
@@ -225,20 +224,18 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
 def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str], start_s: float) -> dict[str, Any]:
     """The finding of the document, in the `units` of the recording's columns. `start_s`: where the record begins."""
     axes: dict[str, Any] = {}
-    scores = []
+    gains = []
     for name in hidden.names:
         on = hidden.on(states[name])
         factor = unit_module.factor(states[name].unit, units[name])
         known = held_out(hidden, name, units[name], factor)
-        score = known["log_score_per_sample"]
-        scores.append((score["samples"] * (score["after"] - score["before"]), score["samples"] * score["sd"]))
+        gains.append(known)
         loading = interval(on.size * factor, on.sd * factor, units[name])
         axes[name] = {
             "estimate": {"loading": loading, "share": hidden.share(name)},
             "probability": on.probability,
             "gain": known,
         }
-    more, sd = sum(one for one, _ in scores), math.sqrt(sum(each**2 for _, each in scores))
     acting = {name: one for name, one in axes.items() if one["probability"] >= 0.5}
     jumps = [{**one, "time_s": one["time_s"] + start_s} for one in hidden.jumps]
     tau_s = hidden.dt / hidden.model.rate
@@ -251,7 +248,7 @@ def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str],
         "axes": acting,
         "evidence_nats": hidden.gain,
         "net_nats": hidden.net,
-        "confirmed": bool(more > HARM_SD * sd),
+        "confirmed": in_sd(gains) > HARM_SD,
         "also_possible": ["temperature", "supply"],
         "record_next": "Record the temperature at the sensor and its supply voltage.",
     }
@@ -276,8 +273,9 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     y = np.array([half_means(states[name].y, block)[0] - events.get(name, 0.0) for name in hidden.names])
     y /= hidden.scale[:, None]
     y, _ = without_lines(y, LINE)
-    scores = [np.nansum(course(model, y).scores(), axis=1) for model in (hidden.null, hidden.model)]
-    more = course(hidden.model, y).ln_likelihood - course(hidden.null, y).ln_likelihood
+    before_after = [course(model, y) for model in (hidden.null, hidden.model)]
+    scores = [np.nansum(one.scores(), axis=1) for one in before_after]
+    more = before_after[1].ln_likelihood - before_after[0].ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())
     pieces = [part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]
     sd = float(np.std(pieces, ddof=1)) / math.sqrt(PIECES)
@@ -286,7 +284,16 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     return {"log_score_per_sample": score}
 
 
-def own_laws(hidden: Hidden) -> dict[str, dict[str, Any]]:
+def extend(tree: dict[str, Any], hidden: Hidden) -> None:
+    """Put the quantity into a model file's tree, and the drifts beside it into the axes of its `simulate`."""
+    tree["hidden_input"] = _stated(hidden)
+    axes = tree["simulate"]["axes"]
+    for name, law in _own_laws(hidden).items():
+        if name in axes:
+            axes[name] = {**law, **{key: axes[name][key] for key in ("bias", "N")}}
+
+
+def _own_laws(hidden: Hidden) -> dict[str, dict[str, Any]]:
     """By axis the drift that it has beside the quantity, as `simulate` in a model file has it: the larger of a walk and
     a Gauss-Markov process over half the record."""
     found = {}
@@ -307,7 +314,7 @@ def own_laws(hidden: Hidden) -> dict[str, dict[str, Any]]:
     return found
 
 
-def stated(hidden: Hidden) -> dict[str, Any]:
+def _stated(hidden: Hidden) -> dict[str, Any]:
     """The model file's entry, in the units of its groups: law, loadings and the correlation of the white noise."""
     pairs = [(one, two) for k, one in enumerate(hidden.names) for two in hidden.names[k + 1 :]]
     alpha = hidden.model.rate / hidden.dt

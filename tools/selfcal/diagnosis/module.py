@@ -22,7 +22,7 @@ from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SLOW, LN_SMOOTHINGS, LONGEST_LAG
-from selfcal.diagnosis.hidden import Hidden, of_model, weighed
+from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood.joint import (
     Act,
     Course,
@@ -445,7 +445,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
         y = y - sum(one.effect for one in search.several)
         model = refitted(search.model, y, span)
-        of = of_model(tuple(found), model, y, scale, span)
+        of = Hidden(tuple(found), model, y, scale, span)
     return Module(tuple(found), span, tuple(search.several), of, scale)
 
 

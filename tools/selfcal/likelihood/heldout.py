@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,12 @@ class HeldOut:
 
 def harmful(parts: Sequence[HeldOut]) -> bool:
     """Whether what was found on some axes predicts the rest of the record clearly worse, all axes together."""
-    scores = [one.gain["log_score_per_sample"] for one in parts if one.gain is not None]
+    gains = [one.gain for one in parts if one.gain is not None]
+    return bool(gains) and in_sd(gains) < -HARM_SD
+
+
+def in_sd(gains: Sequence[Mapping[str, Any]]) -> float:
+    """How much some axes gain together, standard deviations."""
+    scores = [gain["log_score_per_sample"] for gain in gains]
     more = sum(one["samples"] * (one["after"] - one["before"]) for one in scores)
-    return bool(more < -HARM_SD * math.hypot(*(one["samples"] * one["sd"] for one in scores)))
+    return float(more) / max(math.hypot(*(one["samples"] * one["sd"] for one in scores)), 1e-300)

@@ -42,8 +42,8 @@ FASTEST_S = 10.0
 #: Prior standard deviations of ln sizes and ln rates about the middle of their limits: they keep what the record does
 #: not know from running away, and change ln likelihood by a few tenths elsewhere.
 PRIOR_SD = 3.0
-#: Probability that an axis has a column that is there; widths of the size of a column, in its own standard deviations.
-P_AXIS, WIDTHS = 0.5, (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+#: Widths of the size of a column, in its own standard deviations.
+WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 #: A filter has settled when its covariance changes by less than this share a step.
 SETTLED = 1e-7
 #: Numbers of an axis' own drift: ln of white noise, walk a step, Gauss-Markov deviation, rate a sample.
@@ -520,12 +520,12 @@ def act(score: Array, known: Array) -> Act:
 
     The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. Sizes are
     normal about 0 with one width for all axes of a set, in standard deviations of each axis' own. The probability of an
-    axis is what its own readings say: before the record it is P_AXIS, whatever the others do."""
+    axis is what its own readings say: before the record it is a half, whatever the others do."""
     p, m = score.shape
     scale = 1.0 / np.sqrt(np.maximum(np.diag(known), 1e-300))
     z, R = score * scale, known * np.outer(scale, scale)
     widths = np.array(WIDTHS)
-    values, members, of_count, of_axis = [], [], [], []
+    values, members, priors = [], [], []
     for count in range(1, m + 1):
         sets = np.array(list(combinations(range(m), count)))
         rho = R[sets[:, :, None], sets[:, None, :]][None]
@@ -535,14 +535,13 @@ def act(score: Array, known: Array) -> Act:
         volume = np.linalg.slogdet(firm)[1] + 2.0 * count * np.log(widths)[:, None]
         ln_bf = logsumexp(explained - 0.5 * p * volume, axis=0) - math.log(widths.size)
         values.append(ln_bf)
-        of_count.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
-        of_axis.append(np.full(len(sets), count * math.log(P_AXIS / (1.0 - P_AXIS))))
+        priors.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
         one = np.zeros((len(sets), m))
         np.put_along_axis(one, sets, 1.0, axis=1)
         members.append(one)
     ln_bf = np.concatenate(values)
-    total = float(logsumexp(ln_bf + np.concatenate(of_count)))
-    probability = softmax(ln_bf + np.concatenate(of_axis)) @ np.vstack(members)
+    total = float(logsumexp(ln_bf + np.concatenate(priors)))
+    probability = softmax(ln_bf) @ np.vstack(members)
     held = np.flatnonzero(probability >= 0.5)
     size, sd = np.zeros((p, m)), np.full(m, math.inf)
     if held.size:

@@ -181,12 +181,7 @@ def diagnose(
             doing.now("what the axes share")
             shared = shared_by(found, loaded) if not ending.asked else None
             if shared is not None:
-                tree["hidden_input"] = hidden.stated(shared)
-                for name, law in hidden.own_laws(shared).items():
-                    if name not in found:
-                        continue
-                    kept = {key: tree["simulate"]["axes"][name][key] for key in ("bias", "N")}
-                    tree["simulate"]["axes"][name] = {**law, **kept}
+                hidden.extend(tree, shared)
             document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])
             quantity = None if shared is None else entry_of(shared, found, recording)
             if shared is not None and quantity is not None and second is not None:
