@@ -27,9 +27,10 @@ def check(wanted: str | None, more: Collection[str] = ()) -> None:
     """Raise UserError for what is no cause. `more`: what the verb takes besides."""
     if wanted is None:
         return
-    from selfcal.diagnosis.causes import CAUSES  # a second of imports
+    from selfcal.diagnosis import hidden  # a second of imports
+    from selfcal.diagnosis.causes import CAUSES
 
-    known = (INADEQUATE, MATERIAL, *more, *CAUSES, "hidden_input")
+    known = (INADEQUATE, MATERIAL, *more, *CAUSES, hidden.ID)
     if wanted not in known:
         raise UserError(f"--fail-on: there is no cause '{wanted}' ({', '.join(known)})")
 

@@ -8,14 +8,13 @@ from contextlib import suppress
 from dataclasses import replace
 from types import MappingProxyType
 
-import numpy as np
-
 from selfcal.base.ending import Stopped
+from selfcal.base.grid import regridded
 from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, step, tilt
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
-from selfcal.diagnosis.record import Record, carried
+from selfcal.diagnosis.record import TIMES, Record, carried
 from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import work
@@ -199,7 +198,7 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
         if event.cause in module.JUMPS:
             theta = module.sharpened(theta, [states[name] for name in names], seen.dt)
         looks = {name: CAUSES[event.cause].located(states[name], record, theta) for name in names}
-        looks = tilt.of_steps(looks, states) if event.cause == "step" else looks
+        looks = tilt.of_steps(looks, states)
         findings = {}
         for name, look in looks.items():
             after = states[name].refit(**look.changes)
@@ -220,23 +219,17 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
 def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str, Diagnosed]) -> Record:
     """Put what means have found of slow causes into the models of every sample."""
 
-    def carried(name: str) -> State:
+    def taken_over(name: str) -> State:
         state, one = record.axes[name], means.get(name)
         if one is None:
             return state
         kept = [finding for finding in one.findings if CAUSES[finding.look.cause].of_means]
-        owned = {column.name: finding for finding in kept for column in finding.columns}
-        extras = replace(
-            state.extras,
-            flicker=any(finding.after.extras.flicker and not finding.before.extras.flicker for finding in kept),
-            oscillation=any(
-                finding.after.extras.oscillation and not finding.before.extras.oscillation for finding in kept
-            ),
-        )
+        known = one.state.extras
+        extras = replace(state.extras, flicker=known.flicker, oscillation=known.oscillation)
         columns = [
-            _stretched(column, one.record, state, record)
+            _stretched(column, one.record, state)
             for column in one.state.regressors
-            if column.name in owned or column.cause == hidden.ID
+            if column.cause == hidden.ID or any(column.name == own.name for finding in kept for own in finding.columns)
         ]
         if name in found:
             found[name].hidden = one.hidden
@@ -245,20 +238,19 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
             return state
         return state.refit(regressors=(*state.regressors, *columns), extras=extras)
 
-    states = dict(zip(record.axes, work.each(carried, record.axes), strict=True))
+    states = dict(zip(record.axes, work.each(taken_over, record.axes), strict=True))
     for name, one in found.items():
         one.state = states[name]
     return replace(record, axes=states)
 
 
-def _stretched(column: Regressor, means: Record, state: State, record: Record) -> Regressor:
+def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
     """A column of means on the grid of a state. The edges of an event are moved to where the samples have them."""
-    n = state.y.size
-    times = [float(column.entry[key]) for key in ("time_s", "start_s", "end_s") if key in column.entry]
-    if column.entry.get("kind") not in ("step", "pulse"):
-        middle = (np.arange(means.present.size) + 0.5) / means.rate_hz
-        return replace(column, values=np.interp((np.arange(n) + 0.5) * state.dt, middle, column.values))
-    edges = module.sharpened(times, [state], 1.0 / means.rate_hz)
+    n, span = state.y.size, 1.0 / means.rate_hz
+    times = [float(column.entry[key]) for key in TIMES if key in column.entry]
+    if not times:
+        return replace(column, values=regridded(column.values, span, n, state.dt))
+    edges = module.sharpened(times, [state], span)
     begin, end = round(edges[0] / state.dt), round(edges[1] / state.dt) if len(edges) > 1 else n
     return replace(column, values=step.raised(n, begin, end))
 

@@ -35,7 +35,6 @@ From = Annotated[
 Axes = Annotated[Sequence[str], option("Axis to report (repeat for more); default: all", "--axis", metavar="NAME")]
 Json = Annotated[Path | str | None, option("Write the result as JSON (- for stdout)", metavar="FILE")]
 Report = Annotated[Path | str | None, option("Write a page with pictures and tables", metavar="FILE.html")]
-Plot = Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")]
 Start = Annotated[
     float | None, option("Begin here, seconds of the recording; default: its start", "--start", metavar="S")
 ]
@@ -64,7 +63,6 @@ LimitsFile = Annotated[
 ]
 Junit = Annotated[Path | str | None, option("Write the limits' verdicts as JUnit's XML", metavar="FILE.xml")]
 Verdicts = Annotated[Path | str | None, option("Write the limits' verdicts as CSV", metavar="FILE.csv")]
-Seed = Annotated[int, option("Same seed, same records", metavar="N", min=0)]
 Scheduler = Annotated[
     str | None,
     option("Dask scheduler to send the work to (tcp://HOST:PORT); default: this machine", metavar="ADDRESS"),

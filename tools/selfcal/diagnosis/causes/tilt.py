@@ -29,10 +29,11 @@ ABOUT_S, SURE = 3.0, 3.0
 
 
 def of_steps(looks: Mapping[str, Look], states: Mapping[str, State]) -> dict[str, Look]:
-    """The looks at one step of several axes, those that a turn of the sensor explains as looks at the turn."""
+    """The looks at one event of several axes: where that is a step that a turn of the sensor explains, looks at the
+    turn."""
     force = _specific_force(states)
-    known = [name for name in looks if force is not None and name in force]
-    if force is None or len(known) < 2 or len(known) < len(looks):
+    steps = all(look.cause == step.CAUSE.id for look in looks.values())
+    if force is None or not steps or len(looks) < 2 or not looks.keys() <= force.keys():
         return dict(looks)
     axes = list(force)
     f = np.array([force[name][0] for name in axes])
