@@ -327,6 +327,23 @@ def run(work: Sequence[Any], job: Callable[..., Answer], *given: Any, processes:
     return [done[i] for i in sorted(done)]
 
 
+def print_cost(answers: Sequence[Answer]) -> None:
+    """CPU seconds of a diagnosis."""
+    seconds = [each["seconds"] for each in answers]
+    if seconds:
+        print(f"\nCPU of a diagnosis: median {np.median(seconds):.1f} s, longest {max(seconds):.0f} s")
+
+
+def summed_up(answers: Sequence[Answer], work: Sequence[Any], lines: Sequence[Line], out: Path, what: str) -> int:
+    """Write `summary.json`; the exit code: 1 where a goal is not met or the run is not whole. `what`: of the work."""
+    goals = [{"goal": line.what, "hits": line.hits, "of": line.of, "met": line.met} for line in lines]
+    (out / "summary.json").write_text(json.dumps({"goals": goals, "answers": answers}, default=float) + "\n")
+    if len(answers) < len(work):
+        print(f"NOT WHOLE: {len(answers)} of {len(work)} {what}")
+        return 1
+    return int(not all(line.met for line in lines))
+
+
 def command_line(description: str) -> argparse.ArgumentParser:
     """The options that choose the records."""
     today = int(datetime.now().strftime("%Y%m%d"))

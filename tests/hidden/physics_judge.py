@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import numpy as np
 
-from judge import Line, run
+from judge import Line, print_cost, run, summed_up
 from physics import AXES, CLEAN, KINDS, LAWS, Record, pair
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -317,20 +317,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for each in answers:
         for name, words in each.get("inadequate", {}).items():
             print(f"clean, {each['task']['rate']:g} Hz, seed {each['task']['seed']}, {name}: {words}")
-    seconds = [each["seconds"] for each in answers]
-    if seconds:
-        print(f"\nCPU of a diagnosis: median {np.median(seconds):.1f} s, longest {max(seconds):.0f} s")
+    print_cost(answers)
     for error, count in Counter(each["error"] for each in answers if each.get("error")).most_common(5):
         print(f"{count} times refused: {error}")
-    summary = {
-        "goals": [{"goal": line.what, "hits": line.hits, "of": line.of, "met": line.met} for line in lines],
-        "answers": answers,
-    }
-    (out / "summary.json").write_text(json.dumps(summary, default=float) + "\n")
-    if len(answers) < len(work):
-        print(f"NOT WHOLE: {len(answers)} of {len(work)} truths")
-        return 1
-    return int(not all(line.met for line in lines))
+    return summed_up(answers, work, lines, out, "truths")
 
 
 if __name__ == "__main__":

@@ -34,7 +34,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 
 import numpy as np
 
-from judge import Line, run
+from judge import Line, print_cost, run, summed_up
 from physics_judge import ROOT, _commit
 from several import ALL, BESIDE, CALM, CLEAN, KINDS, SECONDS, draw
 
@@ -370,18 +370,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     answers = run(work, answer, out, processes=options.processes)
     lines = goals(answers)
     print(table(answers), "", *lines, "", *failures(answers), sep="\n")
-    seconds = [each["seconds"] for each in answers]
-    if seconds:
-        print(f"\nCPU of a diagnosis: median {np.median(seconds):.1f} s, longest {max(seconds):.0f} s")
-    summary = {
-        "goals": [{"goal": line.what, "hits": line.hits, "of": line.of, "met": line.met} for line in lines],
-        "answers": [{key: each[key] for key in each if key != "document"} for each in answers],
-    }
-    (out / "summary.json").write_text(json.dumps(summary, default=float) + "\n")
-    if len(answers) < len(work):
-        print(f"NOT WHOLE: {len(answers)} of {len(work)} records")
-        return 1
-    return int(not all(line.met for line in lines))
+    print_cost(answers)
+    kept = [{key: each[key] for key in each if key != "document"} for each in answers]
+    return summed_up(kept, work, lines, out, "records")
 
 
 if __name__ == "__main__":
