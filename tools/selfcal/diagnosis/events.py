@@ -9,7 +9,7 @@ after it; the stated intervals are those of the extended model.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -372,10 +372,14 @@ def _before_and_after(one: Diagnosed, unit: str, known: Identified | None) -> di
     return found
 
 
-def small(findings: Sequence[Mapping[str, Any]]) -> Iterator[Mapping[str, Any]]:
-    """Those of a document that change no number by as much as matters, and are named. What moves several axes and was
-    not recorded is told in any case: the next record can have it."""
-    return (one for one in findings if not one["material"] and one["cause"] not in (UNEXPLAINED, hidden.ID))
+def parted(findings: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
+    """Those of a document that are told, and the small ones: these change no number by as much as matters, and are
+    named. What moves several axes and was not recorded is told in any case: the next record can have it."""
+    told: list[Mapping[str, Any]] = []
+    small: list[Mapping[str, Any]] = []
+    for one in findings:
+        (told if one["material"] or one["cause"] in (UNEXPLAINED, hidden.ID) else small).append(one)
+    return told, small
 
 
 def times_of(finding: Mapping[str, Any]) -> list[float]:

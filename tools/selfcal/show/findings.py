@@ -17,7 +17,7 @@ from selfcal.base import units
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of
 from selfcal.diagnosis import words
-from selfcal.diagnosis.events import small
+from selfcal.diagnosis.events import parted
 
 #: Characters of a line where no terminal shows it.
 WIDTH = 114
@@ -40,8 +40,7 @@ def show(
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s{since(recording)}"
     )
-    less = list(small(findings))
-    shown = [one for one in findings if not any(one is each for each in less)]
+    shown, less = parted(findings)
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     if shown:
         console.print(_events(shown))

@@ -19,7 +19,7 @@ from selfcal.base.ending import Stopped
 from selfcal.base.output import write_text
 from selfcal.base.units import parameter_unit
 from selfcal.diagnosis import words
-from selfcal.diagnosis.events import UNEXPLAINED, small, times_of
+from selfcal.diagnosis.events import UNEXPLAINED, parted, times_of
 from selfcal.diagnosis.extend import fitted_law
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
@@ -255,8 +255,7 @@ def _summary(
     for axis, error in failed.items():
         yield f"<p><strong>Not diagnosed: {escape(axis)}.</strong> {escape(error)}</p>"
     findings = document.get("findings") or []
-    less = list(small(findings))
-    shown = [one for one in findings if not any(one is each for each in less)]
+    shown, less = parted(findings)
     if shown:
         yield _events("What matters", "One row an event or source, the largest change first.", shown, axes)
     if less:
