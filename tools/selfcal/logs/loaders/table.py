@@ -156,6 +156,11 @@ def left_out(names: Sequence[str], by: str) -> tuple[str, ...]:
     return (f"left out: {named}: their values come by {by}: export them as physical values",) if names else ()
 
 
+def heading(name: str, unit: str | None) -> str:
+    """A heading `name[unit]`; the name alone without a unit."""
+    return f"{name}[{unit}]" if unit else name
+
+
 def in_memory(array: NDArray[Any]) -> Member:
     """An array as a member."""
     return Member(array.shape, array.dtype, lambda: array)
