@@ -23,7 +23,7 @@ from selfcal.logs.loaders.headings import PART, Meaning, Sensor, sensors_of, spl
 from selfcal.logs.loaders.table import Field
 from selfcal.logs.loaders.text_table import is_clock, is_date, is_row
 from selfcal.logs.loaders.texts import Text
-from selfcal.logs.recorded import SIDE_CHANNELS
+from selfcal.logs.recorded import SIDE_UNITS
 
 #: Unit of a scaled LSB column where the scale states none.
 LSB_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in SENSORS}
@@ -224,7 +224,7 @@ class Header:
         """A heading, without its unit, and the matrix that it is a column of; none that means a column here."""
         name = split(key)[0]
         matrix, _, number = name.rpartition(":")
-        here = {"t", *self.sensors, *dict(SIDE_CHANNELS.values())}
+        here = {"t", *self.sensors, *SIDE_UNITS}
         return [one for one in (key, name, *([matrix] if number.isdigit() else [])) if one not in here]
 
     def _what_to_state(self) -> str:
@@ -273,7 +273,7 @@ class Header:
         dates = dates and name == "t" and stated is None
         unit = "s" if dates else unit
         known = isinstance(unit, str) and units.known(unit)
-        example = {"t": "s", **dict(SIDE_CHANNELS.values()), **LSB_UNITS}.get(name, "UNIT")
+        example = {"t": "s", **SIDE_UNITS, **LSB_UNITS}.get(name, "UNIT")
         to_scale = (
             f"give --scale {shlex.quote(f'{name}=SIZE[{example}]')}, SIZE the {example} of one '{short(str(unit))}'"
         )
@@ -283,7 +283,7 @@ class Header:
         if broken and any(name.startswith(sensor) for sensor in ("t", *self.sensors)):
             raise UserError(f"{column}: the brackets of its unit do not match: write name[unit]")
         if optional and (not name or broken or not known or (unit == units.LSB and "" not in self.scale)):
-            if name in dict(SIDE_CHANNELS.values()):
+            if name in SIDE_UNITS:
                 to_state = f"write {name}[{example}], or give --unit {name}={example}, or the unit that it is in"
                 what = f"no unit and is left out: {to_state}"
                 if unit is not None:
@@ -313,8 +313,7 @@ class Header:
             raise UserError(f"{column}: the size of one LSB must be a number above 0")
         if name == "t" and not units.same_kind(unit, "s"):
             raise UserError(f"{column} is in {unit}, which is not a time (h, min, s, ms, us, ns)")
-        side = name in dict(SIDE_CHANNELS.values())
-        return [Field(key, name, unit, size, optional and not side, dates)]
+        return [Field(key, name, unit, size, optional and name not in SIDE_UNITS, dates)]
 
 
 def number_in(value: Any) -> float:

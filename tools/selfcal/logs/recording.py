@@ -31,7 +31,7 @@ from selfcal.logs.loaders.headings import Meaning, Sensor, sides_of, split
 from selfcal.logs.loaders.sources import Part, chosen
 from selfcal.logs.loaders.table import Field, Hints, Table, meta_place
 from selfcal.logs.loaders.text_table import is_date
-from selfcal.logs.recorded import SIDE_CHANNELS, Column, Recording, as_float, bridged, bridged_at
+from selfcal.logs.recorded import SIDE_CHANNELS, SIDE_UNITS, Column, Recording, as_float, bridged, bridged_at
 from selfcal.logs.timebase import Clock
 from selfcal.logs.written import save
 
@@ -266,7 +266,7 @@ class _Sensor:
         if not (self.side or side):
             header.notes += self.table.notes
             return self._read(header, self.rate, self.keys)
-        header.sensors, header.columns = [name for name, _ in SIDE_CHANNELS.values()], {}
+        header.sensors, header.columns = list(SIDE_UNITS), {}
         try:
             return self._read(header, None, [key for key in self.keys if self.name(key) in ("t", *header.sensors)])
         except UserError as error:
@@ -319,8 +319,7 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: Header) -
         notes += one.notes
         clocks: dict[int, Clock] = {}
         for name, column in one.columns.items():
-            side = name in dict(SIDE_CHANNELS.values())
-            if name in columns and name not in header.sensors and (len(files) == 1 or not side):
+            if name in columns and name not in header.sensors and (len(files) == 1 or name not in SIDE_UNITS):
                 continue  # each sensor's own temperature, or a column of no meaning here
             if name in columns:
                 raise UserError(f"{paths}: column '{name}' is in more than one of them")
