@@ -98,11 +98,7 @@ class Header:
 
     def mapped(self, keys: Sequence[str]) -> dict[str, str]:
         """The names here, by heading, that the user gives."""
-        return {
-            key: name
-            for name, wanted in self.columns.items()
-            for key in [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
-        }
+        return {key: name for name, wanted in self.columns.items() for key in _called(keys, wanted)}
 
     def fields(
         self,
@@ -195,7 +191,7 @@ class Header:
     def _renamed(self, keys: Sequence[str], where: str) -> dict[str, str]:
         renamed: dict[str, str] = {}
         for name, wanted in self.columns.items():
-            matches = [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
+            matches = _called(keys, wanted)
             if not matches and self.several:
                 continue
             if not matches:
@@ -314,6 +310,11 @@ class Header:
         if name == "t" and not units.same_kind(unit, "s"):
             raise UserError(f"{column} is in {unit}, which is not a time (h, min, s, ms, us, ns)")
         return [Field(key, name, unit, size, optional and name not in SIDE_UNITS, dates)]
+
+
+def _called(keys: Sequence[str], wanted: str) -> list[str]:
+    """The headings that the user calls `wanted`: those that are it, else those of this name and any unit."""
+    return [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
 
 
 def number_in(value: Any) -> float:
