@@ -105,11 +105,11 @@ class Header:
         keys: Sequence[str],
         where: str,
         described: Any,
-        first: Sequence[str] = (),
-        meant: Mapping[str, Meaning] | None = None,
+        cells: Mapping[str, str],
+        meant: Mapping[str, Meaning],
     ) -> list[Field]:
         """One field for each column to read, in file order. `where` is put after the path in messages; `described` is
-        what a meta text says of columns that are named plainly; `first`: the cells of the first row of a text;
+        what a meta text says of columns that are named plainly; `cells`: those of the first row of a text, by heading;
         `meant`: what `sensors_of` found of the sensor."""
         if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
             raise UserError(f"{self.path}: meta: 'columns' must be a mapping of column names to unit and lsb")
@@ -118,19 +118,18 @@ class Header:
                 what = f"more than {LONGEST_HEADING} characters, or some that cannot be shown"
                 raise UserError(f"{self.path}: {where}a heading of {what}: '{short(key)}'")
         renamed = self._renamed(keys, where)
-        self.without_unit, self.without_size = [], []
         found: list[Field] = []
-        for place, key in enumerate(keys):
+        for key in keys:
             name, unit = split(key)
             if unit is not None and unit.isdecimal():
                 unit = None  # a place in an array
             size = 1.0
             if key in renamed:
                 name = renamed[key]
-            elif meant is not None and key in meant:
+            elif key in meant:
                 name, unit, size = meant[key].name, meant[key].unit, meant[key].size
             entry = described.get(split(key)[0], {}) if unit is None else {}
-            cell = first[place] if place < len(first) else ""
+            cell = cells.get(key, "")
             dates = is_date(cell)
             if name in self.sensors and cell.lstrip("-").isdecimal():
                 self.whole.add(key)

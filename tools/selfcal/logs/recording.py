@@ -251,11 +251,10 @@ class _Sensor:
 
     def span(self) -> tuple[int, float]:
         """Number of readings, and the seconds of them."""
-        cells = dict(zip(self.table.keys, self.table.first, strict=False))
         for key in self.keys:
             if self.name(key) == "t":
                 unit = self.sensor.meant.get(key, Meaning(*split(key))).unit
-                field = Field(key, "t", "s", 1.0, dates=is_date(cells.get(key, "")))
+                field = Field(key, "t", "s", 1.0, dates=is_date(self.table.cells.get(key, "")))
                 return _span(self.table.rows(self.path, [field]).columns[0], unit)
         wanted = [Field(key, self.name(key), "", 1.0) for key in self.sensor.meant or self.keys]
         return self.table.rows(self.path, wanted[:1]).columns[0].size, 0.0
@@ -277,9 +276,7 @@ class _Sensor:
         if not keys:
             raise UserError(f"{self.path}: there are no columns")
         table = self.table
-        cells = dict(zip(table.keys, table.first, strict=False))
-        first = [cells.get(key, "") for key in keys] if cells else ()
-        fields = header.fields(keys, table.where, table.meta.get("columns", {}), first, self.sensor.meant)
+        fields = header.fields(keys, table.where, table.meta.get("columns", {}), table.cells, self.sensor.meant)
         fields += header.marks(keys, table.meta, rate, fields)
         rows = table.rows(self.path, fields)
         header.damaged += rows.damaged

@@ -100,6 +100,11 @@ class Table:
         return self.headings or list(self.members)
 
     @property
+    def cells(self) -> Mapping[str, str]:
+        """The cells of the first row of a text, by heading."""
+        return dict(zip(self.keys, self.first, strict=False))
+
+    @property
     def where(self) -> str:
         """What a message puts after the path."""
         return self.line or (f"{self.source}: " if self.source else "")
