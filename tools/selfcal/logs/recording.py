@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -243,11 +244,15 @@ class _Sensor:
     side: bool
     mend: bool
 
+    @cached_property
+    def _mapped(self) -> dict[str, str]:
+        return self.header.mapped(self.keys)
+
     def name(self, key: str) -> str:
         """A column's name here."""
         if key in self.sensor.meant:
             return self.sensor.meant[key].name
-        return self.header.mapped(self.keys).get(key, split(key)[0])
+        return self._mapped.get(key, split(key)[0])
 
     def span(self) -> tuple[int, float]:
         """Number of readings, and the seconds of them."""
