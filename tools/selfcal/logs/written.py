@@ -13,7 +13,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -151,7 +151,7 @@ def clocks_of(
         at: Rows = np.asarray(place, np.int64)
         clock = Clock(rate, np.diff(at, prepend=np.int64(-1)) - 1, start_s=start)
         if stamped:
-            clock = Clock(rate, clock.missing_before, stamps - clock.time_s if late is None else stamps, start)
+            clock = replace(clock, off_grid_s=stamps - clock.time_s if late is None else stamps)
         found.append((names, clock, rows))
     return found
 
