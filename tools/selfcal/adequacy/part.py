@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
@@ -190,8 +191,7 @@ def read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Readings
 
 def _step(readings: Readings) -> float:
     """The lattice of an axis, that of a fine one too; 0 for none."""
-    known = readings.values[np.isfinite(readings.values)]
-    return readings.lattice.step if readings.lattice is not None else step_of(known)[0]
+    return readings.lattice.step if readings.lattice is not None else step_of(_known(readings))[0]
 
 
 def _divides(step: float, lsb: float) -> bool:
@@ -201,10 +201,13 @@ def _divides(step: float, lsb: float) -> bool:
 
 def _inside(readings: Readings, limit: float) -> bool:
     """Whether a range of both signs keeps no reading of an axis out; where it clips, its level alone counts."""
-    values = np.abs(readings.values[np.isfinite(readings.values)])
-    if readings.clipped is not None:
-        values = np.abs(np.median(readings.values[np.isfinite(readings.values)]))
-    return bool(np.max(values) <= limit * (1.0 + ROUNDED))
+    known = _known(readings)
+    largest = np.abs(known).max() if readings.clipped is None else abs(np.median(known))
+    return bool(largest <= limit * (1.0 + ROUNDED))
+
+
+def _known(readings: Readings) -> NDArray[np.float64]:
+    return readings.values[np.isfinite(readings.values)]
 
 
 def of_sheet(tree: dict[str, Any], stated: Sequence[Stated], measured: bool) -> list[str]:

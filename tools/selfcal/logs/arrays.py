@@ -12,13 +12,12 @@ from selfcal.base.errors import UserError, short
 from selfcal.base.units import SENSORS
 from selfcal.logs.loaders.headings import split
 from selfcal.logs.loaders.table import Table, of_arrays
+from selfcal.logs.recorded import SIDE_UNITS
 
 #: Axes of an array by its columns.
 _COLUMNS = {1: SENSORS[:1], 3: SENSORS[:3], 6: SENSORS}
 #: Names of the three axes of a sensor.
 _THREE = {"gyro": SENSORS[:3], "accel": SENSORS[3:]}
-#: Columns that are no time.
-_SIDES = ("temp", "supply")
 #: Whole numbers of the time stamps of a data frame are so long.
 _STAMP = "datetime64[ns]"
 
@@ -53,7 +52,7 @@ def table_of(
             f"arrays: no unit of {', '.join(lacking)}: give units={{'{lacking[0]}': 'deg/s'}}, or its own unit; or "
             f"name it '{lacking[0]}[deg/s]'"
         )
-    if rate_hz is None and {split(heading)[0] for heading in arrays} <= {*sensors, *_SIDES} and "t" not in known:
+    if rate_hz is None and {split(heading)[0] for heading in arrays} <= {*sensors, *SIDE_UNITS} and "t" not in known:
         raise UserError("arrays: no time column: give rate_hz=100.0, or a column 't[s]'")
     return of_arrays("", arrays), stated
 

@@ -71,28 +71,26 @@ def assembled(rate: float | None, rows: Rows, header: Header, mend: bool) -> Rec
 def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header, mend: bool) -> tuple[_Stamps, Places]:
     """The stamps in their order, and the rows of the table that they are of. `part`: what is added to the stamps."""
     number = [field.name for field in rows.fields].index("t")
-    every = np.arange(stamps.values.size)
     known = np.flatnonzero(np.isfinite(stamps.values))
-    if known.size < every.size and not (mend and few(every.size - known.size, every.size)):
+    unknown = stamps.values.size - known.size
+    if unknown and not (mend and few(unknown, stamps.values.size)):
         rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
-    values = stamps.values[known] if known.size < every.size else stamps.values
+    values = _at(stamps.values, known)
     tick_s = units.factor(stamps.unit, "s") * rows.fields[number].lsb
     since = units.convert(values - values[0], stamps.unit, "s")
     if part is not None:
         since += units.convert(np.nan_to_num(part.values[known]), part.unit, "s")
     order = in_order(since, tick_s, mend)
     kept = known[order.rows]
-    if unknown := every.size - known.size:
+    if unknown:
         header.notes.append(f"{unknown} line{'s were' if unknown > 1 else ' was'} skipped, without a time stamp")
     header.damaged += Damaged(0, order.damaged + unknown)
     header.notes += order.notes
-    size = np.abs(values).max(keepdims=True)
-    first = float(units.convert(np.array([rows.started + values[0]]), stamps.unit, "s")[0])
     return (
         _Stamps(
             order.time - order.time[0],
-            float(np.abs(units.convert(np.spacing(size), stamps.unit, "s"))[0]),
-            first + float(order.time[0]),
+            units.convert(float(np.spacing(np.abs(values).max())), stamps.unit, "s"),
+            units.convert(rows.started + float(values[0]), stamps.unit, "s") + float(order.time[0]),
             lambda row, what: rows.fail(int(kept[row]), number, what),
         ),
         kept,

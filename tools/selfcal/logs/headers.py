@@ -23,7 +23,7 @@ from selfcal.logs.loaders.headings import PART, Meaning, Sensor, sensors_of, spl
 from selfcal.logs.loaders.table import Field
 from selfcal.logs.loaders.text_table import is_clock, is_date, is_row
 from selfcal.logs.loaders.texts import Text
-from selfcal.logs.recorded import SIDE_CHANNELS
+from selfcal.logs.recorded import SIDE_UNITS
 
 #: Unit of a scaled LSB column where the scale states none.
 LSB_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in SENSORS}
@@ -98,22 +98,18 @@ class Header:
 
     def mapped(self, keys: Sequence[str]) -> dict[str, str]:
         """The names here, by heading, that the user gives."""
-        return {
-            key: name
-            for name, wanted in self.columns.items()
-            for key in [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
-        }
+        return {key: name for name, wanted in self.columns.items() for key in _called(keys, wanted)}
 
     def fields(
         self,
         keys: Sequence[str],
         where: str,
         described: Any,
-        first: Sequence[str] = (),
-        meant: Mapping[str, Meaning] | None = None,
+        cells: Mapping[str, str],
+        meant: Mapping[str, Meaning],
     ) -> list[Field]:
         """One field for each column to read, in file order. `where` is put after the path in messages; `described` is
-        what a meta text says of columns that are named plainly; `first`: the cells of the first row of a text;
+        what a meta text says of columns that are named plainly; `cells`: those of the first row of a text, by heading;
         `meant`: what `sensors_of` found of the sensor."""
         if not isinstance(described, dict) or not all(isinstance(entry, dict) for entry in described.values()):
             raise UserError(f"{self.path}: meta: 'columns' must be a mapping of column names to unit and lsb")
@@ -122,19 +118,18 @@ class Header:
                 what = f"more than {LONGEST_HEADING} characters, or some that cannot be shown"
                 raise UserError(f"{self.path}: {where}a heading of {what}: '{short(key)}'")
         renamed = self._renamed(keys, where)
-        self.without_unit, self.without_size = [], []
         found: list[Field] = []
-        for place, key in enumerate(keys):
+        for key in keys:
             name, unit = split(key)
             if unit is not None and unit.isdecimal():
                 unit = None  # a place in an array
             size = 1.0
             if key in renamed:
                 name = renamed[key]
-            elif meant is not None and key in meant:
+            elif key in meant:
                 name, unit, size = meant[key].name, meant[key].unit, meant[key].size
             entry = described.get(split(key)[0], {}) if unit is None else {}
-            cell = first[place] if place < len(first) else ""
+            cell = cells.get(key, "")
             dates = is_date(cell)
             if name in self.sensors and cell.lstrip("-").isdecimal():
                 self.whole.add(key)
@@ -195,7 +190,7 @@ class Header:
     def _renamed(self, keys: Sequence[str], where: str) -> dict[str, str]:
         renamed: dict[str, str] = {}
         for name, wanted in self.columns.items():
-            matches = [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
+            matches = _called(keys, wanted)
             if not matches and self.several:
                 continue
             if not matches:
@@ -224,7 +219,7 @@ class Header:
         """A heading, without its unit, and the matrix that it is a column of; none that means a column here."""
         name = split(key)[0]
         matrix, _, number = name.rpartition(":")
-        here = {"t", *self.sensors, *dict(SIDE_CHANNELS.values())}
+        here = {"t", *self.sensors, *SIDE_UNITS}
         return [one for one in (key, name, *([matrix] if number.isdigit() else [])) if one not in here]
 
     def _what_to_state(self) -> str:
@@ -273,7 +268,7 @@ class Header:
         dates = dates and name == "t" and stated is None
         unit = "s" if dates else unit
         known = isinstance(unit, str) and units.known(unit)
-        example = {"t": "s", **dict(SIDE_CHANNELS.values()), **LSB_UNITS}.get(name, "UNIT")
+        example = {"t": "s", **SIDE_UNITS, **LSB_UNITS}.get(name, "UNIT")
         to_scale = (
             f"give --scale {shlex.quote(f'{name}=SIZE[{example}]')}, SIZE the {example} of one '{short(str(unit))}'"
         )
@@ -283,7 +278,7 @@ class Header:
         if broken and any(name.startswith(sensor) for sensor in ("t", *self.sensors)):
             raise UserError(f"{column}: the brackets of its unit do not match: write name[unit]")
         if optional and (not name or broken or not known or (unit == units.LSB and "" not in self.scale)):
-            if name in dict(SIDE_CHANNELS.values()):
+            if name in SIDE_UNITS:
                 to_state = f"write {name}[{example}], or give --unit {name}={example}, or the unit that it is in"
                 what = f"no unit and is left out: {to_state}"
                 if unit is not None:
@@ -313,8 +308,12 @@ class Header:
             raise UserError(f"{column}: the size of one LSB must be a number above 0")
         if name == "t" and not units.same_kind(unit, "s"):
             raise UserError(f"{column} is in {unit}, which is not a time (h, min, s, ms, us, ns)")
-        side = name in dict(SIDE_CHANNELS.values())
-        return [Field(key, name, unit, size, optional and not side, dates)]
+        return [Field(key, name, unit, size, optional and name not in SIDE_UNITS, dates)]
+
+
+def _called(keys: Sequence[str], wanted: str) -> list[str]:
+    """The headings that the user calls `wanted`: those that are it, else those of this name and any unit."""
+    return [key for key in keys if key == wanted] or [key for key in keys if split(key)[0] == wanted]
 
 
 def number_in(value: Any) -> float:

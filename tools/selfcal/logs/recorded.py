@@ -22,6 +22,8 @@ from selfcal.logs.timebase import Clock
 LONGEST_POWERED_S = 3.2e7
 #: Columns that are no axis but may explain one, by cause: name and unit.
 SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
+#: Their units, by name.
+SIDE_UNITS = MappingProxyType(dict(SIDE_CHANNELS.values()))
 
 
 @dataclass(frozen=True)

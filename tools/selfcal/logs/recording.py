@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from importlib import import_module
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -31,7 +32,7 @@ from selfcal.logs.loaders.headings import Meaning, Sensor, sides_of, split
 from selfcal.logs.loaders.sources import Part, chosen
 from selfcal.logs.loaders.table import Field, Hints, Table, meta_place
 from selfcal.logs.loaders.text_table import is_date
-from selfcal.logs.recorded import SIDE_CHANNELS, Column, Recording, as_float, bridged, bridged_at
+from selfcal.logs.recorded import SIDE_CHANNELS, SIDE_UNITS, Column, Recording, as_float, bridged, bridged_at
 from selfcal.logs.timebase import Clock
 from selfcal.logs.written import save
 
@@ -243,19 +244,22 @@ class _Sensor:
     side: bool
     mend: bool
 
+    @cached_property
+    def _mapped(self) -> dict[str, str]:
+        return self.header.mapped(self.keys)
+
     def name(self, key: str) -> str:
         """A column's name here."""
         if key in self.sensor.meant:
             return self.sensor.meant[key].name
-        return self.header.mapped(self.keys).get(key, split(key)[0])
+        return self._mapped.get(key, split(key)[0])
 
     def span(self) -> tuple[int, float]:
         """Number of readings, and the seconds of them."""
-        cells = dict(zip(self.table.keys, self.table.first, strict=False))
         for key in self.keys:
             if self.name(key) == "t":
                 unit = self.sensor.meant.get(key, Meaning(*split(key))).unit
-                field = Field(key, "t", "s", 1.0, dates=is_date(cells.get(key, "")))
+                field = Field(key, "t", "s", 1.0, dates=is_date(self.table.cells.get(key, "")))
                 return _span(self.table.rows(self.path, [field]).columns[0], unit)
         wanted = [Field(key, self.name(key), "", 1.0) for key in self.sensor.meant or self.keys]
         return self.table.rows(self.path, wanted[:1]).columns[0].size, 0.0
@@ -266,7 +270,7 @@ class _Sensor:
         if not (self.side or side):
             header.notes += self.table.notes
             return self._read(header, self.rate, self.keys)
-        header.sensors, header.columns = [name for name, _ in SIDE_CHANNELS.values()], {}
+        header.sensors, header.columns = list(SIDE_UNITS), {}
         try:
             return self._read(header, None, [key for key in self.keys if self.name(key) in ("t", *header.sensors)])
         except UserError as error:
@@ -277,9 +281,7 @@ class _Sensor:
         if not keys:
             raise UserError(f"{self.path}: there are no columns")
         table = self.table
-        cells = dict(zip(table.keys, table.first, strict=False))
-        first = [cells.get(key, "") for key in keys] if cells else ()
-        fields = header.fields(keys, table.where, table.meta.get("columns", {}), first, self.sensor.meant)
+        fields = header.fields(keys, table.where, table.meta.get("columns", {}), table.cells, self.sensor.meant)
         fields += header.marks(keys, table.meta, rate, fields)
         rows = table.rows(self.path, fields)
         header.damaged += rows.damaged
@@ -319,8 +321,7 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: Header) -
         notes += one.notes
         clocks: dict[int, Clock] = {}
         for name, column in one.columns.items():
-            side = name in dict(SIDE_CHANNELS.values())
-            if name in columns and name not in header.sensors and (len(files) == 1 or not side):
+            if name in columns and name not in header.sensors and (len(files) == 1 or name not in SIDE_UNITS):
                 continue  # each sensor's own temperature, or a column of no meaning here
             if name in columns:
                 raise UserError(f"{paths}: column '{name}' is in more than one of them")

@@ -13,7 +13,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +24,7 @@ from selfcal.base.errors import UserError, cell
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_COLUMNS, MOST_RATE_HZ
 from selfcal.base.output import together, whole
 from selfcal.logs.loaders import WRITTEN
-from selfcal.logs.loaders.table import meta_place
+from selfcal.logs.loaders.table import heading, meta_place
 from selfcal.logs.recorded import Recording
 from selfcal.logs.timebase import Clock
 
@@ -151,7 +151,7 @@ def clocks_of(
         at: Rows = np.asarray(place, np.int64)
         clock = Clock(rate, np.diff(at, prepend=np.int64(-1)) - 1, start_s=start)
         if stamped:
-            clock = Clock(rate, clock.missing_before, stamps - clock.time_s if late is None else stamps, start)
+            clock = replace(clock, off_grid_s=stamps - clock.time_s if late is None else stamps)
         found.append((names, clock, rows))
     return found
 
@@ -183,7 +183,7 @@ def save(
     n = len(next(iter(columns.values()))[1])
     stamps = np.arange(n) / rate_hz if t is None else t
     values = np.column_stack([stamps, *(values for _, values in columns.values())])
-    names = ",".join(["t[s]", *(_SIGNS.sub("_", cell(_heading(name, unit))) for name, (unit, _) in columns.items())])
+    names = ",".join(["t[s]", *(_SIGNS.sub("_", cell(heading(name, unit))) for name, (unit, _) in columns.items())])
     with together(path, meta_place(path)) as (table, beside):
         if exact:
             _save_exact(table, names, values)
@@ -193,10 +193,6 @@ def save(
             beside.unlink()
         else:
             beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
-
-
-def _heading(name: str, unit: str) -> str:
-    return f"{name}[{unit}]" if unit else name
 
 
 def _save_exact(place: Path, header: str, values: NDArray[np.float64]) -> None:
@@ -228,6 +224,6 @@ def _save_npz(
             arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
             described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
         else:
-            arrays[_heading(name, unit)] = np.asarray(values, np.float64)
+            arrays[heading(name, unit)] = np.asarray(values, np.float64)
     with whole(path) as temporary, temporary.open("wb") as stream:
         np.savez_compressed(stream, allow_pickle=False, meta=np.array(json.dumps(described)), **arrays)

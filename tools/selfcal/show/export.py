@@ -54,6 +54,10 @@ class Kind:
             f"overbound {self.level:g}: {f'{value:.6e}' if math.isfinite(value) else 'none, the record is too short'}"
         )
 
+    def line(self, name: str, unit: str, factor: float = 1.0) -> str:
+        """The number, and in a comment its unit and what stands beside it."""
+        return f"{self.number(name, factor)}  # {unit}; {self.beside(name, factor)}\n"
+
     @property
     def step(self) -> float:
         """Density of the drift of a Gauss-Markov form over short times."""
@@ -146,16 +150,13 @@ def _head(comment: str, gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -
 
 
 def _kalibr(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
-    def line(name: str, kind: Kind, parameter: str, unit: str) -> str:
-        return f"{name}: {kind.number(parameter)}  # {unit}; {kind.beside(parameter)}\n"
-
     return (
         _head("#", gyro, accel, recording)
         + f"rostopic: /imu0\nupdate_rate: {recording['rate_hz']:g}  # Hz\n"
-        + line("accelerometer_noise_density", accel, "N", "m/s^2/sqrt(Hz)")
-        + line("accelerometer_random_walk", accel, "K", "m/s^3/sqrt(Hz)")
-        + line("gyroscope_noise_density", gyro, "N", "rad/s/sqrt(Hz)")
-        + line("gyroscope_random_walk", gyro, "K", "rad/s^2/sqrt(Hz)")
+        + f"accelerometer_noise_density: {accel.line('N', 'm/s^2/sqrt(Hz)')}"
+        + f"accelerometer_random_walk: {accel.line('K', 'm/s^3/sqrt(Hz)')}"
+        + f"gyroscope_noise_density: {gyro.line('N', 'rad/s/sqrt(Hz)')}"
+        + f"gyroscope_random_walk: {gyro.line('K', 'rad/s^2/sqrt(Hz)')}"
     )
 
 
@@ -181,9 +182,6 @@ def _allan_variance_ros(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -
 def _openvins(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
     """`kalibr_imu_chain.yaml`: the keys that its parser wants of imu0, intrinsics those of a perfect IMU."""
 
-    def line(name: str, kind: Kind, parameter: str, unit: str) -> str:
-        return f"  {name}: {kind.number(parameter)}  # {unit}; {kind.beside(parameter)}\n"
-
     def matrix(name: str, size: int, diagonal: float) -> str:
         rows = [[diagonal if row == column else 0.0 for column in range(size)] for row in range(size)]
         return f"  {name}:\n" + "".join(f"    - {row}\n" for row in rows)
@@ -194,10 +192,10 @@ def _openvins(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
         + "# A floor set by the sensor alone: OpenVINS' own files inflate such numbers for what its model leaves out.\n"
         + "\nimu0:\n"
         + matrix("T_i_b", 4, 1.0)
-        + line("accelerometer_noise_density", accel, "N", "m/s^2/sqrt(Hz)")
-        + line("accelerometer_random_walk", accel, "K", "m/s^3/sqrt(Hz)")
-        + line("gyroscope_noise_density", gyro, "N", "rad/s/sqrt(Hz)")
-        + line("gyroscope_random_walk", gyro, "K", "rad/s^2/sqrt(Hz)")
+        + f"  accelerometer_noise_density: {accel.line('N', 'm/s^2/sqrt(Hz)')}"
+        + f"  accelerometer_random_walk: {accel.line('K', 'm/s^3/sqrt(Hz)')}"
+        + f"  gyroscope_noise_density: {gyro.line('N', 'rad/s/sqrt(Hz)')}"
+        + f"  gyroscope_random_walk: {gyro.line('K', 'rad/s^2/sqrt(Hz)')}"
         + f"  rostopic: /imu0\n  time_offset: 0.0  # s\n  update_rate: {float(recording['rate_hz']):.10g}  # Hz\n"
         + '  model: "kalibr"\n'
         + matrix("Tw", 3, 1.0)
@@ -229,33 +227,26 @@ def _px4(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
     """The filter steps by PREDICT_S, whatever the sensor's rate: it adds (noise dt)^2 to an angle and a velocity, and
     (bias noise dt)^2 to a bias (predictCovariance() of EKF/covariance.cpp in src/modules/ekf2)."""
     root, us = PREDICT_S**-0.5, round(1e6 * PREDICT_S)
-
-    def line(name: str, kind: Kind, parameter: str, unit: str) -> str:
-        return f"param set {name} {kind.number(parameter, root)}  # {unit}; {kind.beside(parameter, root)}\n"
-
     return (
         _head("#", gyro, accel, recording)
         + f"# discrete, for the filter's own step, EKF2_PREDICT_US {us}, its default: noise N/sqrt(step), bias noise\n"
         + f"# K/sqrt(step). With another step multiply each by sqrt({us}/EKF2_PREDICT_US). A floor set by the sensor\n"
         + "# alone, not a tuning: vibration and everything else the filter must absorb come on top.\n"
-        + line("EKF2_GYR_NOISE", gyro, "N", "rad/s")
-        + line("EKF2_ACC_NOISE", accel, "N", "m/s^2")
-        + line("EKF2_GYR_B_NOISE", gyro, "K", "rad/s^2")
-        + line("EKF2_ACC_B_NOISE", accel, "K", "m/s^3")
+        + f"param set EKF2_GYR_NOISE {gyro.line('N', 'rad/s', root)}"
+        + f"param set EKF2_ACC_NOISE {accel.line('N', 'm/s^2', root)}"
+        + f"param set EKF2_GYR_B_NOISE {gyro.line('K', 'rad/s^2', root)}"
+        + f"param set EKF2_ACC_B_NOISE {accel.line('K', 'm/s^3', root)}"
     )
 
 
 def _orbslam3(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
-    def line(name: str, kind: Kind, parameter: str, unit: str) -> str:
-        return f"IMU.{name}: {kind.number(parameter)}  # {unit}; {kind.beside(parameter)}\n"
-
     return (
         "%YAML:1.0\n"
         + _head("#", gyro, accel, recording)
-        + line("NoiseGyro", gyro, "N", "rad/s/sqrt(Hz)")
-        + line("NoiseAcc", accel, "N", "m/s^2/sqrt(Hz)")
-        + line("GyroWalk", gyro, "K", "rad/s^2/sqrt(Hz)")
-        + line("AccWalk", accel, "K", "m/s^3/sqrt(Hz)")
+        + f"IMU.NoiseGyro: {gyro.line('N', 'rad/s/sqrt(Hz)')}"
+        + f"IMU.NoiseAcc: {accel.line('N', 'm/s^2/sqrt(Hz)')}"
+        + f"IMU.GyroWalk: {gyro.line('K', 'rad/s^2/sqrt(Hz)')}"
+        + f"IMU.AccWalk: {accel.line('K', 'm/s^3/sqrt(Hz)')}"
         + f"IMU.Frequency: {recording['rate_hz']:g}  # Hz\n"
     )
 
@@ -264,20 +255,16 @@ def _vins(gyro: Kind, accel: Kind, recording: Mapping[str, Any]) -> str:
     """The means of two readings are a step. Each has a noise of its own there, so a step of dt adds (n dt)^2 / 2 to an
     angle, and (w dt)^2 to a bias (midPointIntegration() of factor/integration_base.h)."""
     rate_hz = float(recording["rate_hz"])
-
-    def line(name: str, kind: Kind, parameter: str, factor: float, unit: str) -> str:
-        number = kind.number(parameter, factor * rate_hz**0.5)
-        return f"{name}: {number}  # {unit}; {kind.beside(parameter, factor * rate_hz**0.5)}\n"
-
+    of_n, of_w = 2.0**0.5 * rate_hz**0.5, rate_hz**0.5
     return (
         "%YAML:1.0\n"
         + _head("#", gyro, accel, recording)
         + f"# per sample, of an IMU at {rate_hz:g} Hz: n = N sqrt(2 rate), w = K sqrt(rate). At another rate multiply\n"
         + f"# each by sqrt(rate/{rate_hz:g} Hz).\n"
-        + line("acc_n", accel, "N", 2.0**0.5, "m/s^2")
-        + line("gyr_n", gyro, "N", 2.0**0.5, "rad/s")
-        + line("acc_w", accel, "K", 1.0, "m/s^3")
-        + line("gyr_w", gyro, "K", 1.0, "rad/s^2")
+        + f"acc_n: {accel.line('N', 'm/s^2', of_n)}"
+        + f"gyr_n: {gyro.line('N', 'rad/s', of_n)}"
+        + f"acc_w: {accel.line('K', 'm/s^3', of_w)}"
+        + f"gyr_w: {gyro.line('K', 'rad/s^2', of_w)}"
     )
 
 

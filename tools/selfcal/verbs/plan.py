@@ -92,25 +92,21 @@ def plan(
     plain = replace(loaded, regressors=())
     ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
     lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
-    truth = ensemble.typical
+    samples = max((one for one in lengths if one is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
     entries = []
     for k, wish in enumerate(wishes):
-        length = lengths[k]
-        entries.append(
-            {
-                "wish": wish.text,
-                "duration_s": None if length is None else length / loaded.bank_rate_hz,
-                "most": wish.most,
-                "curve": [] if wish.parameter in columns else ensemble.curve(k),
-            }
-        )
-    samples = max((one for one in lengths if one is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
-    for entry, wish in zip(entries, wishes, strict=True):
-        if wish.parameter in columns:
-            entry["duration_s"] = samples / loaded.bank_rate_hz
-            one = columns[wish.parameter]
-            entry["channel"], entry["unit"] = one.column, one.channel_unit
-            entry["cycling"] = cycling(loaded, name, wish, one, samples, seeds, scheduler)
+        column = columns.get(wish.parameter)
+        length = lengths[k] if column is None else samples
+        entry = {
+            "wish": wish.text,
+            "duration_s": None if length is None else length / loaded.bank_rate_hz,
+            "most": wish.most,
+            "curve": ensemble.curve(k) if column is None else [],
+        }
+        if column is not None:
+            swings = cycling(loaded, name, wish, column, samples, seeds, scheduler)
+            entry |= {"channel": column.column, "unit": column.channel_unit, "cycling": swings}
+        entries.append(entry)
     all_known = all(one["duration_s"] is not None for one in entries)
     document: dict[str, Any] = {
         "schema": SCHEMA,
@@ -121,7 +117,7 @@ def plan(
         "rate_hz": loaded.bank_rate_hz,
         "duration_s": samples / loaded.bank_rate_hz if all_known else None,
         "wishes": entries,
-        "rates": rates(loaded, wishes, lengths, truth),
+        "rates": rates(loaded, wishes, lengths, ensemble.typical),
     }
     if json is not None:
         write_json(document, json)

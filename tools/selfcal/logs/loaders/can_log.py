@@ -14,7 +14,7 @@ import numpy as np
 
 from selfcal.base.errors import UserError
 from selfcal.logs.framelog import FrameLog
-from selfcal.logs.loaders.table import Hints, Table, of_arrays
+from selfcal.logs.loaders.table import Hints, Table, heading, of_arrays
 
 
 def read(path: Path, hints: Hints) -> list[Table]:
@@ -55,7 +55,7 @@ def read(path: Path, hints: Hints) -> list[Table]:
         message = messages[number]
         rows = np.array(values[number, names]).reshape(len(times), -1)
         unit = {one.name: one.unit for one in message.signals}
-        columns = {f"{name}[{unit[name]}]" if unit[name] else name: rows[:, k] for k, name in enumerate(names)}
+        columns = {heading(name, unit[name]): rows[:, k] for k, name in enumerate(names)}
         alone = sum(other == number for other, _ in stamps) == 1
         source = message.name if alone else f"{message.name}/{_chosen(message, names)}"
         tables.append(of_arrays(source, {"t[s]": np.array(times), **columns}, notes=notes, damaged=log.damaged))

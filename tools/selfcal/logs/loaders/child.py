@@ -29,7 +29,7 @@ from selfcal.base.errors import UserError, printable
 from selfcal.base.limits import MOST_COLUMNS, MOST_GROWTH, MOST_NUMBERS, MOST_UNPACKED_SMALL, reading
 from selfcal.base.output import temporary_folder
 from selfcal.logs.loaders import Format
-from selfcal.logs.loaders.damage import Damaged
+from selfcal.logs.loaders.damage import Damaged, parts_of
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
@@ -110,13 +110,9 @@ def _received(pipe: int, size: int, ends: float) -> bytearray:
     return data
 
 
-def _parts(path: Path) -> list[Path]:
-    return list(path.iterdir()) if path.is_dir() else [path]
-
-
 def _bytes(path: Path) -> int:
     """Bytes of a file, or of a folder's files. A hole has none; a disk that packs files does so to a sixteenth."""
-    found = [part.stat() for part in _parts(path)]
+    found = [part.stat() for part in parts_of(path)]
     return sum(min(one.st_size, 16 * 512 * one.st_blocks) for one in found)
 
 
@@ -146,7 +142,7 @@ def answer(module: str, path: Path, hints: Hints, to: int) -> None:
     _bound(resource.RLIMIT_AS, most, most)
     _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
     # What it unpacks into files: each part of a folder, but for its index, into one.
-    most = max(MOST_UNPACKED_SMALL, MOST_GROWTH * _bytes(path)) // max(1, len(_parts(path)) - path.is_dir())
+    most = max(MOST_UNPACKED_SMALL, MOST_GROWTH * _bytes(path)) // max(1, len(parts_of(path)) - path.is_dir())
     _bound(resource.RLIMIT_FSIZE, most, most)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     arrays: list[NDArray[np.uint8]] = []

@@ -42,10 +42,14 @@ class Damaged:
         )
 
 
+def parts_of(path: Path) -> list[Path]:
+    """A file, or those in a folder."""
+    return list(path.iterdir()) if path.is_dir() else [path]
+
+
 def bytes_of(path: Path) -> int:
     """Bytes of a file, or of those in a folder."""
-    parts = path.iterdir() if path.is_dir() else [path]
-    return sum(part.stat().st_size for part in parts)
+    return sum(part.stat().st_size for part in parts_of(path))
 
 
 #: Nothing.

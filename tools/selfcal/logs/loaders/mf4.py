@@ -13,7 +13,7 @@ import numpy as np
 
 from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_COLUMNS
-from selfcal.logs.loaders.table import Hints, Table, left_out, of_arrays
+from selfcal.logs.loaders.table import Hints, Table, heading, left_out, of_arrays
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -46,7 +46,7 @@ def read(path: Path, _: Hints) -> list[Table]:
                 if samples.dtype.kind in "iuf" and samples.ndim == 1:
                     if invalid is not None and invalid.any():
                         samples = np.where(invalid, np.nan, samples)
-                    columns[f"{signal.name}[{signal.unit}]" if signal.unit else signal.name] = samples
+                    columns[heading(signal.name, signal.unit)] = samples
                     columns["t[s]"] = signal.timestamps
             name = getattr(group.channel_group, "acq_name", "") or f"group {number}"
             if columns:

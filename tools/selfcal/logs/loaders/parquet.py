@@ -9,7 +9,7 @@ import numpy as np
 
 from selfcal.base.errors import UserError
 from selfcal.base.limits import MOST_COLUMNS
-from selfcal.logs.loaders.table import Hints, Table, check_numbers, of_arrays
+from selfcal.logs.loaders.table import Hints, Table, check_numbers, heading, of_arrays
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -37,5 +37,5 @@ def read(path: Path, _: Hints) -> list[Table]:
             unit = np.datetime_data(values.dtype)[0]
             columns[f"{name if 't' in names else 't'}[{unit}]"] = values.astype(np.int64)
         else:
-            columns[f"{name}[{unit}]" if unit and "[" not in name else name] = values
+            columns[heading(name, "" if "[" in name else unit)] = values
     return [of_arrays("", columns)]

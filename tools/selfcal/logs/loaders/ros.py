@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.logs.loaders.damage import parts_of
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 #: Doubles after the header, by type. Of an Imu's: an orientation, angular velocity and acceleration, each with nine
@@ -98,7 +99,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     if path.is_file():
         with path.open("rb") as stream:
             first = stream.read(len(_ROS_1)) == _ROS_1
-    parts = [path] if path.is_file() else list(path.iterdir())
+    parts = parts_of(path)
     for part in parts:
         if _has_wal(part):
             step = f"sqlite3 {shlex.quote(str(part))} 'pragma wal_checkpoint(truncate)'"

@@ -100,6 +100,11 @@ class Table:
         return self.headings or list(self.members)
 
     @property
+    def cells(self) -> Mapping[str, str]:
+        """The cells of the first row of a text, by heading."""
+        return dict(zip(self.keys, self.first, strict=False))
+
+    @property
     def where(self) -> str:
         """What a message puts after the path."""
         return self.line or (f"{self.source}: " if self.source else "")
@@ -154,6 +159,11 @@ def left_out(names: Sequence[str], by: str) -> tuple[str, ...]:
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
     named = f"{', '.join(map(short, names[:_MOST_NAMED]))}{more}"
     return (f"left out: {named}: their values come by {by}: export them as physical values",) if names else ()
+
+
+def heading(name: str, unit: str | None) -> str:
+    """A heading `name[unit]`; the name alone without a unit."""
+    return f"{name}[{unit}]" if unit else name
 
 
 def in_memory(array: NDArray[Any]) -> Member:

@@ -16,7 +16,7 @@ from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_NUMBERS
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import TIMES
-from selfcal.logs.loaders.table import Hints, Table, left_out, of_arrays
+from selfcal.logs.loaders.table import Hints, Table, heading, left_out, of_arrays
 
 #: Bytes before a segment's content; the bit of its second number that says in which order the others' bytes are.
 _LEAD, _BIG_ENDIAN, _NEVER_ENDED = 28, 1 << 6, 2**64 - 1
@@ -48,7 +48,7 @@ def read(path: Path, _: Hints) -> list[Table]:
                 elif values.dtype.kind not in "iuf" or values.ndim != 1:
                     continue
                 key = (group.name, values.size)
-                tables.setdefault(key, {})[f"{name}[{unit}]" if unit and "[" not in name else name] = values
+                tables.setdefault(key, {})[heading(name, "" if "[" in name else unit)] = values
                 step = channel.properties.get("wf_increment")
                 if isinstance(step, float) and step > 0.0:
                     begin = float(channel.properties.get("wf_start_offset", 0.0))

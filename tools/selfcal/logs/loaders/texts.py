@@ -6,7 +6,7 @@ import shlex
 import zipfile
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, NoReturn, cast
 
@@ -41,14 +41,14 @@ class Text:
 Knows = Callable[[Sequence[str]], bool]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class TextTable(Table):
     """A text, or its rows that have a cell `only` in a column. Its columns are read when they are wanted."""
 
-    text: Text = field(default_factory=lambda: Text(Path(), ""))
-    knows: Callable[[Text], Knows] = lambda _: lambda _: False
-    skip_bad: bool = False
-    only: tuple[str, str] | None = None
+    text: Text
+    knows: Callable[[Text], Knows]
+    skip_bad: bool
+    only: tuple[str, str] | None
 
     def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
         path = self.text.path
