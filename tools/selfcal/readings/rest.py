@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from selfcal.base.grid import runs
+from selfcal.base.grid import MEDIAN_SD, runs
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
@@ -61,7 +61,7 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
         step = np.abs(np.diff(mean))
         known = np.isfinite(step)
         usual = float(np.quantile(step[known], 0.5)) if known.any() else 0.0
-        jumps = np.flatnonzero(known & (step > JUMP_SD * max(usual, 1e-300) / 0.6745))
+        jumps = np.flatnonzero(known & (step > JUMP_SD * max(usual, 1e-300) / MEDIAN_SD))
         moving[jumps] = moving[jumps + 1] = True
     length_s = piece / recording.rate_hz
     start = recording.start_s
