@@ -23,6 +23,7 @@ from scipy import fft
 from scipy.special import gammaincinv, ndtri
 
 from selfcal.bank.result import HALF_90, Estimate
+from selfcal.base.grid import runs
 from selfcal.model.file import Group
 from selfcal.model.laws import Law, averaged, named
 
@@ -379,8 +380,7 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     """
     values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
     broken = np.isnan(values)
-    ends = np.flatnonzero(np.diff(np.concatenate([[True], broken, [True]]).astype(np.int8)))
-    starts, stops = ends[::2], ends[1::2]
+    starts, stops = np.array(runs(~broken), np.int64).reshape(-1, 2).T
     inner = np.flatnonzero((missing_before > 0) & ~broken)
     cuts = np.setdiff1d(inner, starts)
     starts, stops = np.sort(np.concatenate([starts, cuts])), np.sort(np.concatenate([stops, cuts]))

@@ -15,7 +15,7 @@ import numpy as np
 
 from selfcal.bank.blocks import Blocks
 from selfcal.bank.result import AxisResult
-from selfcal.base.grid import half_means
+from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood.fit import Series, run, shifts
 from selfcal.likelihood.state import net
 from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Terms
@@ -128,7 +128,7 @@ def _series(blocks: Blocks, tables: Tables) -> tuple[Series, int]:
     cells = max(1, math.ceil(m / MOST))
     count = m // cells
     mean, used = half_means(y, cells)
-    r = blocks.r[: count * cells].reshape(count, cells).mean(axis=1) * cells / np.maximum(used, 1)
+    r = block_means(blocks.r, cells) * cells / np.maximum(used, 1)
     return Series(mean, tables.dt_s * cells, r, np.ones((1, count)), block=tables.block * cells), cells
 
 
@@ -194,7 +194,7 @@ def _candidates(
 def _means(values: Array, recording: Recording, begin: int, block: int, count: int) -> Array:
     """Means [count] of a column over whole blocks of the even grid from the place `begin` on, NaN where it has none."""
     if not recording.missing_before.any():
-        return np.asarray(values[begin : begin + count * block].reshape(count, block).mean(axis=1))
+        return block_means(values[begin : begin + count * block], block)
     place = np.arange(values.size) + np.cumsum(recording.missing_before) - recording.missing_before[0] - begin
     index = np.floor_divide(place, block)
     kept = (index >= 0) & (index < count)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +28,6 @@ from selfcal.model.tables import make_tables
 from selfcal.readings.gate import gated
 from selfcal.readings.readings import copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
-
-if TYPE_CHECKING:
-    pass
-
 
 #: Spacing of float32 in the noise of a reading from which on a nominal offset is taken off before.
 SPACING_LEAST = 0.01

@@ -18,9 +18,10 @@ MEDIAN_SD = 0.6745
 def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:
     """First row and the row after the last of every run of true values of a mask [n]. Runs with a gap of at most
     `apart` rows are one."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8))).reshape(-1, 2)
-    new = np.flatnonzero(edges[1:, 0] - edges[:-1, 1] > apart) + 1
-    return [(int(some[0, 0]), int(some[-1, 1])) for some in np.split(edges, new) if some.size]
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    near = 2 * np.flatnonzero(edges[2::2] - edges[1:-1:2] <= apart) + 1
+    edges = np.delete(edges, np.concatenate([near, near + 1]))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
 def equal_runs(values: Array) -> tuple[Rows, Rows]:

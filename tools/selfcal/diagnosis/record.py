@@ -189,7 +189,7 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     for name in known:
         clock, group = recording.clock_of(name), model.group_of(name)
         values = recording.in_unit(name, group.unit)
-        if _beyond(values[np.isfinite(values)], group) or mostly_beyond(values, group) or clock.rate_hz * dt < SLOWEST:
+        if _beyond(values, group) or clock.rate_hz * dt < SLOWEST:
             continue
         if copied(recording, name, tuple(states)):
             continue
@@ -299,10 +299,8 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
     """Why an axis that was asked for is not in the record."""
     group = model.group_of(name)
     values = recording.in_unit(name, group.unit)
-    if _beyond(values[np.isfinite(values)], group):
-        return f"readings beyond {BEYOND:g} times the range of {group.range:g} {group.unit}: is the unit right?"
-    if most := mostly_beyond(values, group):
-        return most
+    if told := _beyond(values, group):
+        return told
     own = recording.clock_of(name).rate_hz
     if own < SLOWEST * recording.rate_hz:
         return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"
@@ -319,9 +317,12 @@ def _varies(values: Array) -> bool:
     return bool(there.size and np.ptp(there) > 0.0)
 
 
-def _beyond(values: Array, group: Group) -> bool:
+def _beyond(values: Array, group: Group) -> str:
+    """What to say where readings [n] lie so far beyond the range that none counts. Empty elsewhere."""
     most = BEYOND * group.range if group.range > 0.0 else math.inf
-    return bool(np.max(np.abs(values)) >= min(most, _library32.SAMPLE_MAX))
+    if np.max(np.abs(values[np.isfinite(values)])) >= min(most, _library32.SAMPLE_MAX):
+        return f"readings beyond {BEYOND:g} times the range of {group.range:g} {group.unit}: is the unit right?"
+    return mostly_beyond(values, group)
 
 
 def _cause(one: Stated, model: Model) -> str:

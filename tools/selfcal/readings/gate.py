@@ -74,7 +74,7 @@ def gated(recording: Recording, model: Model) -> Recording:
     samples = np.ascontiguousarray(samples, np.float32)
     used, ended = _resting(samples, recording.missing_before, table)
     if used.any():
-        at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
+        at = recording.clock.place
         at -= at[np.argmax(used)]
         interval = at // tables.block
         moved = np.concatenate([interval[~used], (at[ended] + 1) // tables.block])

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import ndtr
 
+from selfcal.base.grid import MEDIAN_SD, equal_runs
 from selfcal.readings.budget import nats_of
 from selfcal.readings.lattice import Lattice, lattice_of
 
@@ -86,7 +87,7 @@ def recurring_of(values: Array, rate_hz: float) -> Recurring | None:
     steps = np.abs(np.diff(rest if most > COMMON * y.size else y))
     # On a lattice coarser than the noise most steps are none.
     some = steps[:: max(1, steps.size // STEPS)]
-    sigma = max(float(np.median(some)) / 0.6745, float(np.quantile(some, 0.6)) / 0.8416) / math.sqrt(2.0)
+    sigma = max(float(np.median(some)) / MEDIAN_SD, float(np.quantile(some, 0.6)) / 0.8416) / math.sqrt(2.0)
     del steps, some
     if not sigma > 0.0:
         return None
@@ -282,8 +283,7 @@ def _is_limit(others: Array, value: float, count: int) -> bool:
 
 def _no_stuck(y: Array) -> Mask:
     """Readings [n] less the repeats of runs that are no chance, if the commonest reading is a chance one."""
-    starts = np.flatnonzero(np.diff(y, prepend=np.nan) != 0.0)
-    lengths = np.diff(starts, append=y.size)
+    starts, lengths = equal_runs(y)
     commonest = float(np.unique(y, return_counts=True)[1].max()) / y.size
     stuck = lengths > 2 + math.log(1e-3 / y.size) / math.log(min(commonest, 0.99))
     kept = np.repeat(~stuck, lengths)
@@ -344,7 +344,7 @@ def _lost(y: Array, value: float, share: float, rate_hz: float) -> Mask:
     if share == 1.0:
         return own
     at, others = np.flatnonzero(own), y[~own]
-    sigma = float(np.median(np.abs(np.diff(others)))) / 0.6745 / math.sqrt(2.0)
+    sigma = float(np.median(np.abs(np.diff(others)))) / MEDIAN_SD / math.sqrt(2.0)
     lattice = lattice_of(others, rate_hz)
     if lattice is not None:
         sigma = max(sigma, lattice.step / lattice.coarseness)

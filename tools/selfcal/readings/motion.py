@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -111,6 +112,12 @@ class Energy:
     counts: Array
     apart: tuple[tuple[Array, Rows], ...]
 
+    @cached_property
+    def before(self) -> tuple[Array, Array]:
+        """Sums and counts of all pieces before each one, and of all, [axes, bands, pieces + 1] each."""
+        sums, counts = (np.pad(np.cumsum(one, axis=2), ((0, 0), (0, 0), (1, 0))) for one in (self.sums, self.counts))
+        return sums, counts
+
 
 @dataclass(frozen=True)
 class Stretch:
@@ -156,7 +163,8 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     sums, counts = np.zeros((2, len(names), 1 + len(BANDS_S), count))
     there = [np.isfinite(recording.columns[name].values) for name in names]
     tame = [_tame(recording.columns[name].values[each]) for name, each in zip(names, there, strict=True)]
-    rows = _apart_from_each_other([own for own, _ in tame])
+    scaled_rows = [_scaled(own) for own, _ in tame]
+    rows = _apart_from_each_other([own for own, _ in tame], scaled_rows)
     readings = []
     for k, (clock, own) in enumerate(zip(clocks, rows, strict=True)):
         time = clock.time_s[there[k]]
@@ -169,7 +177,7 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
             sums[k, band] = np.bincount(piece, np.minimum(scaled**2, tame[k][1]), minlength=count)
             counts[k, band] = np.bincount(piece, minlength=count)
             if not band:
-                readings.append((_scaled(tame[k][0]), piece))
+                readings.append((scaled_rows[k], piece))
     return Energy(piece_s, sums, counts, tuple(readings))
 
 
@@ -180,11 +188,10 @@ def _scaled(y: Array) -> Array:
     return apart / noise if noise > 0.0 else np.zeros(0)
 
 
-def _apart_from_each_other(rows: Sequence[Array]) -> list[Array]:
+def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> list[Array]:
     """Readings of axes, [n] each, that are independent at rest: those of one clock that correlate in the nearest units
-    that do not. Of a copy nothing is left."""
+    that do not. Of a copy nothing is left. `scaled`: about their level over their noise."""
     found = list(rows)
-    scaled = [_scaled(row) for row in rows]
     for size in {one.size for one in scaled} - {0}:
         own = [k for k, one in enumerate(scaled) if one.size == size]
         together = np.atleast_2d(np.corrcoef(np.clip([scaled[k] for k in own], -WILD[0], WILD[0])))
@@ -298,7 +305,7 @@ def _together(nats: Array, as_one: Array) -> Array:
 def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
     """Nats of windows of a length over their louder side [axes and all as one, bands, windows]. Whether an axis has
     both sides [axes, windows]. How much wider than of white noise the means lie, `wide` at least [axes, bands]."""
-    sums, counts = (np.pad(np.cumsum(one, axis=2), ((0, 0), (0, 0), (1, 0))) for one in (energy.sums, energy.counts))
+    sums, counts = energy.before
     pieces = energy.sums.shape[2]
     each = counts[..., -1:] / pieces
 

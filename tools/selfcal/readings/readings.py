@@ -438,7 +438,7 @@ def own_rows(recording: Recording, axis: str) -> Rows | None:
 
 def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
     off = recording.off_grid_s
-    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
+    at = recording.clock.place
     values = [recording.columns[name].values for name in axes]
     return held(values, at, None if off is None else off * recording.rate_hz)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
-from selfcal.base.grid import runs
+from selfcal.base.grid import MEDIAN_SD, runs
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
@@ -43,7 +43,7 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
     """When the sensor moved, by the scatter within pieces of 1 s and the jumps between their means, each against those
     of the recording's quietest fifth. An axis alone counts."""
     piece = max(PIECE_LEAST, round(PIECE_S * recording.rate_hz))
-    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
+    at = recording.clock.place
     index = (at - at[0]) // piece
     count = int(index[-1]) + 1 if (at[-1] - at[0] + 1) % piece == 0 else int(index[-1])
     if not FEWEST <= count <= recording.samples:
@@ -61,7 +61,7 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
         step = np.abs(np.diff(mean))
         known = np.isfinite(step)
         usual = float(np.quantile(step[known], 0.5)) if known.any() else 0.0
-        jumps = np.flatnonzero(known & (step > JUMP_SD * max(usual, 1e-300) / 0.6745))
+        jumps = np.flatnonzero(known & (step > JUMP_SD * max(usual, 1e-300) / MEDIAN_SD))
         moving[jumps] = moving[jumps + 1] = True
     length_s = piece / recording.rate_hz
     start = recording.start_s
@@ -107,7 +107,7 @@ def _side(recording: Recording, model: Model, name: str) -> tuple[str, str]:
     block = max(1, round(recording.rate_hz / model.bank_rate_hz))
     tau_s = block / recording.rate_hz
     values = recording.columns[name].values
-    at = np.arange(recording.samples) + np.cumsum(recording.missing_before)
+    at = recording.clock.place
     index = at // block
     places, first = np.unique(index, return_index=True)
     mean = np.add.reduceat(values, first) / np.diff(np.append(first, values.size))

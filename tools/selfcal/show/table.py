@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from rich import box
 from rich.console import Console
@@ -21,6 +21,8 @@ from selfcal.base.output import TABLE_WIDTH, console_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
+
+Reason = TypeVar("Reason", str, tuple[str, str])
 
 #: Laws of smaller probability are not spoken of where the grid does not bear them.
 TOLD_OF = 0.01
@@ -51,9 +53,7 @@ def show(
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     numbered = {name: axis for name, axis in axes.items() if axis.get("summary")}
     summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
-    choices = [_law_table(document, left_out, datasheet) for left_out in range(4)]
-    laws = _fitting(console, [table for table, _ in choices])
-    notes = choices[0][1]
+    laws = _fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
     first.title, first.title_justify = title, "left"
     if numbered:
@@ -61,7 +61,7 @@ def show(
     console.print(laws)
     if any("regressors" in axis for axis in axes.values()):
         console.print(_regressor_table(axes))
-    for line in notes:
+    for line in _notes(document, axes):
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
@@ -111,14 +111,23 @@ def _number(spread: Mapping[str, Any], number: Mapping[str, Any], *, brief: bool
     return f"{spread['median']:.3g}{interval} {unit}"
 
 
+def _by_reason(axes: Iterable[tuple[Reason, str]]) -> dict[Reason, str]:
+    """The axes that share a reason, in one text. `axes`: each reason with the name of its axis."""
+    found: dict[Reason, list[str]] = {}
+    for reason, name in axes:
+        found.setdefault(reason, []).append(name)
+    return {reason: ", ".join(names) for reason, names in found.items()}
+
+
 def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     """Why numbers of the summary are not identified, a line a reason."""
-    found: dict[tuple[str, str], list[str]] = {}
-    for name, axis in axes.items():
-        for key, number in (axis.get("summary") or {}).items():
-            if not number["identified"]:
-                found.setdefault((_NUMBERS[key][0], number["reason"]), []).append(name)
-    lines = [f"{what} not identified: {', '.join(names)}: {reason}" for (what, reason), names in found.items()]
+    found = _by_reason(
+        ((_NUMBERS[key][0], number["reason"]), name)
+        for name, axis in axes.items()
+        for key, number in (axis.get("summary") or {}).items()
+        if not number["identified"]
+    )
+    lines = [f"{what} not identified: {names}: {reason}" for (what, reason), names in found.items()]
     for name, axis in axes.items():
         for parameter, rest_s in axis.get("halved_after_s", {}).items():
             times = f"not even {MOST_REST:g} times this rest halves"
@@ -172,9 +181,8 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
     return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
 
 
-def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> tuple[Table, list[str]]:
-    """The table without the intervals of its last `left_out` columns, and the lines below it."""
-    recording = document["recording"]
+def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
+    """The table without the intervals of its last `left_out` columns."""
     brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
     table = Table(
         box=box.SIMPLE_HEAD,
@@ -184,28 +192,11 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
         caption_justify="left",
     )
-    axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     known = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
     drift = "K or sigma_m" if "B" not in known else "K, sigma_m or B"
     second = "1/alpha, s" + (", or ratio" if known & set(RATIOS) else "")
     for heading in ("law", "P", "N", drift, second):
         table.add_column(heading, no_wrap=True)
-    without: dict[str, list[str]] = {}
-    for name, axis in document["axes"].items():
-        if name not in axes:
-            without.setdefault(axis["error"], []).append(name)
-    failed = [f"no result: {', '.join(names)}: {error}; choose axes with --axis" for error, names in without.items()]
-    outside: dict[str, list[str]] = {}
-    for name, axis in axes.items():
-        if axis.get("priors") == OF_RECORD:
-            outside.setdefault(", ".join(axis["own_priors"]), []).append(name)
-    line = "priors: {}: from this record, which lies outside the model's: {}"
-    kept = [line.format(", ".join(names), own) for own, names in outside.items()]
-    lost: dict[str, list[str]] = {}
-    for name, axis in axes.items():
-        counts = [f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count]
-        lost.setdefault(", ".join(counts), []).append(name)
-    kept += [f"kept out: {', '.join(names)}: {counts}" for counts, names in lost.items() if counts]
     for name, axis in axes.items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]
@@ -232,6 +223,25 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
                 style="bold" if law == best else None,
                 end_section=law == list(axis["hypotheses"])[-1],
             )
+    return table
+
+
+def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
+    """The lines below the tables. `axes`: those that have a result."""
+    recording = document["recording"]
+    own_priors = _by_reason(
+        (", ".join(axis["own_priors"]), name) for name, axis in axes.items() if axis.get("priors") == OF_RECORD
+    )
+    line = "priors: {}: from this record, which lies outside the model's: {}"
+    kept = [line.format(names, own) for own, names in own_priors.items()]
+    lost = _by_reason(
+        (", ".join(f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count), name)
+        for name, axis in axes.items()
+    )
+    kept += [f"kept out: {names}: {counts}" for counts, names in lost.items() if counts]
+    without = _by_reason((axis["error"], name) for name, axis in document["axes"].items() if name not in axes)
+    failed = [f"no result: {names}: {error}; choose axes with --axis" for error, names in without.items()]
+    for name, axis in axes.items():
         coarse = [
             law
             for law, parameters in axis["parameters"].items()
@@ -241,13 +251,13 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
     failed += _not_adequate(axes)
     for said, chosen in (("identified with", True), ("strongest suspicion", False)):
-        suspected: dict[str, list[str]] = {}
-        for name, axis in axes.items():
-            if "suspicion" in axis and ("added_law" in axis) is chosen:
-                suspected.setdefault(axis["suspicion"].replace("_", " "), []).append(name)
+        suspected = _by_reason(
+            (axis["suspicion"].replace("_", " "), name)
+            for name, axis in axes.items()
+            if "suspicion" in axis and ("added_law" in axis) is chosen
+        )
         if suspected:
-            told = "; ".join(f"{', '.join(names)}: {cause}" for cause, names in suspected.items())
-            failed.append(f"{said}: {told}")
+            failed.append(f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in suspected.items())}")
     for name, axis in axes.items():
         if "more_laws" in axis:
             laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]
@@ -258,7 +268,7 @@ def _law_table(document: Mapping[str, Any], left_out: int, datasheet: bool) -> t
         typed = f"{called()} diagnose {as_typed(recording)}" if there else "selfcal.diagnose() of the same readings"
         failed.append(f"why, and what mends it: {typed}")
     N = {name: axis["summary"]["arw"] for name, axis in axes.items() if axis.get("summary")}
-    return table, [*kept, *_unidentified(axes), *noisier(N), *_ahead(axes), *failed]
+    return [*kept, *_unidentified(axes), *noisier(N), *_ahead(axes), *failed]
 
 
 def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
