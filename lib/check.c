@@ -52,7 +52,7 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum,
 
 static bool flags_are_bools(const selfcal_t *self) {
     return is_bool(&self->batch[0].part) && is_bool(&self->batch[1].part) && is_bool(&self->started) &&
-           is_bool(&self->dropped) && is_bool(&self->in_gap);
+           is_bool(&self->dropped) && is_bool(&self->in_gap) && is_bool(&self->held);
 }
 
 /* False for NaN. */
@@ -67,7 +67,7 @@ static bool memory_is_laid_out(const selfcal_t *self) {
         return false;
     }
     const size_t cells = (size_t)model->nodes * model->axes;
-    return self->b != NULL && is_bool(&self->held) && !self->held && self->c == self->b + cells &&
+    return self->b != NULL && !self->held && self->c == self->b + cells &&
            (const void *)self->node == (const void *)(self->c + cells) &&
            (const void *)self->x == (const void *)(self->node + model->nodes);
 }

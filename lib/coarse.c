@@ -80,27 +80,31 @@ void selfcal_coarse_take(selfcal_coarse_t *self, const selfcal_batch_t *batch, u
     self->n++;
 }
 
-/* -2 ln p of filter f, but for a constant, with C less `less`. */
-static selfcal_wide_t cost(const selfcal_coarse_t *self, size_t f, uint8_t axis, selfcal_wide_t less) {
-    const selfcal_wide_t square = (selfcal_wide_t)self->cell[axis][f].square;
-    return (selfcal_wide_t)(self->n - 1U) * log(fmax(square - less, 1e-12 * square)) +
-           (selfcal_wide_t)self->filter[f].ln_s;
+/* ln(1 - B^2 / (A C)), of the part of C that a column leaves, to the last digits of a float: `lost` is what rounding
+ * takes from B / A. */
+static selfcal_real_t ln_left(selfcal_real_t along, selfcal_real_t weight, selfcal_real_t square) {
+    const selfcal_real_t ratio = along / weight, lost = r_fma_exact(-ratio, weight, along) / weight;
+    const selfcal_real_t left = r_fma_exact(-ratio, along, square) - lost * along;
+    return left < R(0.5) * square ? r_log(r_fmax(left / square, R(1e-12))) : r_log1p(-ratio * along / square);
 }
 
-/* Of one column, that filter's too which makes most of it. */
-static selfcal_real_t score_of(const selfcal_coarse_t *self, uint8_t axis, size_t k, selfcal_wide_t without) {
-    selfcal_wide_t least = without;
-    selfcal_real_t sign = R(0.0);
+/* Of one column, that filter's too which makes most of it. `over`: -2 ln p of each filter without a column, over the
+ * least of them. */
+static selfcal_real_t score_of(const selfcal_coarse_t *self, uint8_t axis, size_t k, const selfcal_real_t over[]) {
+    selfcal_real_t most = R(0.0), sign = R(0.0);
     for (size_t f = 0; f < SELFCAL_COARSE_FILTERS; f++) {
-        const selfcal_wide_t along = (selfcal_wide_t)self->cell[axis][f].along[k];
-        const selfcal_wide_t weight = (selfcal_wide_t)self->filter[f].weight[k];
-        const selfcal_wide_t with = weight > 0.0 ? cost(self, f, axis, along * along / weight) : without;
-        if (with < least) {
-            least = with;
-            sign = along > 0.0 ? R(1.0) : R(-1.0);
+        const selfcal_coarse_cell_t *cell = &self->cell[axis][f];
+        const selfcal_real_t along = cell->along[k], weight = self->filter[f].weight[k];
+        if (!(weight > R(0.0))) {
+            continue;
+        }
+        const selfcal_real_t gain = -(selfcal_real_t)(self->n - 1U) * ln_left(along, weight, cell->square) - over[f];
+        if (gain > most) {
+            most = gain;
+            sign = along > R(0.0) ? R(1.0) : R(-1.0);
         }
     }
-    return sign * (selfcal_real_t)sqrt(without - least);
+    return sign * r_sqrt(most);
 }
 
 selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, selfcal_suspect_t *suspect) {
@@ -113,12 +117,18 @@ selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, 
     if (self->n < SELFCAL_EPOCH_MIN || !(self->cell[axis][0].square > R(0.0))) {
         return most;
     }
-    selfcal_wide_t without = (selfcal_wide_t)INFINITY;
+    selfcal_wide_t cost[SELFCAL_COARSE_FILTERS], least = (selfcal_wide_t)INFINITY;
+    selfcal_real_t over[SELFCAL_COARSE_FILTERS];
+    for (size_t f = 0; f < SELFCAL_COARSE_FILTERS; f++) { /* -2 ln p but for a constant */
+        const selfcal_wide_t ln_square = selfcal_bank_ln((selfcal_wide_t)self->cell[axis][f].square);
+        cost[f] = (selfcal_wide_t)(self->n - 1U) * ln_square + (selfcal_wide_t)self->filter[f].ln_s;
+        least = cost[f] < least ? cost[f] : least;
+    }
     for (size_t f = 0; f < SELFCAL_COARSE_FILTERS; f++) {
-        without = fmin(without, cost(self, f, axis, 0.0));
+        over[f] = (selfcal_real_t)(cost[f] - least);
     }
     for (size_t k = 0; k < SELFCAL_COARSE_COLUMNS; k++) {
-        const selfcal_real_t score = score_of(self, axis, k, without);
+        const selfcal_real_t score = score_of(self, axis, k, over);
         if (r_fabs(score) > r_fabs(most)) {
             most = score;
             *suspect = of[k];

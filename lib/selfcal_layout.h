@@ -195,7 +195,7 @@ struct selfcal {
     selfcal_node_t *node;       /* [nodes] */
     selfcal_total_t *b, *c;     /* [nodes][axes]: sums u nu / s and nu^2 / s */
     selfcal_drift_t *x;         /* [nodes][axes]: predicted drift of the zero-bias filter */
-    bool held;                  /* a copy for a report, bank_hold.c: of all that has [axes] it has one */
+    bool held;                  /* a copy for a report, imu_hold.c: of all that has [axes] it has one */
     uint32_t n;                 /* bank samples in all sums */
     selfcal_wide_t weight;      /* of these samples: n without forgetting */
     selfcal_wide_t keep;        /* part of the sums that is kept as the waiting batch comes, 1 without forgetting */

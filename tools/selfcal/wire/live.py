@@ -324,8 +324,8 @@ class View:
     def _next_step(self, module: Module, shown: Sequence[str]) -> str:
         """What to do about a module; "" where there is nothing."""
         contact, status = self._contact_of(module), module.decoder.status
-        if module.decoder.foreign or module.decoder.twins:
-            return module.decoder.foreign or module.decoder.twins
+        if wrong := module.decoder.foreign or module.decoder.twins:
+            return wrong
         if contact is not None and contact.lost and not module.decoder.finished:
             return "contact lost: check cable and power"
         trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if _told(status, name) == text), "")
