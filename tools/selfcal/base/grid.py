@@ -1,4 +1,4 @@
-"""Values on an even grid: runs of a mask, runs of equal values, means of blocks, noise from differences."""
+"""Values on an even grid: runs of a mask and of equal values, counts of pieces, block means, noise of differences."""
 
 from __future__ import annotations
 
@@ -28,6 +28,14 @@ def equal_runs(values: Array) -> tuple[Rows, Rows]:
     """First row [k] and length [k] of every run of equal values [n]; NaN is like no other."""
     first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
     return first, np.diff(first, append=values.size)
+
+
+def counts_of_pieces(code: Rows, many: int, least: int, most: int) -> tuple[Rows, Rows]:
+    """The piece [n] that each code is in, and how often a piece has each of `many` codes [pieces, many]. There are
+    `most` pieces at most, of `least` codes each at least; the last one has the rest too. n is `least` or more."""
+    size = max(least, -(-code.size // most))
+    piece = np.minimum(np.arange(code.size) // size, code.size // size - 1)
+    return piece, np.bincount(piece * many + code, minlength=(int(piece[-1]) + 1) * many).reshape(-1, many)
 
 
 def block_means(values: Array, size: int) -> Array:

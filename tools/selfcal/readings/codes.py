@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
+from selfcal.base.grid import counts_of_pieces
 from selfcal.readings.budget import nats_of
 from selfcal.readings.lattice import Lattice
 
@@ -163,9 +164,8 @@ def uneven_of(values: Array, lattice: Lattice | None) -> Uneven | None:
         return None
     if np.unique(code).size < COME * many:
         return None
-    length = max(PIECE, -(-y.size // PIECES))
-    piece = np.minimum(np.arange(y.size) // length, y.size // length - 1)
-    count = np.bincount(piece * many + code, minlength=(int(piece[-1]) + 1) * many).reshape(-1, many).astype(np.float64)
+    piece, whole = counts_of_pieces(code, many, PIECE, PIECES)
+    count = whole.astype(np.float64)
     sigma = math.sqrt(max(1.0 / coarseness**2 - 1.0 / 12.0, 0.04))
     alike = _fit(count, np.eye(many), sigma)
     read = max(_candidates(count, alike), key=lambda one: _gain(count, alike, one.to))

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from selfcal.base.grid import noise_of
+from selfcal.base.grid import counts_of_pieces, noise_of
 from selfcal.readings.budget import nats_of
 from selfcal.readings.lattice import Lattice, lattice_of
 
@@ -183,9 +183,7 @@ def about_zero(values: Array, lattice: Lattice | None) -> Misread | None:
     first, many = int(place.min()), int(np.ptp(place)) + 1
     if many > 2 * VALUES_MOST or (step and float(np.abs(y / step - np.rint(y / step)).max()) > 0.02):
         return None
-    length = max(PIECE, -(-y.size // PIECES))
-    piece = np.minimum(np.arange(y.size) // length, max(y.size // length - 1, 0))
-    count = np.bincount(piece * many + place - first, minlength=(int(piece[-1]) + 1) * many).reshape(-1, many)
+    _, count = counts_of_pieces(place - first, many, PIECE, PIECES)
     most = max(abs(first), abs(first + many)) + 2
     edges = np.arange(-2 * most, 2 * most + 1) * 0.5 * width
     points = edges[:-1, None] + 0.5 * width * (np.arange(POINTS) + 0.5) / POINTS
