@@ -77,7 +77,7 @@ def test_score_and_information_are_the_dense_ones() -> None:
     dense = (inverse @ np.nan_to_num(y.ravel())).reshape(m, n)
     assert found.weights.T @ column == pytest.approx(dense @ column, rel=1e-4)
     on = np.kron(np.eye(m), column)
-    assert information(model, found, column[None])[0] == pytest.approx(on @ inverse @ on.T, rel=1e-4, abs=1e-4)
+    assert information(model, y, column[None])[0] == pytest.approx(on @ inverse @ on.T, rel=1e-4, abs=1e-4)
     steps = np.kron(np.eye(m), (t >= 20).astype(float))
     assert found.known[20] == pytest.approx(steps @ inverse @ steps.T, rel=1e-4, abs=1e-4)
     assert found.shock[20] == pytest.approx(steps @ inverse @ np.nan_to_num(y.ravel()), rel=1e-4, abs=1e-4)
@@ -120,9 +120,7 @@ def test_an_event_of_several_axes_has_their_names(cause: str, shape: Any, nats: 
     column, theta = shape(n)
     own = np.tile([0.0, math.log(WALK), -12.0, -3.0], (1, 1))
     model = Joint(own, np.eye(1), np.zeros(1), 0.1)
-    size = math.sqrt(
-        2.0 * nats / float(information(model, course(model, np.zeros((1, n)), True), column[None])[0, 0, 0])
-    )
+    size = math.sqrt(2.0 * nats / float(information(model, np.zeros((1, n)), column[None])[0, 0, 0]))
     records = case_records(1, 30)
     for seed in range(records):
         y = drawn(seed, n)

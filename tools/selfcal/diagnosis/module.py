@@ -142,9 +142,11 @@ class Seen:
 
     def filtered(self, model: Joint, y: Array) -> Course:
         """The filter of a model over `coarse` means of records [m, n]."""
-        return course(
-            model.of_means(self.coarse), np.array([half_means(row, self.coarse)[0] for row in y]), smooth=True
-        )
+        return course(model.of_means(self.coarse), self.of_coarse(y), smooth=True)
+
+    def of_coarse(self, y: Array) -> Array:
+        """`coarse` means of records [m, n]."""
+        return np.array([half_means(row, self.coarse)[0] for row in y])
 
     @property
     def edge(self) -> int:
@@ -225,14 +227,14 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         gain = full(score, known)
         at = int(np.argmax(gain))
         best.append((float(gain[at]), at, at + length))
-    for _, first, last in sorted(best, reverse=True)[:PLACES]:
-        begin, end, alike = _moved(seen, first, last)
-        if end - begin < SHORTEST:
-            continue
+    places = [_moved(seen, first, last) for _, first, last in sorted(best, reverse=True)[:PLACES]]
+    places = [one for one in dict.fromkeys(places) if one[1] - one[0] >= SHORTEST]
+    t = np.arange(seen.n)
+    columns = np.array([(t >= begin) & (t < end) for begin, end, _ in places], dtype=np.float64).reshape(-1, seen.n)
+    for (begin, end, alike), column, known in zip(
+        places, columns, information(seen.model, seen.y, columns), strict=True
+    ):
         price = math.log(seen.n) + math.log((end - begin) * octaves) - alike
-        column = np.zeros(seen.n)
-        column[begin:end] = 1.0
-        known = information(seen.model, seen.course, column[None])[0]
         found = act((shock[begin] - shock[end])[None], known)
         yield Candidate("pulse", (begin * seen.dt, end * seen.dt), found, price, column[None])
 
@@ -340,9 +342,9 @@ def channels(seen: Seen) -> Iterator[Candidate]:
 def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
     """Slow columns. Beside the best ones the drifts are fitted anew."""
     columns = np.array([one[2] / max(float(np.std(one[2])), 1e-300) for one in shapes])
-    means = np.array([half_means(one, seen.coarse)[0] for one in columns])
+    means, y = seen.of_coarse(columns), seen.of_coarse(seen.y)
     score = means @ seen.slow.weights
-    known = information(seen.model.of_means(seen.coarse), seen.slow, means)
+    known = information(seen.model.of_means(seen.coarse), y, means)
     gain = full(score, known)
     for k in np.argsort(-gain)[:REFITTED]:
         if gain[k] < NET_LEAST:
@@ -351,7 +353,7 @@ def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
         model = refitted(seen.model, seen.y - np.outer(sizes(score[k], known[k]), columns[k]), seen.dt)
         beside = seen.filtered(model, seen.y)
         less = min(0.0, beside.ln_likelihood - seen.slow.ln_likelihood)
-        own = information(model.of_means(seen.coarse), beside, means[[k]])[0]
+        own = information(model.of_means(seen.coarse), y, means[[k]])[0]
         again = Candidate(cause, theta, act((means[k] @ beside.weights)[None], own), price, columns[k][None], less)
         plain = Candidate(cause, theta, act(score[k][None], known[k]), price, columns[k][None])
         yield max(again, plain, key=lambda one: one.evidence)

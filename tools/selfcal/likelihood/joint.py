@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
 
@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp, softmax
 
+from selfcal import _joint
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Mask
 from selfcal.logs.recording import bridged
@@ -44,12 +45,8 @@ FASTEST_S = 10.0
 PRIOR_SD = 3.0
 #: Widths of the size of a column, in its own standard deviations.
 WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
-#: A filter has settled when its covariance changes by less than this share a step.
-SETTLED = 1e-7
 #: Numbers of an axis' own drift: ln of white noise, walk a step, Gauss-Markov deviation, rate a sample.
 OWN = 4
-#: Samples whose columns are whitened before they are summed up.
-CHUNK = 256
 
 Spectra = NDArray[np.complex128]
 
@@ -339,33 +336,21 @@ def _together(bins: Bins, own: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Gain:
-    """Of the filter at one sample: covariance before it, gain, inverse root of the innovations' covariance, and the
-    axes that are `there`."""
-
-    P: Array
-    K: Array
-    inverse: Array
-    there: Mask
-
-
-@dataclass(frozen=True)
 class Course:
     """What filter and smoother make of a record. `ln_likelihood`; `innovations` [n, m] of each axis (NaN: missing) and
     their variances `spread` [n, m]; `predicted` [n, s]: the states before each sample. Of the smoother: the states
     [n, s]; `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its product
-    with them; `shock` [n, m] and `known` [n, m, m]: score of a jump of each level just before each sample, and its
-    information; `gains`: of the filter at each sample."""
+    with them; `of_f` [n, 2]: score of a jump of f just before each sample, and its information; `shock` [n, m] and
+    `known` [n, m, m]: the same of the levels."""
 
     ln_likelihood: float
     innovations: Array
     spread: Array
     predicted: Array
-    states: Array = field(default_factory=lambda: np.empty((0, 0)))
-    weights: Array = field(default_factory=lambda: np.empty((0, 0)))
-    of_f: Array = field(default_factory=lambda: np.empty((0, 2)))
-    known: Array = field(default_factory=lambda: np.empty((0, 0, 0)))
-    gains: Sequence[Gain] = ()
+    states: Array
+    weights: Array
+    of_f: Array
+    known: Array
 
     @cached_property
     def shock(self) -> Array:
@@ -381,122 +366,37 @@ class Course:
 def ahead(model: Joint, found: Course, steps: int) -> Array:
     """Prediction [n, m] of each axis `steps` samples after the last one that it knows, which is the one before."""
     m = model.loading.size
-    decay = np.concatenate([[math.exp(-model.rate)], np.ones(m), np.exp(-np.exp(model.own[:, 3]))]) ** (steps - 1)
-    x = found.predicted * decay
+    x = found.predicted * _matrices(model)[0] ** (steps - 1)
     predicted: Array = x[:, :1] * model.loading + x[:, 1 : 1 + m] + x[:, 1 + m :]
     return predicted
 
 
-def _dynamics(model: Joint) -> tuple[Array, Array, Array]:
-    """Decay of the states a sample, their noise, and how the axes read them. States: f, then walk and Gauss-Markov
-    drift of each axis."""
+def _matrices(model: Joint) -> tuple[Array, Array, Array, Array, Array]:
+    """Decay of the states a sample, their noise, how the axes read them, the covariance of the white noise, and that of
+    the first state. States: f, then walk and Gauss-Markov drift of each axis. The levels are unknown: the walks begin
+    with a wide prior."""
     m = model.loading.size
     own, scale = model.own, np.exp(2.0 * model.own[:, 0])
+    markov = scale * np.exp(2.0 * own[:, 2])
     decay = np.concatenate([[math.exp(-model.rate)], np.ones(m), np.exp(-np.exp(own[:, 3]))])
-    noise = np.concatenate([[1.0], scale * np.exp(2.0 * own[:, 1]), scale * np.exp(2.0 * own[:, 2])])
+    noise = np.concatenate([[1.0], scale * np.exp(2.0 * own[:, 1]), markov])
     noise *= np.concatenate([[-math.expm1(-2.0 * model.rate)], np.ones(m), -np.expm1(-2.0 * np.exp(own[:, 3]))])
-    return decay, noise, np.hstack([model.loading[:, None], np.eye(m), np.eye(m)])
+    H = np.hstack([model.loading[:, None], np.eye(m), np.eye(m)])
+    wide = np.full(m, 1e6 * max(1.0, float(scale.max())))
+    R = model.correlation * np.outer(model.white, model.white)
+    return decay, noise, H, R, np.diag(np.concatenate([[1.0], wide, markov]))
 
 
 def course(model: Joint, y: Array, smooth: bool = False) -> Course:
-    """Filter records y [m, n] (NaN: missing). The levels are unknown: the walks begin with a wide prior.
-
-    Backwards runs r' = H' S^-1 v + L' r (de Jong, Biometrika 75, 1988): the score of a jump of each state; its
-    information runs likewise (Harvey & Koopman, J. Bus. Econ. Stat. 10, 1992)."""
-    m, n = y.shape
-    decay, noise, H = _dynamics(model)
-    size = decay.size
-    work.count(n, size)
-    scale = np.exp(2.0 * model.own[:, 0])
-    R = model.correlation * np.outer(model.white, model.white)
-    wide = 1e6 * max(1.0, float(scale.max()))
-    P = np.diag(np.concatenate([[1.0], np.full(m, wide), scale * np.exp(2.0 * model.own[:, 2])]))
-    x = np.zeros(size)
-    present: Mask = np.isfinite(y)
-    whole: Mask = np.all(present, axis=0)
-    innovations, spread = np.full((n, m), np.nan), np.full((n, m), np.nan)
-    gains: list[Gain] = []
-    kept: list[Array] = []
-    predicted = np.empty((n, size))
-    total, first = 0.0, np.ones(m, bool)
-    steady: tuple[Gain, Array, float, Array] | None = None
-    for t in range(n):
-        at = slice(None) if whole[t] else np.flatnonzero(present[:, t])
-        if steady is None or not whole[t]:
-            h = H[at]
-            S = h @ P @ h.T + R[np.ix_(present[:, t], present[:, t])]
-            if h.shape[0]:
-                root = np.linalg.cholesky(S)
-                inverse = np.linalg.inv(root)
-                K = P @ h.T @ inverse.T @ inverse
-                ln_det = 2.0 * float(np.log(np.diag(root)).sum())
-            else:
-                inverse, K, ln_det = np.empty((0, 0)), np.empty((size, 0)), 0.0
-            after = P - K @ h @ P
-            P_next = after * np.outer(decay, decay) + np.diag(noise)
-            P_next = 0.5 * (P_next + P_next.T)
-            settled = whole[t] and float(np.abs(P_next - P).max()) < SETTLED * float(np.abs(np.diag(P_next)).max())
-            now = (Gain(P, K, inverse, present[:, t]), h, ln_det, np.diag(S))
-            steady = now if settled else None
-            P = P_next
-        else:
-            now = steady
-        gain, h, ln_det, variances = now
-        v = y[at, t] - h @ x
-        u = gain.inverse @ v
-        predicted[t] = x
-        if smooth:
-            gains.append(gain)
-            kept.append(u)
-        if first.any():  # the first reading of an axis sets its level
-            first &= ~present[:, t]
-        else:
-            total -= 0.5 * (float(u @ u) + ln_det)
-        innovations[t, at], spread[t, at] = v, variances
-        x = decay * (x + gain.K @ v)
-    if not smooth:
-        return Course(total, innovations, spread, predicted)
-    r, N = np.zeros(size), np.zeros((size, size))
-    states, weights, of_f, known = np.empty((n, size)), np.zeros((n, m)), np.empty((n, 2)), np.empty((n, m, m))
-    constant = False
-    for t in range(n - 1, -1, -1):
-        gain = gains[t]
-        same = t + 1 < n and gains[t + 1] is gain
-        if not same:
-            h = H if whole[t] else H[gain.there]
-            whiten = gain.inverse.T @ gain.inverse
-            L, back = decay[:, None] * (np.eye(size) - gain.K @ h), (decay[:, None] * gain.K).T
-            own = h.T @ whiten @ h
-        e = gain.inverse.T @ kept[t]
-        weights[t, slice(None) if whole[t] else gain.there] = e - back @ r
-        r = h.T @ e + L.T @ r
-        if not (constant and same):
-            N_next = own + L.T @ N @ L
-            constant = same and float(np.abs(N_next - N).max()) < SETTLED * float(np.abs(N_next).max())
-            N = N_next
-        states[t] = predicted[t] + gain.P @ r
-        of_f[t], known[t] = (r[0], N[0, 0]), N[1 : 1 + m, 1 : 1 + m]
-    return Course(total, innovations, spread, predicted, states, weights, of_f, known, gains)
+    """Filter records y [m, n] (NaN: missing), and smooth them."""
+    work.count(y.shape[1], 1 + 2 * len(y))
+    return Course(*_joint.course(np.ascontiguousarray(y), *_matrices(model), smooth))
 
 
-def information(model: Joint, found: Course, columns: Array) -> Array:
-    """Information [k, m, m] of each column [k, n] on every axis, beside the levels. `found`: with its smoother."""
-    decay, _, H = _dynamics(model)
-    (k, n), m = columns.shape, model.loading.size
-    total, X = np.zeros((k, m, m)), np.zeros((decay.size, k * m))
-    eye, block = np.eye(m), np.zeros((CHUNK, m, k * m))
-    for begin in range(0, n, CHUNK):
-        work.count(CHUNK, k)
-        block[:] = 0.0
-        for t in range(begin, min(n, begin + CHUNK)):
-            gain = found.gains[t]
-            read = (eye[:, None, :] * columns[:, t][None, :, None]).reshape(m, k * m)
-            V = (read - H @ X)[gain.there]
-            block[t - begin, : V.shape[0]] = gain.inverse @ V
-            X = decay[:, None] * (X + gain.K @ V)
-        each = block.reshape(CHUNK * m, k, m).transpose(1, 0, 2)
-        total += each.transpose(0, 2, 1) @ each
-    return total
+def information(model: Joint, y: Array, columns: Array) -> Array:
+    """Information [k, m, m] of each column [k, n] on every axis of records y [m, n], beside the levels."""
+    work.count(y.shape[1], len(columns) * len(y))
+    return _joint.information(np.ascontiguousarray(y), np.ascontiguousarray(columns), *_matrices(model))
 
 
 @dataclass(frozen=True)

@@ -193,7 +193,15 @@ def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
 
 
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
-    """The readings of an axis of an evened and thinned recording."""
+    """The readings of an axis of an evened and thinned recording. Looked at once."""
+    key = axis, group.unit, group.range, group.stuck_limit
+    if key not in recording.seen:
+        recording.seen[key] = _readings_of(recording, axis, group)
+    found: Readings = recording.seen[key]
+    return found
+
+
+def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     values = recording.in_unit(axis, group.unit)
     none = np.zeros(values.size, bool)
     misread = spans_of(values, recording.rate_hz)
