@@ -122,7 +122,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
         gain = sum(
             one.state.best.ln_likelihood - state.best.ln_likelihood for (one, _), state in zip(parts, less, strict=True)
         )
-        if gain - price < NET_LEAST:
+        if gain - price < module.EVIDENT:
             for (one, finding), state in zip(parts, less, strict=True):
                 one.findings = [each for each in one.findings if each.event != finding.event]
                 one.state = state

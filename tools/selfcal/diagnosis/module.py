@@ -44,6 +44,11 @@ from selfcal.model.forms import formed, slope
 MEANS_S = 1.0
 #: Means that the joint model takes at least, and the share of them that an axis may lack.
 LEAST, GAPS = 600, 0.3
+#: Share of the modules on which nothing acts in which a search may name a candidate.
+SHARE = 0.01
+#: Evidence of a candidate that is named, nats. Evidence is a Bayes factor, and chance makes one of e^T in a share of e^-T
+#: at most (Markov's inequality).
+EVIDENT = -math.log(SHARE)
 #: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
 CERTAIN = 25.0
 #: A mean so many deviations of the noise off the median of this many is left out: a spike is no event that lasts.
@@ -442,7 +447,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     model = weighed(search.model, search.rest, span)
     if model is not None:
         search.weigh(model)
-    search.go(NET_LEAST)
+    search.go(EVIDENT)
     of = None
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
         y = y - sum(one.effect for one in search.several)
