@@ -34,7 +34,7 @@ from selfcal.likelihood.joint import (
     without_lines,
     without_pair,
 )
-from selfcal.likelihood.state import NET_LEAST, Regressor, State, interval, net
+from selfcal.likelihood.state import EVIDENT, NET_LEAST, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import Array
 
 #: Its name in the document.
@@ -123,7 +123,7 @@ class Hidden:
             gains = 0.5 * score**2 / np.maximum(known, 1e-300)
             gains[: max(3, gains.size // 200)] = 0.0
             at = int(np.argmax(gains))
-            if net(float(gains[at]), 1, math.log(gains.size)) < NET_LEAST:
+            if net(float(gains[at]), 1, math.log(gains.size)) < EVIDENT:
                 break
             size = float(score[at] / known[at])
             found.append({"time_s": at * self.dt, "size": size / self.step, "evidence_nats": float(gains[at])})

@@ -19,7 +19,7 @@ from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import work
 from selfcal.likelihood.heldout import harmful
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State
+from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, Regressor, State
 from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
@@ -122,7 +122,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
         gain = sum(
             one.state.best.ln_likelihood - state.best.ln_likelihood for (one, _), state in zip(parts, less, strict=True)
         )
-        if gain - price < module.EVIDENT:
+        if gain - price < EVIDENT:
             for (one, finding), state in zip(parts, less, strict=True):
                 one.findings = [each for each in one.findings if each.event != finding.event]
                 one.state = state
@@ -203,7 +203,7 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
         for name, look in looks.items():
             after = states[name].refit(**look.changes)
             known = replace(look, net=max(look.net, event.evidence))
-            held_out = score.gain(known, states[name], after, record)
+            held_out = score.gain(known, states[name], after, record, located=True)
             findings[name] = Finding(known, 0, states[name], after, held_out=held_out, event=number)
         if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
             continue

@@ -8,8 +8,8 @@ over theta is paid for once, whatever the set. What acts on one axis alone is le
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -36,7 +36,7 @@ from selfcal.likelihood.joint import (
     refitted,
     without_lines,
 )
-from selfcal.likelihood.state import NET_LEAST, State
+from selfcal.likelihood.state import EVIDENT, NET_LEAST, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.model.forms import formed, slope
 
@@ -44,23 +44,16 @@ from selfcal.model.forms import formed, slope
 MEANS_S = 1.0
 #: Means that the joint model takes at least, and the share of them that an axis may lack.
 LEAST, GAPS = 600, 0.3
-#: Share of the modules on which nothing acts in which a search may name a candidate.
-SHARE = 0.01
-#: Evidence of a candidate that is named, nats. Evidence is a Bayes factor, and chance makes one of e^T in a share of e^-T
-#: at most (Markov's inequality).
-EVIDENT = -math.log(SHARE)
 #: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
 CERTAIN = 25.0
 #: A mean so many deviations of the noise off the median of this many is left out: a spike is no event that lasts.
 SPIKE, SPIKE_OF = 7.0, 5
 #: Events of a module at most, those of one axis among them.
 MOST = 16
-#: Slow columns whose drift is fitted anew beside them: the one that was fitted without has swallowed a part of them.
+#: Candidates of a search beside which the drifts are fitted anew: those fitted without have swallowed a part of them.
 REFITTED = 3
 #: Places beside the best one that share its evidence.
 NEAR = 30
-#: Means at most that slow columns are looked for in.
-COARSE = 2000
 #: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
 PLACES = 4
 #: Samples at each end in which no step is looked for, and of a pulse at least.
@@ -79,6 +72,8 @@ PATTERN = 0.7
 JUMPS = ("step", "pulse")
 #: Causes that the quantity may be, with that pattern: its course has any shape.
 OF_TIME = (*JUMPS, "ramp", "turn_on")
+#: The shortest lag of a channel, means.
+LAG_LEAST = 20.0
 #: Smoothing of a channel, s, and windows of its rate.
 SMOOTH_S, RATES_S = 30.0, (60.0, 400.0)
 
@@ -140,28 +135,10 @@ class Seen:
     def course(self) -> Course:
         return course(self.model, self.y, smooth=True)
 
-    @cached_property
-    def slow(self) -> Course:
-        """The filter of `coarse` means."""
-        return self.filtered(self.model, self.y)
-
-    def filtered(self, model: Joint, y: Array) -> Course:
-        """The filter of a model over `coarse` means of records [m, n]."""
-        return course(model.of_means(self.coarse), self.of_coarse(y), smooth=True)
-
-    def of_coarse(self, y: Array) -> Array:
-        """`coarse` means of records [m, n]."""
-        return np.array([half_means(row, self.coarse)[0] for row in y])
-
     @property
     def edge(self) -> int:
         """Samples at each end in which nothing jumps: there a line that was taken out rings."""
         return max(EDGE, self.n // 100)
-
-    @property
-    def coarse(self) -> int:
-        """Samples of a mean that slow columns are looked for in."""
-        return max(1, self.n // COARSE)
 
     @cached_property
     def cross(self) -> Array:
@@ -327,7 +304,7 @@ def channels(seen: Seen) -> Iterator[Candidate]:
         price = LN_SMOOTHINGS + LN_SLOW
         static = FORMS.index("static")
         shapes: list[Shape] = [(cause, (static, 1.0), about, price), (cause, (static, SMOOTH_S), smooth, price)]
-        lag = 4.0 * seen.dt * seen.coarse
+        lag = LAG_LEAST * seen.dt
         while lag < LONGEST_LAG * seen.n * seen.dt:
             shapes.append(
                 (cause, (FORMS.index("lag"), lag), formed(about, "lag", lag, 0.0, seen.dt), price + LN_FORMS["lag"])
@@ -347,26 +324,39 @@ def channels(seen: Seen) -> Iterator[Candidate]:
 def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
     """Slow columns. Beside the best ones the drifts are fitted anew."""
     columns = np.array([one[2] / max(float(np.std(one[2])), 1e-300) for one in shapes])
-    means, y = seen.of_coarse(columns), seen.of_coarse(seen.y)
-    score = means @ seen.slow.weights
-    known = information(seen.model.of_means(seen.coarse), y, means)
+    score, known = columns @ seen.course.weights, information(seen.model, seen.y, columns)
     gain = full(score, known)
     for k in np.argsort(-gain)[:REFITTED]:
         if gain[k] < NET_LEAST:
             return
         cause, theta, _, price = shapes[k]
-        model = refitted(seen.model, seen.y - np.outer(sizes(score[k], known[k]), columns[k]), seen.dt)
-        beside = seen.filtered(model, seen.y)
-        less = min(0.0, beside.ln_likelihood - seen.slow.ln_likelihood)
-        own = information(model.of_means(seen.coarse), y, means[[k]])[0]
-        again = Candidate(cause, theta, act((means[k] @ beside.weights)[None], own), price, columns[k][None], less)
         plain = Candidate(cause, theta, act(score[k][None], known[k]), price, columns[k][None])
-        yield max(again, plain, key=lambda one: one.evidence)
+        yield max(plain, beside(seen, plain), key=lambda one: one.evidence)
+
+
+def beside(seen: Seen, one: Candidate) -> Candidate:
+    """The candidate with the drifts fitted anew beside its column, which it may have on any axis."""
+    known = information(seen.model, seen.y, one.columns[:1])[0]
+    effect = sizes(one.columns @ seen.course.weights, known).T @ one.columns
+    model = refitted(seen.model, seen.y - effect, seen.dt)
+    found = course(model, seen.y, smooth=True)
+    less = min(0.0, found.ln_likelihood - seen.course.ln_likelihood)
+    known = information(model, seen.y, one.columns[:1])[0]
+    return replace(one, act=act(one.columns @ found.weights, known), more=less)
 
 
 #: The searches, each with the columns that it looks for.
 FAMILIES: tuple[Callable[[Seen], Iterator[Candidate]], ...] = (steps, pulses, lines, transients, channels)
 OF_JUMPS = (steps, pulses)
+
+
+def _ranked(found: Iterable[Candidate]) -> list[Candidate]:
+    """The most evident first."""
+    return sorted(found, key=lambda one: -one.evidence)
+
+
+def _best_of(found: Iterable[Candidate]) -> Candidate | None:
+    return next(iter(_ranked(found)), None)
 
 
 @dataclass
@@ -394,7 +384,10 @@ class Search:
             if seen is None:
                 seen = Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s, passed)
                 known = {k: list(family(seen)) for k, family in enumerate(FAMILIES)}
-            found = max((one for each in known.values() for one in each), key=lambda one: one.evidence, default=None)
+            found = _best_of(one for each in known.values() for one in each)
+            if found is None or found.evidence < least:
+                jumps = [_ranked(known[k])[:REFITTED] for k, family in enumerate(FAMILIES) if family in OF_JUMPS]
+                found = _best_of(beside(seen, one) for each in jumps for one in each)
             if found is None or found.evidence < least:
                 return
             if not self._is_own(found):

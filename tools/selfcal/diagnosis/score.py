@@ -2,8 +2,8 @@
 
 The prediction is over the posterior that the earlier samples leave. Coefficients have the prior of an extended model
 file, the white noise has none. The drift's parameters are a sum over nodes that the whole record leaves possible.
-What no posterior covers is looked for anew in the first half (`Cause.trained`). A column that is nothing in the first
-half was chosen by what is scored, so the price of its search is charged.
+What no posterior covers is looked for anew in the first half (`Cause.trained`), if one axis alone shows it. A column
+that is nothing in the first half was chosen by what is scored, so the price of its search is charged.
 """
 
 from __future__ import annotations
@@ -60,8 +60,11 @@ class Cut:
         return np.asarray(np.add.reduceat(steps, np.searchsorted(self.marks, self.edges[:-1])) / self.sizes)
 
 
-def gain(look: Look, before: State, after: State, record: Record, partner: State | None = None) -> HeldOut:
-    """What one finding gains. `partner`: the axis that shares the cause."""
+def gain(
+    look: Look, before: State, after: State, record: Record, partner: State | None = None, *, located: bool = False
+) -> HeldOut:
+    """What one finding gains. `partner`: the axis that shares the cause. `located`: several axes show its shape, which
+    the first half of one alone hardly does."""
     cause = CAUSES[look.cause]
     if cause.no_gain:
         return HeldOut(None, cause.no_gain)
@@ -76,7 +79,7 @@ def gain(look: Look, before: State, after: State, record: Record, partner: State
             split = place + max(20, (n - place) // 4)
         if n - split < max(60, n // 20):
             return HeldOut(None, "too little of the record is left after its detection")
-    if cause.trained is not None:
+    if cause.trained is not None and not located:
         after = cause.trained(look, before, after, record, split)
     cut = _cut(before, partner if joint and partner is not None else after, split)
     if cut is None:

@@ -151,11 +151,6 @@ class Joint:
         """Whether f moves any axis."""
         return bool(self.loading.any())
 
-    def of_means(self, block: int) -> Joint:
-        """The same of means of so many samples, for columns that are slow beside them."""
-        by = math.log(block)
-        return replace(self, own=self.own + by * np.array([-0.5, 1.0, 0.5, 1.0]), rate=self.rate * block)
-
     def precision(self, turn: Array) -> Array:
         """Inverse spectrum [k, m, m] of the first differences at angles `turn` [k] above 0."""
         bins = Bins(np.empty(0), turn, np.empty(0))

@@ -19,6 +19,11 @@ from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Terms
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
 P_LOOK = 5e-4
 NET_LEAST = -math.log(P_LOOK)
+#: Share of the modules on which nothing acts in which a search over all axes may name a candidate.
+P_MODULE = 0.01
+#: Evidence of a candidate that is named, nats. It is a Bayes factor: chance makes one of e^T in a share of e^-T at most
+#: (Markov's inequality).
+EVIDENT = -math.log(P_MODULE)
 #: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
 FAR = 40.0
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.

@@ -83,7 +83,10 @@ def spans_of(values: Array, rate_hz: float) -> Misread | None:
         return None
     lattice = lattice_of(y, rate_hz)
     span = float(np.median(far))
-    span = float(far[np.abs(far / span - 1.0) < OFF * noise / span].mean())
+    alike = far[np.abs(far / span - 1.0) < OFF * noise / span]
+    if not alike.size:  # the median lies between two that differ
+        return None
+    span = float(alike.mean())
     if lattice is not None:
         span = lattice.step * round(span / lattice.step)
         noise = max(noise, LIKE_NOISE * lattice.step)
