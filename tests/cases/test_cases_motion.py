@@ -25,6 +25,7 @@ from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Column, Recording, save
 from selfcal.model.file import Model
+from selfcal.readings.misread import spans_of
 from selfcal.readings.motion import loud, moves_of
 from selfcal.readings.readings import look
 from selfcal.verbs.diagnose import diagnose
@@ -65,6 +66,24 @@ def in_hand(random: np.random.Generator, t: Array, size: float) -> Array:
     """A hand's slow turning and its tremor, `size` and a fifth of it."""
     turning = np.sin(2.0 * math.pi * random.uniform(0.3, 0.8) * t + random.uniform(0.0, 6.0))
     return np.asarray(size * turning + 0.2 * size * random.standard_normal(t.size))
+
+
+def test_a_knock_vouches_for_no_other_stretch() -> None:
+    """Six axes 8.5 % as loud again for 6 s have some 4 nats of chance; a knock elsewhere does not change that."""
+    y = np.random.default_rng(0).standard_normal((6, 60_000))
+    y[:, 20_000:20_300] *= 1.085
+    assert moves_of(a_recording(50.0, *y)) == {}
+    y[:, 45_000:45_040] *= 12.0
+    found = moves_of(a_recording(50.0, *y))
+    assert len(found) == 6
+    assert all(len(one.intervals) == 1 for one in found.values())
+
+
+def test_a_shock_of_two_sizes_is_read() -> None:
+    """Spans of an overflow are all of one size. The median of a shock's steps may lie between two sizes."""
+    y = np.random.default_rng(0).standard_normal(4000)
+    y[1000:1012] += np.tile([0.0, 100.0, 0.0, 300.0], 3)
+    assert spans_of(y, 50.0) is None
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,7 @@ from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 from scipy.special import logsumexp, softmax
 
 from selfcal import _joint
@@ -76,9 +77,8 @@ class Bins:
 
 def _lines(power: Array, least: float = LINE) -> Mask:
     """Bins [n] of a spectrum that hold a line, or lie beside one."""
-    half = min(NEIGHBOURS, max(8, power.size // 8))
-    groups = np.arange(power.size) // half
-    level = np.array([np.median(power[groups == one]) for one in range(groups[-1] + 1)])[groups] / math.log(2.0)
+    half = min(NEIGHBOURS, max(8, power.size // 8)) // 2
+    level = median_filter(power, 2 * half + 1, mode="reflect") / math.log(2.0)
     found = np.zeros(power.size, bool)
     for at in np.flatnonzero(power > least * level):
         if at >= SINGLE // 4:

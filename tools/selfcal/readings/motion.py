@@ -288,8 +288,9 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
-    together = sum(one.net for one in [*known, *apart] if one.axes.sum() > 1)
-    return [one for one in apart if max(one.net, together * (one.axes.sum() > 1)) > -math.log(SHARE)]
+    sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others
+    together = sum(one.net for one in [*known, *apart] if one.axes.sum() > 1 and one.net <= sure)
+    return [one for one in apart if max(one.net, together * (one.axes.sum() > 1)) > sure]
 
 
 def _together(nats: Array, as_one: Array) -> Array:
