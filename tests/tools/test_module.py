@@ -43,8 +43,7 @@ def seen(y: Array, **channels: Array) -> module.Module:
         name: SimpleNamespace(
             y=row,
             dt=1.0,
-            best=SimpleNamespace(c=np.zeros(1)),
-            series=SimpleNamespace(columns=np.ones((1, row.size))),
+            rest=row,
             below_lattice=False,
         )
         for name, row in zip(NAMES, y, strict=False)

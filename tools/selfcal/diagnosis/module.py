@@ -482,4 +482,4 @@ def sharpened(times: Sequence[float], states: Sequence[State], span: float) -> t
 
 def _means(state: State, block: int) -> Array:
     """Means [k] of the readings less the columns of the model; NaN where half are missing."""
-    return half_means(state.y - state.best.c @ state.series.columns, block)[0]
+    return half_means(state.rest, block)[0]

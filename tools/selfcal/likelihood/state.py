@@ -88,6 +88,11 @@ class State:
     def best(self) -> Fit:
         return best(self.fits)
 
+    @property
+    def rest(self) -> Array:
+        """The record [n] less its level and the columns of the fitted model."""
+        return np.asarray(self.y - self.best.c @ self.series.columns)
+
     def bases(self) -> tuple[Terms, ...]:
         """The drifts that the model may have, with its extras: the paper's laws; walk includes the constant."""
         return (replace(self.extras, walk=True), replace(self.extras, markov=True))

@@ -15,8 +15,9 @@ from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import ALIKE, Look, State
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State
 from selfcal.likelihood.statemodel import Array
+from selfcal.logs.recording import bridged
 from selfcal.model.forms import formed
 from selfcal.model.regressors import coefficient_unit
 
@@ -27,23 +28,22 @@ RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
 def looks(state: State, record: Record) -> list[Look]:
     """One look for every other axis."""
     others = {name: values for name, values in record.other_axes(state.axis).items() if np.ptp(values) > 0.0}
-    return forms.look(
-        state,
-        [
-            Channel(
-                "cross_axis",
-                f"axis_{name}",
-                name,
-                record.axes[name].unit,
-                values,
-                rate_windows_s=RATE_WINDOWS_S,
-                forms=("static", "lag", "rate", "square"),  # first_order would follow noise that both share
-                slow=False,
-                ln_looks=math.log(len(others)),
-                extra={"other": name},
-            )
-            for name, values in others.items()
-        ],
+    return forms.look(state, [_channel(record, name, values) for name, values in others.items()])
+
+
+def _channel(record: Record, name: str, values: Array) -> Channel:
+    """Another axis as a channel of `values` [n]."""
+    return Channel(
+        "cross_axis",
+        f"axis_{name}",
+        name,
+        record.axes[name].unit,
+        values,
+        rate_windows_s=RATE_WINDOWS_S,
+        forms=("static", "lag", "rate", "square"),  # first_order would follow noise that both share
+        slow=False,
+        ln_looks=math.log(max(1, len(record.axes) - 1)),
+        extra={"other": name},
     )
 
 
@@ -51,8 +51,8 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     """Two axes that each blame the other: the reading that follows is the one that gains more by it.
 
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
-    coupling is kept: a mechanical one is below 1. Returns the axes that are blamed less."""
-    changed: list[str] = []
+    coupling is kept: a mechanical one is below 1. Returns the axes whose model changed."""
+    changed = _own_ramps(record, found)
     pairs = {
         (name, str(finding.look.estimate["other"])): finding
         for name, one in found.items()
@@ -83,6 +83,25 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                     look = one.findings[k].look
                     look = replace(look, estimate={**look.estimate, "source": "not shown"})
                     one.findings[k] = replace(one.findings[k], look=look)
+    return changed
+
+
+def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    """Drop an axis that shows in another by nothing but what its own model explains: a step or a ramp, of which both
+    may have their own. Returns the axes whose model changed."""
+    changed = []
+    for name, one in found.items():
+        for finding in [each for each in one.findings if each.look.cause == "cross_axis"]:
+            other = str(finding.look.estimate["other"])
+            source = found[other].state if other in found else record.axes[other]
+            if not source.regressors:
+                continue
+            free = without(one.state, other)
+            rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
+            if not any(look.net >= NET_LEAST for look in rest):
+                one.findings.remove(finding)
+                one.state = free
+                changed.append(name)
     return changed
 
 
