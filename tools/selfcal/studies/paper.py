@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +14,7 @@ from rich.table import Table
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of
 from selfcal.show.chart import Figure, draw
-from selfcal.show.page import STYLE
+from selfcal.show.template import render
 from selfcal.studies.paper_figures import section4
 from selfcal.studies.paper_figures.told import Told
 
@@ -44,36 +43,9 @@ def with_reason(told: Sequence[Told], log: Path, diagnose: Callable[..., Mapping
 
 def page(told: Sequence[Told], records: int, seed: int) -> str:
     """One self-contained page: a table of all figures, then each with its pictures."""
-    rows = "".join(
-        f"<tr><th scope=row><a href='#f{k}'>{escape(one.name)}</a></th><td>{escape(one.paper)}</td>"
-        f"<td>{escape(one.here)}</td><td class={'good' if one.verdict == 'agrees' else 'bad'}>{one.verdict}</td></tr>"
-        for k, one in enumerate(told)
-    )
-    head = "".join(f"<th scope=col>{name}</th>" for name in ("figure", "the paper", "here", "verdict"))
-    sections = "".join(
-        f"<section id=f{k}><h2>{escape(one.name)}</h2><dl><dt>The paper</dt><dd>{escape(one.paper)}</dd>"
-        f"<dt>Here</dt><dd>{escape(one.here)}</dd>"
-        f"<dt>Verdict</dt><dd class={'good' if one.verdict == 'agrees' else 'bad'}>{one.verdict}</dd>"
-        + (f"<dt>Why</dt><dd>{escape(one.why)}</dd>" if one.why else "")
-        + "</dl>"
-        + "".join(draw(figure) for figure in ([one.figures] if isinstance(one.figures, Figure) else one.figures))
-        + "</section>"
-        for k, one in enumerate(told)
-    )
-    return (
-        "<!DOCTYPE html><html lang=en><head><meta charset=utf-8>"
-        "<meta name=viewport content='width=device-width,initial-scale=1'>"
-        "<meta http-equiv=Content-Security-Policy content=\"default-src 'none';style-src 'unsafe-inline'\">"
-        f"<title>The paper's figures</title><style>{STYLE}</style></head><body>"
-        "<header><h1>Stepanov &amp; Motorin (2017), made anew</h1>"
-        "<p>O. A. Stepanov, A. V. Motorin, <cite>Problem-oriented approach to identification of sensor error models "
-        "and its application to navigation data processing</cite>, IFAC-PapersOnLine 50-1 (2017) 2830–2835.</p>"
-        f"<p class=soft>selfcal paper --records {records} --seed {seed}. The seeds were fixed beforehand. Every figure "
-        "is shown whether it agrees or not.</p></header><main>"
-        "<div class=scroll tabindex=0 role=group aria-label='All figures'><table>"
-        f"<thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
-        f"{sections}</main></body></html>"
-    )
+    pictures = [[one.figures] if isinstance(one.figures, Figure) else one.figures for one in told]
+    drawn = [[draw(figure) for figure in figures] for figures in pictures]
+    return str(render("paper.html", figures=list(zip(told, drawn, strict=True)), records=records, seed=seed))
 
 
 def show(told: Sequence[Told], output: Path | str) -> None:

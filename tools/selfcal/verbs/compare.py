@@ -136,7 +136,7 @@ def compare(
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
     if report is not None and not none:
-        from selfcal.show.compare_page import write_page
+        from selfcal.show.comparison_page import write_page
 
         write_page(report, document, curves)
     if none:

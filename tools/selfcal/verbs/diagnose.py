@@ -167,7 +167,7 @@ def diagnose(
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
-                        from selfcal.show.page import write_page
+                        from selfcal.show.diagnosis_page import write_page
 
                         write_page(report, document, record, {})
                     if json is not None:
@@ -201,7 +201,7 @@ def diagnose(
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
                     note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
             if report is not None:
-                from selfcal.show.page import write_page
+                from selfcal.show.diagnosis_page import write_page
 
                 doing.now("pictures")
                 given = options_given(axes, model, decimate, recording)

@@ -175,7 +175,7 @@ def fleet(
     if json is not None:
         write_json(document, json)
     if report is not None:
-        from selfcal.batch.page import write_page
+        from selfcal.batch.fleet_page import write_page
 
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
         pages = (
