@@ -8,11 +8,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment, FileSystemLoader
+from jinja2 import Environment
 from markupsafe import Markup
 
 import selfcal
 from selfcal.base.errors import printable
+from selfcal.base.templates import of_pages
 from selfcal.base.units import typeset
 from selfcal.diagnosis import words
 
@@ -54,8 +55,7 @@ def shortened(text: str) -> str:
 
 @cache
 def _environment() -> Environment:
-    folder = Path(__file__).parent / "templates"
-    made = Environment(loader=FileSystemLoader(folder), autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    made = of_pages(Path(__file__).parent / "templates")
     made.filters |= {one.__name__: one for one in (number, interval, spaced, shortened, typeset)}
     made.filters["tenth"] = "{:.1f}".format
     made.globals |= {"words": words, "version": selfcal.__version__}

@@ -8,13 +8,14 @@ from __future__ import annotations
 import argparse
 import re
 import textwrap
-from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 
 from selfcal.base.errors import UserError
+from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
 from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, REASON, dbc
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc
@@ -59,6 +60,14 @@ class Field:
     def macro(self) -> str:
         """Name in C, less the prefix."""
         return self.name.upper()
+
+    @property
+    def bits(self) -> str:
+        """Where it lies, if it does not fill the value."""
+        if self.length == 32:
+            return ""
+        last = self.start + self.length - 1
+        return f", bit {last}" if self.length == 1 else f", bits {self.start} to {last}"
 
 
 def _as_elsewhere(signal: Signal) -> bool:
@@ -106,15 +115,6 @@ def fields(message: Message) -> list[Field]:
     return sorted(found, key=lambda field: (field.item, field.start))
 
 
-def _bits(field: Field) -> str:
-    """Where a field lies, if it does not fill the value."""
-    if field.length == 32:
-        return ""
-    if field.length == 1:
-        return f", bit {field.start}"
-    return f", bits {field.start} to {field.start + field.length - 1}"
-
-
 def _shape(field: Field) -> tuple[object, ...]:
     """What must be alike in all axis messages: everything but unit and comment."""
     return (field.name, field.item, field.start, field.length, field.kind, field.scale)
@@ -150,89 +150,31 @@ def check(database: Database) -> None:
                     raise UserError(f"selfcal.dbc: {message.name}.{field.name}: unit '{field.unit}', not '{unit}'")
 
 
-def _items(prefix: str, members: Iterable[Field]) -> list[str]:
-    lines: list[str] = []
-    by_item: dict[int, list[Field]] = {}
-    for field in members:
-        by_item.setdefault(field.item, []).append(field)
-    lines.append("enum {")
-    for item, group in by_item.items():
-        for field in group:
-            kind = f"{field.kind}{field.length}" + (f" x {field.scale:g}" if field.scale != 1.0 else "")
-            unit = f", {field.unit}" if field.unit else ""
-            lines.append(f"    {prefix}_{field.macro} = {item}, /* {kind}{_bits(field)}{unit} */")
-    lines += ["};", ""]
-    for group in by_item.values():
-        for field in group:
-            if field.length != 32:
-                lines.append(f"#define {prefix}_{field.macro}_SHIFT {field.start}U")
-                lines.append(f"#define {prefix}_{field.macro}_MASK 0x{(1 << field.length) - 1:X}U")
-            if field.scale != 1.0:
-                lines.append(f"#define {prefix}_{field.macro}_PER_UNIT {1.0 / field.scale:.1f}")
-    lines.append("")
-    return lines
-
-
 def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
     check(database)
-    lines = [
-        "/* The telemetry frame format in numbers. selfcal.dbc describes every item.",
-        " * Generated: python -m selfcal.wire.frames_codegen. Do not edit. */",
-        "#ifndef SELFCAL_FRAMES_H",
-        "#define SELFCAL_FRAMES_H",
-        "",
-        f"#define SELFCAL_FRAMES_VERSION {int(database.version or 0)}U",
-        "",
-        "/* First bit and width of what every frame carries, in its 8 bytes read as one little-endian number.",
-        " * The value of the item is in bits 0 to 31. */",
-    ]
-    for name, (start, length) in COMMON.items():
-        lines.append(f"#define SELFCAL_FRAME_{name.upper()}_SHIFT {start}U")
-        lines.append(f"#define SELFCAL_FRAME_{name.upper()}_MASK 0x{(1 << length) - 1:X}U")
-    lines += [
-        "",
-        "/* Identifiers of node 0. Those of node n are SELFCAL_FRAME_NODE_IDS n higher. */",
-        f"#define SELFCAL_FRAME_NODES {NODES}U",
-        f"#define SELFCAL_FRAME_NODE_IDS {NODE_IDS}U",
-    ]
-    for name in (STATUS, CORRECTED, COMMAND, ANSWER):
-        lines.append(f"#define SELFCAL_FRAME_{name}_ID 0x{database.get_message_by_name(name).frame_id:X}U")
-    lines += [
-        "",
-        "/* Those of the first axis. The next axis has the next one, or the next SELFCAL_FRAME_HYPOTHESES. */",
-    ]
-    for suffix in SENT:
-        lines.append(f"#define SELFCAL_FRAME_{OF_AXIS[suffix]}_ID 0x{_first(database, suffix).frame_id:X}U")
-    names = ", ".join(f'"{name}"' for name in AXES)
-    lines += [
-        "",
-        "/* Axes in the order of their messages. Room for hypotheses, parameters of each, and statistics of those. */",
-        f"#define SELFCAL_FRAME_AXES {len(AXES)}U",
-        f"#define SELFCAL_FRAME_AXIS_NAMES {{{names}}}",
-        f"#define SELFCAL_FRAME_HYPOTHESES {HYPOTHESES}U",
-        f"#define SELFCAL_FRAME_PLACES {PLACES}U",
-        f"#define SELFCAL_FRAME_STATISTICS {len(STATISTICS)}U",
-        "",
-        "/* Units are those of a gyro axis; an accelerometer's are alike in m/s^2. */",
-    ]
-    for suffix in SENT:
-        lines += _of_message(_first(database, suffix), OF_AXIS[suffix])
-    for name in (STATUS, CORRECTED, ANSWER):
-        lines += _of_message(database.get_message_by_name(name), name)
-    lines += ["#endif", ""]
-    return "\n".join(lines)
+    status, corrected, command, answer = map(database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER))
+    values = {
+        "version": int(database.version or 0),
+        "of_axis": {OF_AXIS[suffix]: _first(database, suffix) for suffix in SENT},
+        "of_node": [status, corrected],
+        "command": command,
+        "of_host": [answer],
+        "members_of": lambda message: [field for field in fields(message) if not LATER.match(field.name)],
+        "later_of": lambda message: any(LATER.match(field.name) for field in fields(message)),
+        "choices_of": _choices,
+        "COMMON": COMMON,
+        **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES, "PLACES": PLACES},
+        "STATISTICS": STATISTICS,
+    }
+    templates = of_code(Path(__file__).parent / "templates")
+    return templates.get_template("selfcal_frames.h.jinja").render(values)
 
 
-def _of_message(message: Message, name: str) -> list[str]:
-    """Items of a message, and the numbers of their choices."""
-    members = [field for field in fields(message) if not LATER.match(field.name)]
-    more = "" if len(members) == len(fields(message)) else f" Each later column's are {len(members)} higher."
-    lines = [f"/* Items of the message {message.name}.{more} */", *_items(f"SELFCAL_{name}", members)]
-    for signal in message.signals:
-        for number, word in ({} if _as_elsewhere(signal) else signal.choices or {}).items():
-            lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
-    return lines if lines[-1] == "" else [*lines, ""]
+def _choices(message: Message) -> list[tuple[str, int, str]]:
+    """Signal, number and word of each choice."""
+    signals = [signal for signal in message.signals if not _as_elsewhere(signal)]
+    return [(signal.name, number, str(word)) for signal in signals for number, word in (signal.choices or {}).items()]
 
 
 def _entry(head: str, text: str) -> str:
@@ -270,7 +212,7 @@ def table(database: Database) -> str:
             if accel.get(field.name, field.unit) != field.unit:
                 unit += f" (accelerometers: {accel[field.name]})"
             meaning = field.comment + (f": {field.choices}" if field.choices else "")
-            lines.append(_entry(f"{field.item} `{field.name}`, {kind}{_bits(field)}{unit}", meaning))
+            lines.append(_entry(f"{field.item} `{field.name}`, {kind}{field.bits}{unit}", meaning))
     command = database.get_message_by_name(COMMAND)
     lines += ["", "### Command, from the host", "", f"`0x{command.frame_id:X}` COMMAND", ""]
     for signal in command.signals:
