@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
@@ -29,6 +29,12 @@ from selfcal.verbs._shared import (
 )
 
 if TYPE_CHECKING:
+    from selfcal.base.ending import Held
+    from selfcal.base.progress import Doing
+    from selfcal.diagnosis.finding import Diagnosed
+    from selfcal.diagnosis.record import Record
+    from selfcal.logs.recording import Recording
+    from selfcal.model.file import Model
     from selfcal.show.results import Diagnosis
 
 
@@ -89,34 +95,18 @@ def diagnose(
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.diagnosis import hidden
-    from selfcal.diagnosis.diagnose import (
-        FIRST_FROM,
-        FIRST_HZ,
-        LEAST_HZ,
-        add_carried,
-        add_posteriors,
-        below_lattice,
-        by_identify,
-        entry_of,
-        events_of,
-        less_stated,
-        looked_at,
-        options_given,
-        shared_by,
-        show_first,
-        why_not,
-    )
+    from selfcal.diagnosis.diagnose import add_carried, add_posteriors, entry_of, events_of, options_given, shared_by
     from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
     from selfcal.diagnosis.events import add_findings
     from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
-    from selfcal.diagnosis.finding import Diagnosed
-    from selfcal.diagnosis.loop import INTERRUPTED
     from selfcal.diagnosis.record import of_recording
-    from selfcal.diagnosis.verdict import joined
     from selfcal.likelihood import work
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.show.results import Diagnosis
+
+    if report is not None:
+        from selfcal.show.diagnosis_page import write_page
 
     check(fail_on)
     check_options(limits, junit, verdicts)
@@ -135,44 +125,18 @@ def diagnose(
     second = None
     if on is not None:
         second = load(on, sensors=loaded.sensors, **reading)
-    first: dict[str, Diagnosed] = {}
     with held() as ending, Doing("diagnose") as doing:
-        record = of_recording(recording, loaded, decimate, names)
-        if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
-            means = None
-            with suppress(UserError):  # a recording that is too short for means is looked at once
-                means = of_recording(recording, loaded, FIRST_HZ, names)
-            if means is not None and record.axes:
-                first = looked_at(means, names, ending, doing)
-                show_first(recording, first, [name for name in names if name in record.axes], ending)
-        seen = looked_at(record, names, ending, doing, first) if not ending.asked else {}
-        looked = {
-            name: first.get(name)
-            if name not in seen and below_lattice(record, name)
-            else joined(seen.get(name), first.get(name), INTERRUPTED)
-            for name in names
-        }
-        found = {name: less_stated(one, loaded) for name, one in looked.items() if one is not None}
-        if not ending.asked:
-            doing.now("checks")
-            by_identify(found, recording, loaded)
-        errors = {
-            name: seen[name].unfinished if name in seen else why_not(recording, loaded, record, name)
-            for name in names
-            if name not in found
-        }
+        record, first, found, errors = _looked(recording, loaded, names, decimate, full_rate, ending, doing)
         with work.within(work.Work(lambda: ending.overdue)):
             if not found:
-                reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
-                        from selfcal.show.diagnosis_page import write_page
-
                         write_page(report, document, record, {})
                     if json is not None:
                         write_json(document, json)
                 ending.check()
+                reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
             doing.now("held-out gain")
             sensor = recording.path.name.partition(".")[0] if model is None else None
@@ -201,8 +165,6 @@ def diagnose(
                     told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
                     note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
             if report is not None:
-                from selfcal.show.diagnosis_page import write_page
-
                 doing.now("pictures")
                 given = options_given(axes, model, decimate, recording)
                 write_page(report, document, record, found, given)
@@ -211,6 +173,59 @@ def diagnose(
     if json is not None:
         write_json(document, json)
     return Diagnosis(document)
+
+
+def _looked(
+    recording: Recording,
+    model: Model,
+    names: Sequence[str],
+    decimate: float | None,
+    full_rate: bool,
+    ending: Held,
+    doing: Doing,
+) -> tuple[Record, dict[str, Diagnosed], dict[str, Diagnosed], dict[str, str]]:
+    """The look at means, whose findings go to stderr, then at every sample: the record, what the first look found, what
+    both found together, and why the other axes have no result."""
+    from selfcal.diagnosis.diagnose import (
+        FIRST_FROM,
+        FIRST_HZ,
+        LEAST_HZ,
+        below_lattice,
+        by_identify,
+        less_stated,
+        looked_at,
+        show_first,
+        why_not,
+    )
+    from selfcal.diagnosis.loop import INTERRUPTED
+    from selfcal.diagnosis.record import of_recording
+    from selfcal.diagnosis.verdict import joined
+
+    first: dict[str, Diagnosed] = {}
+    record = of_recording(recording, model, decimate, names)
+    if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
+        means = None
+        with suppress(UserError):  # a recording that is too short for means is looked at once
+            means = of_recording(recording, model, FIRST_HZ, names)
+        if means is not None and record.axes:
+            first = looked_at(means, names, ending, doing)
+            show_first(recording, first, [name for name in names if name in record.axes], ending)
+    seen = looked_at(record, names, ending, doing, first) if not ending.asked else {}
+    found: dict[str, Diagnosed] = {}
+    for name in names:
+        only_means = name not in seen and below_lattice(record, name)
+        diagnosed = first.get(name) if only_means else joined(seen.get(name), first.get(name), INTERRUPTED)
+        if diagnosed is not None:
+            found[name] = less_stated(diagnosed, model)
+    if not ending.asked:
+        doing.now("checks")
+        by_identify(found, recording, model)
+    errors = {
+        name: seen[name].unfinished if name in seen else why_not(recording, model, record, name)
+        for name in names
+        if name not in found
+    }
+    return record, first, found, errors
 
 
 def show(document: Diagnosis, given: Mapping[str, Any]) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from selfcal.base.errors import UserError, note, short
 from selfcal.base.options import argument, option
@@ -25,6 +25,9 @@ from selfcal.verbs._shared import (
     Workers,
     to_stderr,
 )
+
+if TYPE_CHECKING:
+    from selfcal.batch.files import Named
 
 
 def fleet(
@@ -88,7 +91,7 @@ def fleet(
 
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.fail_on import check
-    from selfcal.batch.files import DATE_FORM, sources_of
+    from selfcal.batch.files import DATE_FORM
     from selfcal.batch.fleet import document_with, judged_units, version_of_package
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
@@ -114,20 +117,9 @@ def fleet(
         loaded.group_of(name)
     bounds = None if limits is None else Limits.load(limits, loaded)
     folder = Path(f"{output}.parts") if results is None else Path(results)
-    given = {Path(str(one)).resolve() for one in patterns}
-    outputs = [Path(one) for one in (output, junit, verdicts, json, report, write_model) if one is not None]
-    for one in outputs:
-        if one.resolve() in given:
-            raise UserError(f"{one}: is one of the recordings: give it a name of its own")
-    own_files = [
-        *outputs,
-        folder,
-        Path(f"{report}.units"),
-        *(Path(one) for one in (model, limits, units_table) if one is not None),
-    ]
-    named = sources_of([str(one) for one in patterns], units_table, serial_from, own_files)
-    for copy, other in named.copies.items():
-        note(f"{copy}: the same recording as {other}: counted once")
+    outputs = [Path(file) for file in (output, junit, verdicts, json, report, write_model) if file is not None]
+    inputs = [Path(file) for file in (model, limits, units_table) if file is not None]
+    named = _named(patterns, units_table, serial_from, outputs, [*inputs, folder, Path(f"{report}.units")])
     verbs = Verbs(identify, run_diagnose)
     options = Options(
         None if model is None else str(Path(model).absolute()),
@@ -138,29 +130,27 @@ def fleet(
     )
     version = version_of_package()
     keeper = ByContent(folder, settings_of(options, model_settings_of(loaded), version))
-    own = [one for one in named.sources if not one.copy_of]
-    found = spread(
+    sources = [source for source in named.sources if not source.copy_of]
+    records = spread(
         partial(examined, verbs, options),
-        [(str(Path(one.path).absolute()), one.content) for one in own],
+        [(str(Path(source.path).absolute()), source.content) for source in sources],
         settings={},
         piece=1,
         scheduler=scheduler,
         results=keeper,
         count=workers,
         lost=killed,
-        weights=[one.size + 1.0 for one in own],
+        weights=[source.size + 1.0 for source in sources],
         verb="fleet",
     )
-    record_of = dict(zip((one.path for one in own), found, strict=True))
+    record_of = dict(zip((source.path for source in sources), records, strict=True))
     batch = [
-        Unit(one, record_of.get(one.path, {"error": f"is the same recording as {one.copy_of}"}))
-        for one in named.sources
+        Unit(source, record_of.get(source.path, {"error": f"is the same recording as {source.copy_of}"}))
+        for source in named.sources
     ]
     for unit in batch:
         if unit.undated:
             note(f"{unit.source.path}: leaves out the date '{short(unit.undated)}': write it as {DATE_FORM}")
-        if "damaged" in (known := unit.record.get("recording", {})):
-            note(f"{unit.source.path}: {known['damaged']['words']}")
         if "damaged" in (known := unit.record.get("recording", {})):
             note(f"{unit.source.path}: {known['damaged']['words']}")
     batch.sort(key=lambda unit: unit.place)
@@ -178,11 +168,31 @@ def fleet(
         from selfcal.batch.fleet_page import write_page
 
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
-        pages = (
-            own_pages(f"{report}.units", flagged, summary.devices, verbs, options, keeper, workers) if diagnose else {}
-        )
+        pages: dict[str, str] = {}
+        if diagnose:
+            pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, keeper, workers)
         write_page(report, document, summary, pages)
     return document
+
+
+def _named(
+    patterns: Sequence[Path | str],
+    units_table: Path | str | None,
+    serial_from: str | None,
+    outputs: Sequence[Path],
+    others: Sequence[Path],
+) -> Named:
+    """The recordings with their devices. `outputs`, `others`: the run's own files, which are no recordings."""
+    from selfcal.batch.files import sources_of
+
+    given = {Path(str(pattern)).resolve() for pattern in patterns}
+    for file in outputs:
+        if file.resolve() in given:
+            raise UserError(f"{file}: is one of the recordings: give it a name of its own")
+    named = sources_of([str(pattern) for pattern in patterns], units_table, serial_from, [*outputs, *others])
+    for copy, other in named.copies.items():
+        note(f"{copy}: the same recording as {other}: counted once")
+    return named
 
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 
@@ -29,6 +29,9 @@ from selfcal.verbs._shared import (
 )
 
 if TYPE_CHECKING:
+    from selfcal.likelihood.state import Look
+    from selfcal.logs.recording import Recording
+    from selfcal.model.file import Model
     from selfcal.show.results import Identification
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
@@ -168,17 +171,10 @@ def identify(
             if isinstance(axis, Identified) and against(axis.judged.checks).keys() - {"motion"}
         ]
         if doubtful and suspicion:
-            from selfcal.diagnosis.suspicion import suspicions, weigh_more_laws, with_added_laws
-            from selfcal.readings.tests import TESTS
+            from selfcal.diagnosis.suspicion import weigh_more_laws, with_added_laws
 
             progress.update(task, description="strongest suspicion")
-            suspected = suspicions(recording, loaded_model, doubtful)
-            for name, shown in suspected.items():
-                document["axes"][name]["suspicion"] = shown.cause
-            for name in doubtful:
-                for test in TESTS:  # shown by the readings themselves
-                    if test.name in document["axes"][name]["checks"]:
-                        document["axes"][name]["suspicion"] = test.name
+            suspected = _suspect(document, recording, loaded_model, doubtful)
             if model is None:
                 progress.update(task, description="more laws")
                 again = with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)
@@ -195,6 +191,21 @@ def identify(
         plot_allan(document, plot, datasheet=datasheet)
         console.print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
     return Identification(document)
+
+
+def _suspect(document: dict[str, Any], recording: Recording, model: Model, names: Sequence[str]) -> dict[str, Look]:
+    """Name the strongest suspicion of each axis in the document: a test of the readings, else the look that explains
+    most. The looks by axis."""
+    from selfcal.diagnosis.suspicion import suspicions
+    from selfcal.readings.tests import TESTS
+
+    suspected = suspicions(recording, model, names)
+    for name in names:
+        axis = document["axes"][name]
+        causes = [suspected[name].cause] if name in suspected else []
+        causes += [test.name for test in TESTS if test.name in axis["checks"]]
+        axis |= {"suspicion": causes[-1]} if causes else {}
+    return suspected
 
 
 def show(document: Identification, given: Mapping[str, Any]) -> int:
