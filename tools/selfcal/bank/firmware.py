@@ -27,11 +27,11 @@ class Played:
     malformed = 0
 
     def __init__(self, model: Model, tables: Tables, rows: Path, period_ms: int, gate: bool) -> None:
-        found = gate_table(model, tables)
+        table = gate_table(model, tables)
         watched = None
-        if found is not None:
-            numbers = (found.window, found.false_alarm, found.hold, found.settle, found.memory)
-            watched = (*numbers, list(found.sigma), list(found.is_rate))
+        if table is not None:
+            numbers = (table.window, table.false_alarm, table.hold, table.settle, table.memory)
+            watched = (*numbers, list(table.sigma), list(table.is_rate))
         self._module: Any = _firmware.Module(
             *arguments(tables),
             _columns(tables),
@@ -56,9 +56,9 @@ class Played:
 
         if not self._frames and not self._module.ended:
             sent: bytes = self._module.play(ROWS)
-            for at in range(0, len(sent), FRAME):
-                identifier = int.from_bytes(sent[at : at + IDENTIFIER], "little")
-                self._frames.append((identifier, sent[at + IDENTIFIER : at + FRAME]))
+            for start in range(0, len(sent), FRAME):
+                identifier = int.from_bytes(sent[start : start + IDENTIFIER], "little")
+                self._frames.append((identifier, sent[start + IDENTIFIER : start + FRAME]))
         if not self._frames:
             return None
         identifier, data = self._frames.popleft()

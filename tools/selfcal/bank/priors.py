@@ -170,8 +170,8 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
         return None
     block = max(1, round(recording.rate_hz / model.bank_rate_hz))
     tau_s = block / recording.rate_hz
-    place = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
-    size = np.ones(place.size)
+    interval = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
+    size = np.ones(interval.size)
     tau: list[float] = []
     deviations: list[float] = []
     counts: list[int] = []
@@ -179,12 +179,12 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     with np.errstate(over="ignore", invalid="ignore"):
         total = values[sound]
         while True:
-            first = np.flatnonzero(np.diff(place, prepend=place[0] - 1))
-            place, total, size = place[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
+            first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
+            interval, total, size = interval[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
             whole = size > 0.5 * size.max()
             mean = total[whole] / size[whole]
             level = level if tau else float(np.median(mean))
-            step = np.diff(mean)[np.diff(place[whole]) == 1]
+            step = np.diff(mean)[np.diff(interval[whole]) == 1]
             step[np.abs(step) < SAME * np.abs(mean).max()] = 0.0
             if step.size < (FEWEST_OF_DRIFT if tau else FEWEST):
                 break
@@ -195,7 +195,7 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             tau.append(tau_s)
             counts.append(step.size)
             tau_s *= 2.0
-            place = place // 2
+            interval = interval // 2
     if not tau or not 0.0 < deviations[0] < math.inf:
         return None
     return Seen(level, np.array(tau), np.array(deviations), np.array(counts))
@@ -281,46 +281,46 @@ def moved_along(
         bank.push(samples, own.missing_before)
         return bank.report(0)
 
-    first = found = report(priors)
+    first = result = report(priors)
     moved, gaining = priors, priors != model.group_of(name).priors  # only the model's own have to be outdone
     for _ in range(LEANS_MOST):
-        further = {key: _moved(key, moved[key], end, least) for key, end in leaning(found, moved).items()}
+        further = {key: _moved(key, moved[key], end, least) for key, end in leaning(result, moved).items()}
         further = {key: prior for key, prior in further.items() if prior != moved[key]}
         if not further:
             break
         moved = {**moved, **further}
-        found = report(moved)
-        gaining = gaining or _gains(first, found, [key for key, prior in moved.items() if prior != priors[key]])
+        result = report(moved)
+        gaining = gaining or _gains(first, result, [key for key, prior in moved.items() if prior != priors[key]])
     return moved if gaining else priors
 
 
-def leaning(found: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
+def leaning(result: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
     """The parameters whose posterior under a law leans on an end of its prior: -1 the lower, 1 the upper one."""
     ends: dict[str, int] = {}
-    for estimates in found.parameters.values():
-        for key, one in estimates.items():
+    for estimates in result.parameters.values():
+        for key, estimate in estimates.items():
             prior = priors[key]
-            if key in RATIOS or not prior.law.endswith("uniform") or not one.q05 > 0.0:
+            if key in RATIOS or not prior.law.endswith("uniform") or not estimate.q05 > 0.0:
                 continue
             for end, near, far in (
-                (-1, one.q05 / prior.min, one.q95 / prior.min),
-                (1, prior.max / one.q95, prior.max / one.q05),
+                (-1, estimate.q05 / prior.min, estimate.q95 / prior.min),
+                (1, prior.max / estimate.q95, prior.max / estimate.q05),
             ):
-                middle = one.median / prior.min if end < 0 else prior.max / one.median
+                middle = estimate.median / prior.min if end < 0 else prior.max / estimate.median
                 left = math.log(max(near, 1.0))
                 if left < LEANS_LEFT * (math.log(middle) - left) and math.log(far) < LEANS_WITHIN:
                     ends[key] = end
     return ends
 
 
-def _gains(first: AxisResult, found: AxisResult, moved: Collection[str]) -> bool:
+def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> bool:
     """Whether limits `moved` are the record's own: a law that counts gains by them. Of a law whose alpha moved the sum
     of all laws must gain: as alpha falls it becomes a walk, which may be one of them."""
-    gain = {law: found.log_evidence[law] - before for law, before in first.log_evidence.items()}
-    whole = [float(np.logaddexp.reduce(list(one.log_evidence.values()))) for one in (first, found)]
+    gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
+    whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
     return whole[1] > whole[0] + LEANS_GAIN or any(
-        gain[law] > LEANS_GAIN and found.probability[law] > LEANS_LAW
-        for law, estimates in found.parameters.items()
+        gain[law] > LEANS_GAIN and second.probability[law] > LEANS_LAW
+        for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )
 

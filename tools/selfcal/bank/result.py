@@ -30,8 +30,8 @@ def of_mixture(
     def quantile(p: float) -> float:
         low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
         for _ in range(40):
-            at = 0.5 * (low + high)
-            low, high = (at, high) if float(weight @ ndtr((at - mean) / sd)) < p else (low, at)
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if float(weight @ ndtr((middle - mean) / sd)) < p else (low, middle)
         return 0.5 * (low + high)
 
     return middle, spread, quantile(0.05), quantile(0.5), quantile(0.95)

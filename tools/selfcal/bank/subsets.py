@@ -79,19 +79,21 @@ def combine(
         math.sqrt(float(of_choice @ (sd**2 + (mean - bias) ** 2))),
     )
     inclusion = {}
-    for one in choices[-1]:
-        having = [i for i, choice in enumerate(choices) if one in choice]
+    for regressor in choices[-1]:
+        having = [i for i, choice in enumerate(choices) if regressor in choice]
         coefficients = []
-        for place, column in enumerate(one.columns):
+        for k, column in enumerate(regressor.columns):
             parts = []
             for i in having:
-                at = place + sum(len(other.columns) for other in choices[i][: choices[i].index(one)])
+                index = k + sum(len(other.columns) for other in choices[i][: choices[i].index(regressor)])
                 likely = [law for k, law in enumerate(hypotheses) if weight[i, k] >= LIKELY * of_choice[i] > 0.0]
                 if likely:
-                    widest = max((results[i].coefficients[law][at] for law in likely), key=lambda found: found[1])
+                    widest = max(
+                        (results[i].coefficients[law][index] for law in likely), key=lambda mean_sd: mean_sd[1]
+                    )
                     parts.append((of_choice[i], *widest))
-            coefficients.append(_coefficient(column, coefficient_unit(unit, one.unit), np.array(parts)))
-        inclusion[one.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
+            coefficients.append(_coefficient(column, coefficient_unit(unit, regressor.unit), np.array(parts)))
+        inclusion[regressor.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
     return Scored(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
 
 
@@ -102,5 +104,5 @@ def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coeffi
 
 def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
     """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
-    found = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
-    return Coefficient(column, unit, *found)
+    mixture = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
+    return Coefficient(column, unit, *mixture)

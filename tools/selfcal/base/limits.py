@@ -75,7 +75,7 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
 
 def named_pipe(path: Path) -> bool:
     """Whether a path is a pipe of the file system, which may hold its reader or writer for ever. Raises OSError."""
-    return path.is_fifo() and not any(str(one).startswith(STREAMS) for one in (path, path.resolve()))
+    return path.is_fifo() and not any(str(name).startswith(STREAMS) for name in (path, path.resolve()))
 
 
 def read_text(path: Path, most: int, otherwise: str) -> str:

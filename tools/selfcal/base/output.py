@@ -56,29 +56,29 @@ def together(path: Path | str, *others: Path | str) -> Iterator[tuple[Path, ...]
     An older one of the `others` goes just before: none stands beside a `path` that it is not of. One whose temporary
     file the block removes goes without a new one.
     """
-    at = Path(path)
+    target = Path(path)
     pending: list[_Pending] = []
     try:
         try:
-            for at in map(Path, (path, *others)):
-                pending.append(_Pending.of(at))
-            at = Path(path)
-            yield tuple(one.temporary for one in pending)
-            written = [one for one in pending if one.temporary != one.place]
-            written = [one for one in written if one is pending[0] or one.temporary.exists()]
-            for one in written:
-                one.settle()
-            for one in pending[1:]:
-                if one.temporary != one.place:
-                    one.place.unlink(missing_ok=True)
-            for one in written:
-                one.temporary.replace(one.place)
+            for target in map(Path, (path, *others)):
+                pending.append(_Pending.of(target))
+            target = Path(path)
+            yield tuple(file.temporary for file in pending)
+            written = [file for file in pending if file.temporary != file.place]
+            written = [file for file in written if file is pending[0] or file.temporary.exists()]
+            for file in written:
+                file.settle()
+            for file in pending[1:]:
+                if file.temporary != file.place:
+                    file.place.unlink(missing_ok=True)
+            for file in written:
+                file.temporary.replace(file.place)
         finally:
-            for one in pending:
-                if one.temporary != one.place:
-                    one.temporary.unlink(missing_ok=True)
+            for file in pending:
+                if file.temporary != file.place:
+                    file.temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise UserError(f"{at}: cannot be written: {error.strerror or error}") from error
+        raise UserError(f"{target}: cannot be written: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def write_text(path: Path | str, text: str) -> None:
 def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
     """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
     or that is there twice. None and '-' are none."""
-    taken = {Path(one).resolve() for one in inputs if one is not None}
+    taken = {Path(path).resolve() for path in inputs if path is not None}
     for file in files:
         if file is not None and str(file) != "-":
             check_place(file)

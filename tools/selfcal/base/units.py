@@ -163,9 +163,9 @@ def plain(name: str) -> str:
         return spelled
     return next(
         (
-            one
-            for one in RECORDING_UNITS
-            if one != LSB and (same := parse(one)).dimension == meant.dimension and same.size == meant.size
+            unit
+            for unit in RECORDING_UNITS
+            if unit != LSB and (same := parse(unit)).dimension == meant.dimension and same.size == meant.size
         ),
         product,
     )
@@ -198,13 +198,13 @@ def parse(name: str) -> Unit:
         raise unknown
     for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
         match = _FACTOR.match(part)
-        found = None if match is None else _atom(match["root"] or match["atom"])
-        if match is None or found is None:
+        atom = None if match is None else _atom(match["root"] or match["atom"])
+        if match is None or atom is None:
             raise unknown
         power = Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1)
         if sign == "/":
             power = -power
-        kind, scale = found
+        kind, scale = atom
         dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
         size *= scale ** float(power)
         if not _LEAST < size < _MOST:
@@ -220,9 +220,9 @@ def known(name: str) -> bool:
         return False
 
 
-def same_kind(one: str, other: str) -> bool:
+def same_kind(unit: str, other: str) -> bool:
     """Whether one unit converts into the other."""
-    return parse(one).dimension == parse(other).dimension
+    return parse(unit).dimension == parse(other).dimension
 
 
 def factor(unit: str, to: str) -> float:

@@ -109,13 +109,15 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
         for check, outcome in axis["checks"].items()
         if check.startswith("allan_") and not outcome["passed"]
     }
-    at = [int(np.argmin(np.abs(np.log(tau / tau_s)))) for tau_s in failed]
+    nearest = [int(np.argmin(np.abs(np.log(tau / tau_s)))) for tau_s in failed]
     recorded = scaled(allan, "recording")
-    panel.plot(tau[at], recorded[at], color=OUTSIDE, marker="o", markersize=10, fillstyle="none", linestyle="")
+    panel.plot(
+        tau[nearest], recorded[nearest], color=OUTSIDE, marker="o", markersize=10, fillstyle="none", linestyle=""
+    )
     panel.set_title(f"{name}: {'adequate' if axis['adequate'] else 'NOT ADEQUATE'}", loc="left", fontweight="bold",
                     color="black" if axis["adequate"] else OUTSIDE)  # fmt: skip
     likely = sorted(axis["hypotheses"].items(), key=lambda entry: -entry[1])
-    lines = [(f"{law}  P {probability:.3f}", MODEL if place == 0 else "0.4") for place, (law, probability) in
+    lines = [(f"{law}  P {probability:.3f}", MODEL if rank == 0 else "0.4") for rank, (law, probability) in
              enumerate(likely[:4])]  # fmt: skip
     if failed:
         lines.append(("model over recording:", OUTSIDE))
@@ -123,9 +125,9 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
         lines += [(",  ".join(named[k : k + 3]), OUTSIDE) for k in range(0, len(named), 3)]
     others = [check for check, outcome in axis["checks"].items() if not outcome["passed"] and "allan" not in check]
     lines += [(check, OUTSIDE) for check in others]
-    for place, (text, color) in enumerate(lines):
-        panel.text(0.97, 0.97 - 0.055 * place, text, color=color, ha="right", va="top", fontsize="x-small",
-                   fontweight="bold" if place == 0 else "normal", transform=panel.transAxes)  # fmt: skip
+    for row, (text, color) in enumerate(lines):
+        panel.text(0.97, 0.97 - 0.055 * row, text, color=color, ha="right", va="top", fontsize="x-small",
+                   fontweight="bold" if row == 0 else "normal", transform=panel.transAxes)  # fmt: skip
     panel.set_xlabel("averaging time τ, s")
     panel.set_ylabel(f"Allan deviation, {units.typeset(unit)}")
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -109,8 +109,8 @@ class Panel:
             thinned = "" if every == 1 else f" One point in {every} of {x.size}."
             heads = [self.x_label, *(label for label, _ in columns)]
             rows = (
-                [number(float(at), 5), *(number(float(y)) for y in row)]
-                for at, *row in zip(x[::every], *(y[::every] for _, y in columns), strict=True)
+                [number(float(abscissa), 5), *(number(float(y)) for y in row)]
+                for abscissa, *row in zip(x[::every], *(y[::every] for _, y in columns), strict=True)
             )
             yield f"{self.title}: {self.y_label} over {self.x_label}.{thinned}", heads, rows
 
@@ -183,14 +183,14 @@ def _log_ticks(low: float, high: float) -> list[float]:
     a, b = math.log10(low), math.log10(high)
     factors = (1.0,) if b - a > 2.0 else (1.0, 2.0, 5.0)
     every = max(1, math.ceil((b - a) / (TICKS + 1)))
-    found = [
+    ticks = [
         factor * 10.0**k
         for k in range(math.floor(a), math.ceil(b) + 1)
         if k % every == 0
         for factor in factors
         if low * 0.999 <= factor * 10.0**k <= high * 1.001
     ]
-    return found if len(found) > 1 else [low, high]
+    return ticks if len(ticks) > 1 else [low, high]
 
 
 def _limits(values: Sequence[Array], log: bool, pad: float) -> tuple[float, float]:
@@ -208,7 +208,7 @@ def _limits(values: Sequence[Array], log: bool, pad: float) -> tuple[float, floa
 
 def _x_limits(figure: Figure) -> tuple[float, float]:
     first = figure.panels[0]
-    xs = [one.x for panel in figure.panels for one in panel.drawn]
+    xs = [item.x for panel in figure.panels for item in panel.drawn]
     if first.stairs:  # to the outer edges of the bins, and to the marks beyond them
         low, high = _limits(xs, first.log_x, 0.5 / max(1, xs[0].size - 1))
         marks = [mark for panel in figure.panels for mark in panel.marks]
@@ -219,8 +219,8 @@ def _x_limits(figure: Figure) -> tuple[float, float]:
 
 
 def _y_limits(figure: Figure) -> tuple[float, float]:
-    values = [one.y for panel in figure.panels for one in panel.curves]
-    values += [edge for panel in figure.panels for one in panel.bands for edge in (one.low, one.high)]
+    values = [curve.y for panel in figure.panels for curve in panel.curves]
+    values += [edge for panel in figure.panels for band in panel.bands for edge in (band.low, band.high)]
     return _limits(values, figure.panels[0].log_y, 0.06)
 
 
@@ -253,8 +253,8 @@ def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
         ]
         rows.append((replace(panel, curves=curves, bands=bands), y))
     above: dict[float, list[str]] = {}  # a text that has no room of its own goes to its left neighbour
-    for at, text in sorted(marks):
-        place = x.place(at)
+    for value, text in sorted(marks):
+        place = x.place(value)
         above.setdefault(next((other for other in above if place - other < 14.0), place), []).append(text)
     return render(
         "strips.html",
@@ -270,8 +270,8 @@ def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
 
 def _usual(panel: Panel) -> tuple[float, float]:
     """Limits that all but a few points of a panel keep: a shock must not hide a step."""
-    values = [one.y for one in panel.curves] + [edge for one in panel.bands for edge in (one.low, one.high)]
-    usual = [np.nanquantile(one, (USUAL, 1.0 - USUAL)) for one in values if np.isfinite(one).any()]
+    values = [curve.y for curve in panel.curves] + [edge for band in panel.bands for edge in (band.low, band.high)]
+    usual = [np.nanquantile(ys, (USUAL, 1.0 - USUAL)) for ys in values if np.isfinite(ys).any()]
     return _limits(usual, False, 0.06)
 
 
@@ -319,10 +319,12 @@ def _stairs(px: Array, py: Array, stairs: bool) -> tuple[Array, Array]:
 
 def _path(px: Array, py: Array) -> str:
     """Path data in steps of a tenth, relative: a third shorter than absolute ones."""
-    at = np.rint(10.0 * np.column_stack([px, py])).astype(int)
-    steps = np.diff(at, axis=0)
+    corners = np.rint(10.0 * np.column_stack([px, py])).astype(int)
+    steps = np.diff(corners, axis=0)
     text = "".join(_tenth(int(dx), "") + _tenth(int(dy), " ") + " " for dx, dy in steps if dx or dy)
-    return f"M{_tenth(int(at[0, 0]), '')}{_tenth(int(at[0, 1]), ' ')}" + (f"l{text.rstrip()}" if text else "h0")
+    return f"M{_tenth(int(corners[0, 0]), '')}{_tenth(int(corners[0, 1]), ' ')}" + (
+        f"l{text.rstrip()}" if text else "h0"
+    )
 
 
 def _tenth(value: int, before: str) -> str:

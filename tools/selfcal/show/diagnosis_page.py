@@ -41,25 +41,26 @@ Entry = Mapping[str, Any]
 
 
 def write_page(
-    path: Path | str, document: Entry, record: Record, found: Mapping[str, Diagnosed], options: Options = ()
+    path: Path | str, document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()
 ) -> None:
     """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
-    write_text(path, page(document, record, found, options))
+    write_text(path, page(document, record, diagnosed, options))
 
 
-def page(document: Entry, record: Record, found: Mapping[str, Diagnosed], options: Options = ()) -> str:
-    """The page. Numbers and words are the document's (selfcal.diagnose/1); pictures are made from `record` and `found`.
+def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()) -> str:
+    """The page. Numbers and words are the document's (selfcal.diagnose/1); pictures are made from `record` and
+    `diagnosed`.
     `options`: how the recording was read and looked at, for the commands that reproduce it.
 
     The same arguments give the same page: the simulated records of the bands have a fixed seed."""
     recording = document["recording"]
     results = {name: entry for name, entry in document["axes"].items() if "error" not in entry}
-    axes = [_axis(name, entry, found[name]) for name, entry in results.items()]
+    axes = [_axis(name, entry, diagnosed[name]) for name, entry in results.items()]
     findings = document.get("findings") or []
     shown, small = parted(findings)
     gains = [(axis.name, finding) for axis in axes for finding in axis.entry["findings"]]
-    horizons = sorted({str(h): None for _, one in gains for h in _horizons(one)}, key=float)
-    inflated = list({key: None for _, one in gains for key in one.get("inflation") or ()})
+    horizons = sorted({str(h): None for _, finding in gains for h in _horizons(finding)}, key=float)
+    inflated = list({key: None for _, finding in gains for key in finding.get("inflation") or ()})
     values = {
         "document": document,
         "recording": recording,
@@ -71,7 +72,9 @@ def page(document: Entry, record: Record, found: Mapping[str, Diagnosed], option
         "sides": _sides(results),
         "shown": shown,
         "small": small,
-        "alone": [one for one in findings if not any(axis.first_of(one["cause"]) is not None for axis in axes)],
+        "alone": [
+            finding for finding in findings if not any(axis.first_of(finding["cause"]) is not None for axis in axes)
+        ],
         "boxes_of": lambda finding: [(axis.name, k) for axis in axes if (k := axis.box_of(finding)) is not None],
         "noisier": noisier_of(results),
         "readings": _readings(shown, axes) if axes else "",
@@ -138,7 +141,7 @@ class _Axis:
     def numbers(self) -> list[str]:
         """N, K and B without the findings and with them."""
         known = [self.entry["numbers"][name] for name in ("N", "K", "B")]
-        return [f"{before_after(one).replace('->', '→')} {units.typeset(str(one['unit']))}" for one in known]
+        return [f"{before_after(entry).replace('->', '→')} {units.typeset(str(entry['unit']))}" for entry in known]
 
     @property
     def law(self) -> tuple[str, str, Mapping[str, Entry]]:
@@ -152,9 +155,9 @@ class _Axis:
     @property
     def statistics(self) -> list[tuple[Statistic, Statistic | None]]:
         """Every statistic before and after, those outside their band first."""
-        after = {one.name: one for one in self.diagnosed.after}
-        ordered = sorted(self.diagnosed.before, key=lambda one: (not _outside(one), one.p))
-        return [(one, after.get(one.name)) for one in ordered]
+        after = {statistic.name: statistic for statistic in self.diagnosed.after}
+        ordered = sorted(self.diagnosed.before, key=lambda statistic: (not _outside(statistic), statistic.p))
+        return [(statistic, after.get(statistic.name)) for statistic in ordered]
 
     @property
     def counts(self) -> list[int]:
@@ -168,25 +171,27 @@ class _Axis:
 
     def first_of(self, cause: str) -> int | None:
         """Place of the first box of a cause."""
-        return next((k for k, one in enumerate(self.entry["findings"]) if one["cause"] == cause), None)
+        return next((k for k, finding in enumerate(self.entry["findings"]) if finding["cause"] == cause), None)
 
     def box_of(self, finding: Entry) -> int | None:
         """Place of the box of a finding of all axes."""
-        return next((k for k, one in enumerate(self.entry["findings"]) if one.get("of") == finding["id"]), None)
+        return next((k for k, box in enumerate(self.entry["findings"]) if box.get("of") == finding["id"]), None)
 
 
-def _axis(name: str, entry: Entry, one: Diagnosed) -> _Axis:
+def _axis(name: str, entry: Entry, diagnosed: Diagnosed) -> _Axis:
     unit = str(entry["unit"])
     overview: Sequence[Figure] = ()
-    own: Sequence[Sequence[Figure]] = [()] * len(one.findings)
+    own: Sequence[Sequence[Figure]] = [()] * len(diagnosed.findings)
     with suppress(Stopped):
-        overview, own = pictures.figures(one, one.record, units.factor(one.state.unit, unit), unit)
+        overview, own = pictures.figures(diagnosed, diagnosed.record, units.factor(diagnosed.state.unit, unit), unit)
     panel = next((figure.panels[-1] for figure in overview if figure.name == ALLAN), None)
     outside, points = (0, 0) if panel is None else outside_of(panel.curves[0], panel.bands[0])
     boxes: list[_Box] = []
-    axis = _Axis(name, entry, one, [_Picture(figure.name, draw(figure)) for figure in overview], boxes, outside, points)
+    axis = _Axis(
+        name, entry, diagnosed, [_Picture(figure.name, draw(figure)) for figure in overview], boxes, outside, points
+    )
     for finding in entry["findings"]:
-        match = _match(finding, one.findings)
+        match = _match(finding, diagnosed.findings)
         figures = own[match] if match is not None else ()
         drawn = [_Picture(figure.name, draw(figure), min(_nats(finding), 1e300)) for figure in figures]
         boxes.append(_Box(finding, drawn, folded=not axis.matters(finding["cause"])))
@@ -231,10 +236,10 @@ def _readings(findings: Sequence[Entry], axes: Sequence[_Axis]) -> Markup:
     return strips(Figure("Readings and events", caption, panels), marks)
 
 
-def _fitted(one: Diagnosed, unit: str) -> tuple[str, str, dict[str, Entry]]:
+def _fitted(diagnosed: Diagnosed, unit: str) -> tuple[str, str, dict[str, Entry]]:
     """The law of the diagnosis' own fit and its parameters in `unit`, without intervals."""
-    law = fitted_law(one)
-    factor = units.factor(one.state.unit, unit)
+    law = fitted_law(diagnosed)
+    factor = units.factor(diagnosed.state.unit, unit)
     estimates: dict[str, Entry] = {
         name: {"median": law[name] * (1.0 if name == "alpha" else factor), "unit": units.parameter_unit(name, unit)}
         for name in ("N", "K", "sigma_m", "alpha")
@@ -258,7 +263,7 @@ def _id(axis: str, k: int) -> str:
 
 def _match(finding: Entry, candidates: Sequence[Finding]) -> int | None:
     """Which finding of the loop the document's is: same cause, nearest evidence."""
-    same = [k for k, one in enumerate(candidates) if one.look.cause == finding["cause"]]
+    same = [k for k, candidate in enumerate(candidates) if candidate.look.cause == finding["cause"]]
     return min(same, key=lambda k: abs(candidates[k].look.gain - _nats(finding)), default=None)
 
 

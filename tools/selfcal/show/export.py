@@ -99,33 +99,37 @@ def text_of(form: str, gyro: Kind, accel: Kind, recording: Mapping[str, Any]) ->
 
 
 def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
-    found = {
+    axes = {
         name: axis
         for name, axis in document["axes"].items()
         if "error" not in axis and units.same_kind(axis["bias_now"]["unit"], unit)
     }
     what = "gyro" if unit == "rad/s" else "accelerometer"
-    if not found:
+    if not axes:
         raise UserError(f"--export needs at least one {what} axis in the answer")
 
     def median(name: str, law: str, parameter: str) -> float:
-        entry = found[name]["parameters"][law][parameter]
+        entry = axes[name]["parameters"][law][parameter]
         return units.convert(float(entry["median"]), entry["unit"], units.parameter_unit(parameter, unit))
 
     def worst(law: str, parameter: str) -> str:
-        return str(max(found, key=lambda name: median(name, law, parameter)))
+        return str(max(axes, key=lambda name: median(name, law, parameter)))
 
     for law in ("random_walk", "gauss_markov"):
-        if any(law not in axis["parameters"] for axis in found.values()):
+        if any(law not in axis["parameters"] for axis in axes.values()):
             raise UserError(f"--export needs the hypothesis {law} in the model")
-    at = {"N": worst("random_walk", "N"), "K": worst("random_walk", "K"), "sigma_m": worst("gauss_markov", "sigma_m")}
-    medians = {
-        "N": median(at["N"], "random_walk", "N"),
-        "K": median(at["K"], "random_walk", "K"),
-        "sigma_m": median(at["sigma_m"], "gauss_markov", "sigma_m"),
-        "alpha": median(at["sigma_m"], "gauss_markov", "alpha"),
+    worst_axis = {
+        "N": worst("random_walk", "N"),
+        "K": worst("random_walk", "K"),
+        "sigma_m": worst("gauss_markov", "sigma_m"),
     }
-    curves = [axis["allan"] for axis in found.values() if axis["allan"] and axis["allan"]["tau_s"]]
+    medians = {
+        "N": median(worst_axis["N"], "random_walk", "N"),
+        "K": median(worst_axis["K"], "random_walk", "K"),
+        "sigma_m": median(worst_axis["sigma_m"], "gauss_markov", "sigma_m"),
+        "alpha": median(worst_axis["sigma_m"], "gauss_markov", "alpha"),
+    }
+    curves = [axis["allan"] for axis in axes.values() if axis["allan"] and axis["allan"]["tau_s"]]
     tau = [np.array(curve["tau_s"]) for curve in curves]
     limits = [
         upper_limit(
@@ -138,13 +142,13 @@ def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
     n, k = overbound(tau, limits)
     if level is not None and not math.isfinite(n):
         raise UserError("--overbound: the record is too short for an Allan deviation; leave the option out")
-    probability = found[at["K"]]["hypotheses"]
+    probability = axes[worst_axis["K"]]["hypotheses"]
     law = max(probability, key=lambda name: probability[name])
-    unexplained = [name for name, axis in found.items() if not axis["adequate"]]
+    unexplained = [name for name, axis in axes.items() if not axis["adequate"]]
     verdict = f"NOT ADEQUATE: no law explains {', '.join(unexplained)}" if unexplained else "adequate"
     notes = [
-        f"{what}: axes {', '.join(found)}; medians of the worst: N {at['N']}, K {at['K']}, "
-        f"Gauss-Markov {at['sigma_m']}; most probable law on {at['K']}: {law}",
+        f"{what}: axes {', '.join(axes)}; medians of the worst: N {worst_axis['N']}, K {worst_axis['K']}, "
+        f"Gauss-Markov {worst_axis['sigma_m']}; most probable law on {worst_axis['K']}: {law}",
         f"{what}: {verdict}",
     ]
     if tau:

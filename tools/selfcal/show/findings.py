@@ -67,8 +67,8 @@ def show(
 
 def verdict(axis: Mapping[str, Any]) -> str:
     """The verdict on an axis, why it is not finished, and what the model file states already."""
-    told = words.verdict(axis) + (f": {axis['unfinished']}" if axis.get("unfinished") else "")
-    return told + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
+    text = words.verdict(axis) + (f": {axis['unfinished']}" if axis.get("unfinished") else "")
+    return text + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
 
 
 def noisier_of(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -104,13 +104,13 @@ def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> Table:
 def before_after(number: Mapping[str, Any]) -> str:
     """One number of an axis."""
     after = number["after"]
-    told = "–" if not after["identified"] else f"{after['median']:.3g}"
+    text = "–" if not after["identified"] else f"{after['median']:.3g}"
     if "q05" in after:
         half = 0.5 * (after["q95"] - after["q05"])
         known = f"{words.rounded(after['median'], 10.0 * half)} ± {half:.1g}"
-        told = known if after["identified"] else f"< {after['q95']:.2g}"
+        text = known if after["identified"] else f"< {after['q95']:.2g}"
     before = f"{number['before']:.3g}" if number["before"] > 0.0 and math.isfinite(number["before"]) else "–"
-    return f"{before} -> {told}"
+    return f"{before} -> {text}"
 
 
 def _lines(finding: Mapping[str, Any]) -> list[str]:

@@ -141,7 +141,7 @@ def result(of: type[Object]) -> Json:
 def _hint(hint: Any, places: dict[str, Json]) -> Json:
     """Of an annotation; classes go to `places`."""
     if isinstance(hint, UnionType):
-        return {"anyOf": [_hint(one, places) for one in get_args(hint)]}
+        return {"anyOf": [_hint(choice, places) for choice in get_args(hint)]}
     if hint is NoneType:
         return {"type": "null"}
     arguments = get_args(hint)
@@ -153,8 +153,8 @@ def _hint(hint: Any, places: dict[str, Json]) -> Json:
         if hint.__name__ not in places:
             places[hint.__name__] = {}
             hints = get_type_hints(hint)
-            needed = [key for key, one in hints.items() if NoneType not in get_args(one)]
-            entries = {key: _hint(one, places) for key, one in hints.items()}
+            needed = [key for key, value in hints.items() if NoneType not in get_args(value)]
+            entries = {key: _hint(value, places) for key, value in hints.items()}
             failed = {"anyOf": [{"required": ["error"]}, {"required": needed}]}
             places[hint.__name__] = {"type": "object", "properties": entries} | (
                 failed if "error" in hints else {"required": needed}
@@ -167,7 +167,7 @@ def _hint(hint: Any, places: dict[str, Json]) -> Json:
 def schemas() -> dict[str, Json]:
     """By the name of the file."""
     of = {"identify": Identification, "diagnose": Diagnosis, "compare": Comparison}
-    return {"model": model(), **{name: result(one) for name, one in of.items()}}
+    return {"model": model(), **{name: result(results) for name, results in of.items()}}
 
 
 if __name__ == "__main__":

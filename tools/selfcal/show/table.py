@@ -70,7 +70,7 @@ def _fitting(console: Console, tables: Sequence[Table]) -> Table:
     if not console.is_terminal:
         return tables[0]
     wide = console.options.update(width=10 * TABLE_WIDTH)
-    fitting = (one for one in tables if console.measure(one, options=wide).maximum <= console.width)
+    fitting = (table for table in tables if console.measure(table, options=wide).maximum <= console.width)
     return next(fitting, tables[-1])
 
 
@@ -113,21 +113,21 @@ def _number(spread: Mapping[str, Any], number: Mapping[str, Any], *, brief: bool
 
 def _by_reason(axes: Iterable[tuple[Reason, str]]) -> dict[Reason, str]:
     """The axes that share a reason, in one text. `axes`: each reason with the name of its axis."""
-    found: dict[Reason, list[str]] = {}
+    names_of: dict[Reason, list[str]] = {}
     for reason, name in axes:
-        found.setdefault(reason, []).append(name)
-    return {reason: ", ".join(names) for reason, names in found.items()}
+        names_of.setdefault(reason, []).append(name)
+    return {reason: ", ".join(names) for reason, names in names_of.items()}
 
 
 def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     """Why numbers of the summary are not identified, a line a reason."""
-    found = _by_reason(
+    by_reason = _by_reason(
         ((_NUMBERS[key][0], number["reason"]), name)
         for name, axis in axes.items()
         for key, number in (axis.get("summary") or {}).items()
         if not number["identified"]
     )
-    lines = [f"{what} not identified: {names}: {reason}" for (what, reason), names in found.items()]
+    lines = [f"{what} not identified: {names}: {reason}" for (what, reason), names in by_reason.items()]
     for name, axis in axes.items():
         for parameter, rest_s in axis.get("halved_after_s", {}).items():
             times = f"not even {MOST_REST:g} times this rest halves"
@@ -171,11 +171,11 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
             more = len(outcome["intervals"]) - TIMES_MOST
             return f"{check}, left out: {times}{f' and {more} more' if more > 0 else ''}"
         case "channel":
-            told = f"{outcome['column']} ({outcome['form']}) explains {nats} nats of it"
-            return f"channel: {told}: N, K and the bias include that"
+            text = f"{outcome['column']} ({outcome['form']}) explains {nats} nats of it"
+            return f"channel: {text}: N, K and the bias include that"
         case "turn_on":
-            told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {nats} nats"
-            return f"turn_on: {told}: K includes that"
+            text = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {nats} nats"
+            return f"turn_on: {text}: K includes that"
         case "jump":
             return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {nats} nats: K includes that"
     return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
@@ -261,8 +261,8 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
     for name, axis in axes.items():
         if "more_laws" in axis:
             laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]
-            told = ", ".join(f"{law} {P:.2g}" for law, P in laws)
-            failed.append(f"with the laws of sums.yaml: {name}: {told}")
+            likeliest = ", ".join(f"{law} {P:.2g}" for law, P in laws)
+            failed.append(f"with the laws of sums.yaml: {name}: {likeliest}")
     if any(line.startswith("not adequate") for line in failed):
         there = Path(recording["path"]).exists() or recording.get("paths")
         typed = f"{called()} diagnose {as_typed(recording)}" if there else "selfcal.diagnose() of the same readings"
@@ -273,50 +273,52 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
 
 def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
     """What speaks against the laws: a line an event or source. The statistics of an axis that shows one are its own."""
-    found: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
+    events: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
     named: set[str] = set()
     for name, axis in axes.items():
         for check, outcome in axis["checks"].items():
             if outcome["passed"] or check.startswith(STATISTICS):
                 continue
             named.add(name)
-            known = next((one for one in found if one[0] == check and _one(check, one[2][0], outcome)), None)
+            known = next((event for event in events if event[0] == check and _same(check, event[2][0], outcome)), None)
             if known is None:
-                found.append((check, [name], [outcome]))
+                events.append((check, [name], [outcome]))
             else:
                 known[1].append(name)
                 known[2].append(outcome)
     lines = []
-    for check, names, outcomes in found:
-        values = [f"{one['value']:.0f}" for one in sorted(outcomes, key=lambda one: float(one["value"]))]
+    for check, names, outcomes in events:
+        values = [
+            f"{outcome['value']:.0f}" for outcome in sorted(outcomes, key=lambda outcome: float(outcome["value"]))
+        ]
         nats = values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
-        told = _why(check, outcomes[0], axes[names[0]]["bias_now"]["unit"], nats)
-        lines.append(f"not adequate: {', '.join(names)}: {told}")
+        text = _why(check, outcomes[0], axes[names[0]]["bias_now"]["unit"], nats)
+        lines.append(f"not adequate: {', '.join(names)}: {text}")
     beside = []
     for name, axis in axes.items():
-        failed = {check: one for check, one in axis["checks"].items() if not one["passed"]}
+        failed = {check: outcome for check, outcome in axis["checks"].items() if not outcome["passed"]}
         unit = axis["bias_now"]["unit"]
         # The model's deviation over the recording's, by averaging time.
         off = [
-            (100.0 * one["value"], check.removeprefix("allan_"))
-            for check, one in failed.items()
+            (100.0 * outcome["value"], check.removeprefix("allan_"))
+            for check, outcome in failed.items()
             if check.startswith("allan_")
         ]
         if name in named:
-            most, at = max(off, key=lambda one: abs(one[0]), default=(0.0, ""))
+            most, tau = max(off, key=lambda share: abs(share[0]), default=(0.0, ""))
             if any(check.startswith(STATISTICS) for check in failed):
-                beside.append(name + (f" (allan_{at} model {most:+.0f} %)" if off else ""))
+                beside.append(name + (f" (allan_{tau} model {most:+.0f} %)" if off else ""))
             continue
-        own = [_why(check, one, unit, "") for check, one in failed.items() if not check.startswith("allan_")]
+        own = [_why(check, outcome, unit, "") for check, outcome in failed.items() if not check.startswith("allan_")]
         if off:  # allan_16s model -9 %, 128s +22 %
-            own.append("allan_" + ", ".join(f"{at} {most:+.0f} %" for most, at in off).replace(" ", " model ", 1))
-        lines += [f"not adequate: {name}: {told}" for told in own]
+            own.append("allan_" + ", ".join(f"{tau} {most:+.0f} %" for most, tau in off).replace(" ", " model ", 1))
+        lines += [f"not adequate: {name}: {text}" for text in own]
     if beside:
         lines.append(f"not adequate: statistics of {', '.join(beside)} as well")
     return lines
 
 
-def _one(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether two axes fail a check by one event or source."""
     match check:
         case "jump":
@@ -332,11 +334,11 @@ def _one(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 
 def _ahead(axes: Mapping[str, Any]) -> list[str]:
     """What the module's calibration is worth some time after a report, of `replay`."""
-    told = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
+    known = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
     return [
-        f"corrected output {one['horizon_s']:g} s after a report: {name}: rms error {one['rmse']:.3g} {one['unit']} "
-        f"({one['reports']} reports, means of {one['mean_s']:g} s)"
-        for name, one in told.items()
+        f"corrected output {ahead['horizon_s']:g} s after a report: {name}: rms error {ahead['rmse']:.3g} "
+        f"{ahead['unit']} ({ahead['reports']} reports, means of {ahead['mean_s']:g} s)"
+        for name, ahead in known.items()
     ]
 
 

@@ -56,7 +56,7 @@ def shortened(text: str) -> str:
 @cache
 def _environment() -> Environment:
     made = of_pages(Path(__file__).parent / "templates")
-    made.filters |= {one.__name__: one for one in (number, interval, spaced, shortened, typeset)}
+    made.filters |= {function.__name__: function for function in (number, interval, spaced, shortened, typeset)}
     made.filters["tenth"] = "{:.1f}".format
     made.globals |= {"words": words, "version": selfcal.__version__}
     return made

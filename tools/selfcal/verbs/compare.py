@@ -83,7 +83,7 @@ def compare(
         raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
     check(fail_on, more=(CHANGED,))
     check_options(limits, junit, verdicts)
-    files = [file for one in logs for file in list_of(one)]
+    files = [file for log in logs for file in list_of(log)]
     check_writable(json, report, junit, verdicts, inputs=(*files, model, limits))
     bounds = None if limits is None else Limits.load(limits, Model.load(model))
     seen = []
@@ -93,46 +93,48 @@ def compare(
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
     part |= reading
     names = [
-        str(one if isinstance(one, Path | str) else getattr(one, "path", f"arrays {number}"))
-        for number, one in enumerate(logs, 1)
+        str(log if isinstance(log, Path | str) else getattr(log, "path", f"arrays {number}"))
+        for number, log in enumerate(logs, 1)
     ]
-    for log, place in zip(logs, names, strict=True):
+    for log, path in zip(logs, names, strict=True):
         known = identify(log, suspicion=False, **part)
         identified = known["axes"]
         if bounds is not None:
             add_verdicts(known, bounds, None, None)
-            judged.append(("", place, [Verdict.of(one) for one in known["limits"]]))
+            judged.append(("", path, [Verdict.of(entry) for entry in known["limits"]]))
         diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]
         Held().check()
-        by_log[place] = {
+        by_log[path] = {
             name: verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
         }
         for name, axis in identified.items():
             if axis.get("allan"):
-                curves.setdefault(name, {})[place] = axis["allan"]
+                curves.setdefault(name, {})[path] = axis["allan"]
         seen.append({name: quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
-    compared = {name: Compared() for name in sorted({name for one in by_log.values() for name in one})}
+    compared = {name: Compared() for name in sorted(set().union(*by_log.values()))}
     for (first, before), (second, after) in pairwise(zip(names, seen, strict=True)):
-        for name, one in compared.items():
+        for name, axis in compared.items():
             error = incomparable({log: by_log[log].get(name) for log in (first, second)})
             if error is not None:
-                one.errors += [error] if error not in one.errors else []
+                axis.errors += [error] if error not in axis.errors else []
             elif name in before and name in after:
-                one.pairs += 1
+                axis.pairs += 1
                 rows = changes(before[name], after[name])
-                one.changes += [{"from": first, "to": second, **row} for row in rows]
+                axis.changes += [{"from": first, "to": second, **row} for row in rows]
     document = {
         "schema": SCHEMA,
         "recordings": names,
-        "axes": {name: one.entry() for name, one in compared.items()},
+        "axes": {name: axis.entry() for name, axis in compared.items()},
         "verdicts": by_log,
         "quantities": dict(zip(names, seen, strict=True)),
         "limit_sd": LIMIT,
     }
     if bounds is not None:
-        document["limits"] = [{**one.entry(), "recording": log} for _, log, found in judged for one in found]
+        document["limits"] = [
+            {**judgement.entry(), "recording": log} for _, log, of_log in judged for judgement in of_log
+        ]
         write(judged, junit, verdicts)
-    none = not any(one.pairs for one in compared.values())
+    none = not any(axis.pairs for axis in compared.values())
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
     if report is not None and not none:
@@ -140,8 +142,8 @@ def compare(
 
         write_page(report, document, curves)
     if none:
-        told = "; ".join(f"{name}: {', '.join(one.errors)}" for name, one in compared.items())
-        raise UserError(f"no axis can be compared ({told})")
+        reasons = "; ".join(f"{name}: {', '.join(axis.errors)}" for name, axis in compared.items())
+        raise UserError(f"no axis can be compared ({reasons})")
     return Comparison(document)
 
 

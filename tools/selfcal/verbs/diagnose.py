@@ -126,9 +126,9 @@ def diagnose(
     if on is not None:
         second = load(on, sensors=loaded.sensors, **reading)
     with held() as ending, Doing("diagnose") as doing:
-        record, first, found, errors = _looked(recording, loaded, names, decimate, full_rate, ending, doing)
+        record, first, diagnosed, errors = _looked(recording, loaded, names, decimate, full_rate, ending, doing)
         with work.within(work.Work(lambda: ending.overdue)):
-            if not found:
+            if not diagnosed:
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
@@ -140,34 +140,34 @@ def diagnose(
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
             doing.now("held-out gain")
             sensor = recording.path.name.partition(".")[0] if model is None else None
-            tree, read_out = extended(loaded, record, found, sensor)
-            out = left_out(loaded, found)
+            tree, read_out = extended(loaded, record, diagnosed, sensor)
+            out = left_out(loaded, diagnosed)
             doing.now("what the axes share")
-            shared = shared_by(found, loaded) if not ending.asked else None
+            shared = shared_by(diagnosed, loaded) if not ending.asked else None
             if shared is not None:
                 hidden.extend(tree, shared)
-            document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])
-            quantity = None if shared is None else entry_of(shared, found, recording)
+            document = to_document(recording, diagnosed, errors, tree, first, [finding for _, finding in out])
+            quantity = None if shared is None else entry_of(shared, diagnosed, recording)
             if shared is not None and quantity is not None and second is not None:
                 on_second = of_recording(second, loaded, 1.0 / shared.dt)
                 quantity["gain_on"] = hidden.carried(shared, on_second.axes, events_of(on_second))
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
-                add_carried(document, loaded, tree, record, found, second)
+                add_carried(document, loaded, tree, record, diagnosed, second)
             doing.now("posterior")
             known = add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
-            add_findings(document, recording, found, known, quantity)
+            add_findings(document, recording, diagnosed, known, quantity)
             if write_model is not None:
                 write_text(write_model, as_text(tree, recording.path, read_out))
                 note(f"{write_model}: {read_out}")
                 if out:
-                    told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
-                    note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
+                    causes = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
+                    note(f"{write_model}: a module leaves out {causes}: {NO_ROOM}")
             if report is not None:
                 doing.now("pictures")
                 given = options_given(axes, model, decimate, recording)
-                write_page(report, document, record, found, given)
+                write_page(report, document, record, diagnosed, given)
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
     if json is not None:
@@ -211,21 +211,21 @@ def _looked(
             first = looked_at(means, names, ending, doing)
             show_first(recording, first, [name for name in names if name in record.axes], ending)
     seen = looked_at(record, names, ending, doing, first) if not ending.asked else {}
-    found: dict[str, Diagnosed] = {}
+    diagnosed: dict[str, Diagnosed] = {}
     for name in names:
         only_means = name not in seen and below_lattice(record, name)
-        diagnosed = first.get(name) if only_means else joined(seen.get(name), first.get(name), INTERRUPTED)
-        if diagnosed is not None:
-            found[name] = less_stated(diagnosed, model)
+        axis = first.get(name) if only_means else joined(seen.get(name), first.get(name), INTERRUPTED)
+        if axis is not None:
+            diagnosed[name] = less_stated(axis, model)
     if not ending.asked:
         doing.now("checks")
-        by_identify(found, recording, model)
+        by_identify(diagnosed, recording, model)
     errors = {
         name: seen[name].unfinished if name in seen else why_not(recording, model, record, name)
         for name in names
-        if name not in found
+        if name not in diagnosed
     }
-    return record, first, found, errors
+    return record, first, diagnosed, errors
 
 
 def show(document: Diagnosis, given: Mapping[str, Any]) -> int:

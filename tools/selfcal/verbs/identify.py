@@ -143,7 +143,7 @@ def identify(
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     of_file, loaded_model = loaded_model, for_record(loaded_model, recording, names)
-    found: dict[str, Identified | UserError] = {}
+    identified: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         subsets = sum(len(choices_of(offered(loaded_model, name))) for name in names)
@@ -151,7 +151,7 @@ def identify(
         for name in names:
             progress.update(task, description=f"{name} ({engine})")
             try:
-                found[name] = identify_axis(
+                identified[name] = identify_axis(
                     recording,
                     name,
                     loaded_model,
@@ -161,13 +161,13 @@ def identify(
                     draw=plot is not None,
                 )
             except UserError as error:
-                found[name] = error
-        with_reasons(found, recording, loaded_model)
-        document = to_document(recording, found, all_failed=json if fail_on is not None else None)
+                identified[name] = error
+        with_reasons(identified, recording, loaded_model)
+        document = to_document(recording, identified, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)
         doubtful = [  # motion is left out already: what is left is judged
             name
-            for name, axis in found.items()
+            for name, axis in identified.items()
             if isinstance(axis, Identified) and against(axis.judged.checks).keys() - {"motion"}
         ]
         if doubtful and suspicion:

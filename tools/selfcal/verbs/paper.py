@@ -56,24 +56,24 @@ def paper(
         survey.write_tracks(Path(tracks), areas)
     priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
     rows = section3.ensemble(priors, seeds, seed, scheduler, results)
-    told = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
+    figures = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("Figs 5 to 8", total=5)
         simulated = section4.simulated(seed)
-        told += section4.figures_5_and_6(default, simulated, False, seed)
+        figures += section4.figures_5_and_6(default, simulated, False, seed)
         progress.advance(task)
         real = section4.real(folder, default)
         progress.advance(task)
         if len(real) == len(section4.STRETCHES):
-            told += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED, diagnose)
+            figures += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED, diagnose)
         else:
             missing = sorted({name for name, _ in section4.STRETCHES if not (folder / name).exists()})
             note(
                 f"REAL DATA ABSENT: {', '.join(missing)} not in {folder}: Figs 5 and 6 are of simulated records alone;"
                 " name their folder with --data DIR"
             )
-            told.append(
+            figures.append(
                 Told(
                     "Figs 5, 6, real",
                     (),
@@ -83,17 +83,17 @@ def paper(
                 )
             )
         progress.advance(task)
-        told += section4.figures_7(default, simulated | real, seed)
+        figures += section4.figures_7(default, simulated | real, seed)
         progress.advance(task)
-        told += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
+        figures += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
         progress.advance(task)
-    write_text(output, page(told, records, seed))
-    return told
+    write_text(output, page(figures, records, seed))
+    return figures
 
 
-def show(told: list[Told], given: Mapping[str, Any]) -> int:
+def show(figures: list[Told], given: Mapping[str, Any]) -> int:
     """Print a line a figure."""
     from selfcal.studies.paper import show as table
 
-    table(told, given["output"])
+    table(figures, given["output"])
     return 0

@@ -116,13 +116,17 @@ def replay(
     sent_model, rows = sent(loaded_model, recording, taken) if foreign else (loaded_model, recording)
     on_wire = list(taken.values())
     if target == "host" and transport is None:
-        told, said = run_here(rows, sent_model, on_wire, report_every, gate, known)
+        reports, said = run_here(rows, sent_model, on_wire, report_every, gate, known)
     else:
         firmware = build(sent_model, recording.rate_hz, on_wire, target, start=known)
         how = transport or "slcan"
-        told, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel)
-    history = {name: [replace(one, axis=name) for one in told[at]] for name, at in taken.items() if at in told}
-    why = {name: said[at] for name, at in taken.items() if at in said}
+        reports, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel)
+    history = {
+        name: [replace(report, axis=name) for report in reports[sent_as]]
+        for name, sent_as in taken.items()
+        if sent_as in reports
+    }
+    why = {name: said[sent_as] for name, sent_as in taken.items() if sent_as in said}
     document = document_of(recording, loaded_model, history, why, gate)
     add_sources(document, of_file, loaded_model)
     document["recording"] |= {"start_s": known_s, "since_power_on_s": since_power_on_s}

@@ -61,7 +61,7 @@ def worth(
             span = RESTS_S[0] + HORIZONS_S[-1] + REFERENCE_S
             raise UserError(f"the recordings are too short: {span} s without a gap are needed; record longer")
     else:
-        jobs = [Job(law, rest, one) for law in LAWS for rest in RESTS_S for one in seeds]
+        jobs = [Job(law, rest, record_seed) for law in LAWS for rest in RESTS_S for record_seed in seeds]
         settings = {"schema": SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
         settings["records"] = str(records)  # the jobs' order has it
         rows = spread(

@@ -108,12 +108,12 @@ def write_tables(model: Model, tables: Tables, folder: Path, target: str, start:
 
 def check_forms(model: Model) -> None:
     """Raises UserError for a regressor of a form that no module makes."""
-    for one in model.regressors:
-        if not one.on_module:
-            what = f"form: {one.form}" if one.form == "play" else f"input: {one.input}"
+    for regressor in model.regressors:
+        if not regressor.on_module:
+            what = f"form: {regressor.form}" if regressor.form == "play" else f"input: {regressor.input}"
             raise UserError(
-                f"{model.path}: regressor '{one.name}': no module makes `{what}`: leave the regressor out, or take "
-                "`identify`, which does"
+                f"{model.path}: regressor '{regressor.name}': no module makes `{what}`: leave the regressor out, or "
+                "take `identify`, which does"
             )
 
 
@@ -121,14 +121,14 @@ def sizes(tables: Tables, target: str) -> dict[str, int]:
     """The library's sizes for these tables on a core, by their macros without SELFCAL_ (lib/selfcal.h)."""
     grids = [grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid]
     grid = max(grids, default=LEAST_GRID)
-    one = max(grid, *(h.nodes for h in tables.hypotheses))
+    nodes = max(grid, *(h.nodes for h in tables.hypotheses))
     return {
         "AXES_MAX": len(tables.axes),
         "HYPOTHESES_MAX": len(tables.hypotheses),
         "GRID_MAX": grid,
         "ALPHA_MAX": max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=LEAST_GRID),
-        "HYPOTHESIS_NODES_MAX": one,
-        "NODES_MAX": max(one, tables.nodes),
+        "HYPOTHESIS_NODES_MAX": nodes,
+        "NODES_MAX": max(nodes, tables.nodes),
         "REGRESSORS_MAX": max(1, len(tables.regressors)),
         "TERMS_MAX": 3 if tables.term_nodes else 1,
         "BATCH": 16,

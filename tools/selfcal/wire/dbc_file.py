@@ -94,8 +94,8 @@ def _patterns(text: str) -> tuple[list[str], dict[str, Pattern], str]:
 
     def change(id_: str, name: str, **changes: object) -> None:
         signals = messages[int(id_)].signals
-        at = next(index for index, signal in enumerate(signals) if signal.name == name)
-        signals[at] = replace(signals[at], **changes)  # type: ignore[arg-type]
+        index = next(index for index, signal in enumerate(signals) if signal.name == name)
+        signals[index] = replace(signals[index], **changes)  # type: ignore[arg-type]
 
     for line in text.splitlines():
         if match := re.match(r"BO_ (\d+) (\w+): 8 (\w+)", line):
@@ -141,10 +141,10 @@ def _hypothesis(names: Names, k: int, reading: str) -> Callable[[Signal], Signal
         place, _, statistic = signal.name.partition("_")
         if place not in PLACE_NAMES:
             return signal
-        at = PLACE_NAMES.index(place)
-        if at >= len(names.parameters[k]):
+        index = PLACE_NAMES.index(place)
+        if index >= len(names.parameters[k]):
             return None
-        parameter = names.parameters[k][at]
+        parameter = names.parameters[k][index]
         unit = "" if statistic == "flags" else parameter_unit(parameter, reading)
         comment = signal.comment
         if names.known:
@@ -183,13 +183,13 @@ def symbol(name: str) -> str:
 
 def _different(names: Iterable[str]) -> list[str]:
     """The symbols of names, made different where two are alike."""
-    found: list[str] = []
+    symbols: list[str] = []
     for name in names:
-        one, number = symbol(name), 2
-        while one in found:
-            one, number = f"{symbol(name)[:16]}_{number}", number + 1
-        found.append(one)
-    return found
+        free, number = symbol(name), 2
+        while free in symbols:
+            free, number = f"{symbol(name)[:16]}_{number}", number + 1
+        symbols.append(free)
+    return symbols
 
 
 def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS_UNITS)) -> str:
@@ -211,25 +211,25 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
 
     add("STATUS", offset("STATUS"), "STATUS", same, patterns["STATUS"].comment)
     for axis in axes:
-        at, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
-        add("GX", offset("GX") + at, big, _in_unit(unit), patterns["GX"].comment.replace("gx", axis))
+        index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
+        add("GX", offset("GX") + index, big, _in_unit(unit), patterns["GX"].comment.replace("gx", axis))
     for name in ("CORRECTED", "COMMAND", "ANSWER"):
         add(name, offset(name), name, same, patterns[name].comment)
     small = [name.lower() for name in _different(names.hypotheses)]
     for axis in axes:
-        at, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
+        index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
         if names.columns:
             comment = patterns["GX_COEFFICIENTS"].comment.replace("gx", axis)
             change = _coefficients(names, unit)
-            add("GX_COEFFICIENTS", offset("GX_COEFFICIENTS") + at, f"{big}_COEFFICIENTS", change, comment)
+            add("GX_COEFFICIENTS", offset("GX_COEFFICIENTS") + index, f"{big}_COEFFICIENTS", change, comment)
         comment = patterns["GX_ADEQUACY"].comment.replace("gx", axis)
-        add("GX_ADEQUACY", offset("GX_ADEQUACY") + at, f"{big}_ADEQUACY", same, comment)
+        add("GX_ADEQUACY", offset("GX_ADEQUACY") + index, f"{big}_ADEQUACY", same, comment)
         for k, hypothesis in enumerate(names.hypotheses):
             comment = patterns["GX_H0"].comment.replace("gx", axis)
             comment = comment.replace(
                 "hypothesis 0", f"hypothesis {k}{f', {remark(hypothesis)}' if names.known else ''}"
             )
-            where = offset("GX_H0") + HYPOTHESES * at + k
+            where = offset("GX_H0") + HYPOTHESES * index + k
             add("GX_H0", where, f"{big}_{small[k].upper()}", _hypothesis(names, k, unit), comment)
     return "\n".join(_text([line.replace("MODULE", sender) for line in head], messages, whole, sender))
 

@@ -75,7 +75,7 @@ def names_of(model: Model) -> Names:
     """The model's names of hypotheses, of their parameters by place, and of regressor columns.
 
     Place 0 is N, place 1 the drift parameter, place 2 the bandwidth or ratio."""
-    columns = tuple((column, one.unit) for one in model.regressors for column in one.columns)
+    columns = tuple((column, regressor.unit) for regressor in model.regressors for column in regressor.columns)
     return Names(tuple(model.hypotheses), tuple(model.laws[name].parameters for name in model.hypotheses), columns)
 
 
@@ -104,18 +104,18 @@ REASONS = {
 }
 
 
-def reasons(*told: Mapping[str, float]) -> dict[str, str]:
-    """Why each axis has no calibration to rely on, in the DBC's words; axes without a reason are left out. `told`:
+def reasons(*messages: Mapping[str, float]) -> dict[str, str]:
+    """Why each axis has no calibration to rely on, in the DBC's words; axes without a reason are left out. `messages`:
     status and corrected sample, as far as they came; of two the later one counts."""
-    found: dict[str, str] = {}
+    known: dict[str, str] = {}
     latest = -math.inf
-    for values in told:
+    for values in messages:
         said = {axis: values[f"reason_{axis}"] for axis in AXES if f"reason_{axis}" in values}
         if said and values.get("time_ms", -math.inf) >= latest:
             latest = values.get("time_ms", -math.inf)
             words = {axis: choices(STATUS, f"reason_{axis}").get(int(code), f"{code:g}") for axis, code in said.items()}
-            found = {axis: word for axis, word in words.items() if word != "none"}
-    return found
+            known = {axis: word for axis, word in words.items() if word != "none"}
+    return known
 
 
 def status_text(signal: str, value: float) -> str:
@@ -589,9 +589,9 @@ class Decoder:
         return max(0, self.time_ms - wrapped % 1000 + 1000 * ahead)
 
 
-def _ahead(told: int, known: int, modulus: int) -> int:
-    """How far `told`, modulo `modulus`, lies before or behind what is known, by the shorter way."""
-    return (told - known + modulus // 2) % modulus - modulus // 2
+def _ahead(second: int, known: int, modulus: int) -> int:
+    """How far `second`, modulo `modulus`, lies before or behind what is known, by the shorter way."""
+    return (second - known + modulus // 2) % modulus - modulus // 2
 
 
 @lru_cache(maxsize=1)
@@ -601,7 +601,7 @@ def _starts() -> tuple[int, ...]:
     for kind in _kinds().values():
         if kind.axis == AXES[0]:
             ids = [signal.multiplexer_ids[0] for signal in kind.message.signals if signal.multiplexer_ids]
-            items[kind.part] = 1 + max(one for one in ids if one != _END_ITEM)
+            items[kind.part] = 1 + max(id_ for id_ in ids if id_ != _END_ITEM)
     return tuple(sum(items[before] for before in range(part)) for part in range(_END + 1))
 
 
@@ -679,7 +679,11 @@ class Streams:
     def known(self) -> dict[int, Decoder]:
         """The nodes that are no passing stranger, by number. Until there is one: whatever is heard."""
         heard = dict(sorted(self.decoders.items()))  # the view asks from a thread of its own
-        sure = {node: one for node, one in heard.items() if one.statistics.received >= RESYNC or self._node == node}
+        sure = {
+            node: decoder
+            for node, decoder in heard.items()
+            if decoder.statistics.received >= RESYNC or self._node == node
+        }
         return sure or heard
 
     @property
@@ -688,14 +692,14 @@ class Streams:
         known = self.known
         total = Statistics(**vars(self.strangers))
         for node, decoder in list(self.decoders.items()):
-            one = decoder.statistics
-            total.damaged += one.damaged
-            total.foreign += one.foreign
+            counted = decoder.statistics
+            total.damaged += counted.damaged
+            total.foreign += counted.foreign
             if node in known:
-                total.received, total.lost = total.received + one.received, total.lost + one.lost
-                total.refused += one.refused
+                total.received, total.lost = total.received + counted.received, total.lost + counted.lost
+                total.refused += counted.refused
             else:
-                total.refused += one.refused + one.received
+                total.refused += counted.refused + counted.received
         return total
 
 
@@ -876,10 +880,10 @@ def serial_ports() -> str:
     """The machine's serial ports, in words."""
     from serial.tools.list_ports import comports
 
-    found = sorted(port.device for port in comports())
-    if not found:
+    ports = sorted(port.device for port in comports())
+    if not ports:
         return "this machine has none: is the module plugged in?"
-    return f"there are {', '.join(found[:8])}{' and more' if len(found) > 8 else ''}"
+    return f"there are {', '.join(ports[:8])}{' and more' if len(ports) > 8 else ''}"
 
 
 def _can_devices() -> str:

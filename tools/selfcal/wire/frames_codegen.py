@@ -111,8 +111,8 @@ def fields(message: Message) -> list[Field]:
         signal = message.get_signal_by_name(name)
         if (signal.start, signal.length) != bits or signal.is_signed or signal.byte_order != "little_endian":
             raise UserError(f"selfcal.dbc: {message.name}.{name}: must be bits {bits[0]} to {sum(bits) - 1}, unsigned")
-    found = [_field(message, signal) for signal in message.signals if signal.name not in COMMON]
-    return sorted(found, key=lambda field: (field.item, field.start))
+    members = [_field(message, signal) for signal in message.signals if signal.name not in COMMON]
+    return sorted(members, key=lambda field: (field.item, field.start))
 
 
 def _shape(field: Field) -> tuple[object, ...]:
@@ -131,12 +131,12 @@ def check(database: Database) -> None:
     if columns != list(range(3 * COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
     suffixes = [*OF_AXIS, *(f"_H{k}" for k in range(1, HYPOTHESES))]
-    for place, axis in enumerate(AXES):
+    for index, axis in enumerate(AXES):
         for suffix in suffixes:
             pattern = _first(database, "_H0" if suffix.startswith("_H") else suffix)
             message = database.get_message_by_name(axis.upper() + suffix)
             k = int(suffix[2:]) if suffix.startswith("_H") else None
-            if message.frame_id != pattern.frame_id + (place if k is None else HYPOTHESES * place + k):
+            if message.frame_id != pattern.frame_id + (index if k is None else HYPOTHESES * index + k):
                 raise UserError(f"selfcal.dbc: {message.name}: identifier {message.frame_id:#x} is out of line")
             mine = fields(message)
             if [_shape(field) for field in mine] != [_shape(field) for field in fields(pattern)]:

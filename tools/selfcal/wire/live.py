@@ -286,8 +286,8 @@ class View:
             done = round(min(1.0, (first.now() if first else 0.0) / self._total_s) * (width // 2))
             parts.append(Text.assemble(("━" * done, "green"), ("━" * (width // 2 - done), "dim")))
         height = None if whole else self._console.height - len(parts) - (len(modules) > 1)
-        for place, (node, module) in enumerate(modules.items()):
-            share = None if height is None else height // (len(modules) - place)
+        for row, (node, module) in enumerate(modules.items()):
+            share = None if height is None else height // (len(modules) - row)
             lines = [_line(self._title_of(f"node {node}", module))] if numbered else []
             lines += self._lines(module, width, None if share is None else share - len(lines))
             height = None if height is None else height - len(lines)
@@ -333,7 +333,7 @@ class View:
             return f"{trouble}: see port/README.md"
         why = {axis: word for axis, word in module.reasons.items() if axis in shown}
         word = next((word for word in URGENT if word in why.values()), next(iter(why.values()), ""))
-        names = ", ".join(axis for axis, one in why.items() if one == word)
+        names = ", ".join(axis for axis, reason in why.items() if reason == word)
         return f"{names}: {REASONS.get(word, word)}" if word else ""
 
     def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
@@ -363,8 +363,15 @@ class View:
     @staticmethod
     def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
         """What the record cannot tell yet."""
-        told = [report.adequacy for report, _ in last.values()]
-        moved = max((one.temperature_moved for one in told if one and one.temperature_moved is not None), default=None)
+        judgements = [report.adequacy for report, _ in last.values()]
+        moved = max(
+            (
+                judgement.temperature_moved
+                for judgement in judgements
+                if judgement and judgement.temperature_moved is not None
+            ),
+            default=None,
+        )
         if moved is None or moved >= TEMPERATURE_NEEDED:
             return []
         said = f"temperature has moved {moved:.1f} of the {TEMPERATURE_NEEDED:g} degC that a temperature law needs"

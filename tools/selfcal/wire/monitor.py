@@ -91,7 +91,7 @@ class Run:
                 frame, reports = heard
                 if self.writer is not None:
                     self.writer.write(frame)
-                if self.streams.known and all(one.surely_foreign for one in self.streams.known.values()):
+                if self.streams.known and all(decoder.surely_foreign for decoder in self.streams.known.values()):
                     return
                 view.show(reports)
                 self.came_s = time.time() if self.contact is not None else frame.timestamp
@@ -152,7 +152,9 @@ class Run:
             if node in known and history
         }
         if needed and not reported:
-            why = {a: word for one in known.values() for a, word in reasons(one.status, one.corrected).items()}
+            why = {
+                a: word for decoder in known.values() for a, word in reasons(decoder.status, decoder.corrected).items()
+            }
             said = "".join(f"; {axis}: {REASONS.get(word, word)}" for axis, word in why.items())
             raise UserError(f"{self.name}: no complete report came, so there is nothing to write{said}")
         return reported
@@ -170,7 +172,7 @@ class Run:
         }
         if len(documents) == 1:
             return next(iter(documents.values()))
-        return {"schema": MODULES, "modules": {str(node): one for node, one in documents.items()}}
+        return {"schema": MODULES, "modules": {str(node): entry for node, entry in documents.items()}}
 
     def farewell(self) -> list[str]:
         """What went wrong at the end, if anything did."""
@@ -219,11 +221,11 @@ def document(
         samples=int(status["samples"]) if "samples" in status else None,
         duration_s=max(reports[-1].time_s for reports in history.values()),
     )
-    found = {
+    identified = {
         axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(names), Judged({}, None), {})
         for axis, reports in history.items()
     }
-    document = to_document(run, found)
+    document = to_document(run, identified)
     document["node"] = node
     for axis, entry in document["axes"].items():
         report = history[axis][-1]
@@ -232,8 +234,8 @@ def document(
         entry["adequacy"] = asdict(says) if says is not None else None
         entry["time_s"], entry["averages"] = report.time_s, int(report.value("count"))
         entry["module_reason"] = why.get(axis)
-        told = report.coefficients(names)
-        if told:
+        coefficients = report.coefficients(names)
+        if coefficients:
             units = dict(names.columns)
             entry["coefficients"] = {
                 column: {
@@ -242,6 +244,6 @@ def document(
                     "probability": probability,
                     "unit": f"{axis_unit(axis)}/{units[column]}" if units[column] else None,
                 }
-                for column, (mean, sd, probability) in told.items()
+                for column, (mean, sd, probability) in coefficients.items()
             }
     return document
