@@ -53,9 +53,9 @@ def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[J
                 open_.setdefault(unit.device, []).extend(lines)
     broken = {unit.source.path for unit in batch if unit.error is not None}  # listed with their errors
     for device, path, verdicts in judged:
-        for one in verdicts:
-            if one.verdict != PASS and path not in broken:
-                (failed if one.verdict == FAIL else open_).setdefault(device, []).append(one.words)
+        for verdict in verdicts:
+            if verdict.verdict != PASS and path not in broken:
+                (failed if verdict.verdict == FAIL else open_).setdefault(device, []).append(verdict.words)
     devices = dict.fromkeys(unit.device for unit in batch)
     return {
         "schema": SCHEMA,
@@ -64,9 +64,9 @@ def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[J
         "failed": failed,
         "not_judged": {device: list(dict.fromkeys(lines)) for device, lines in open_.items()},
         "limits": [
-            {"device": device, "recording": path, **one.entry()}
+            {"device": device, "recording": path, **verdict.entry()}
             for device, path, verdicts in judged
-            for one in verdicts
+            for verdict in verdicts
         ],
         "code": 1 if failed else 2 if open_ else 0,
     }
@@ -78,9 +78,9 @@ def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
     diagnosis = unit.record.get("diagnosis", {})
     for name, axis in unit.axes.items():
         if "error" not in axis:
-            found = outcome({"axes": {name: diagnosis.get(name, axis)}}, fail_on)
-            shown += [name] if found.code == 1 else []
-            lines += found.lines
+            judged = outcome({"axes": {name: diagnosis.get(name, axis)}}, fail_on)
+            shown += [name] if judged.code == 1 else []
+            lines += judged.lines
     return shown, lines
 
 

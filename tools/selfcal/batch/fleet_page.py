@@ -55,7 +55,9 @@ def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) ->
         "groups": list(group_lines(batch)),
         "populations": [_row(population) for population in batch.populations],
         "unidentified": list(unidentified_lines(batch)),
-        "distributions": _drawn(_histogram(one, _limits(document, one.measured.name)) for one in histograms),
+        "distributions": _drawn(
+            _histogram(population, _limits(document, population.measured.name)) for population in histograms
+        ),
         "charts": _control(batch),
         "devices": len(batch.devices),
         "marked": marked,
@@ -102,19 +104,19 @@ def _histogram(population: Population, limits: Sequence[tuple[float, str]]) -> F
     bins = int(np.clip(2.0 * y.size ** (1.0 / 3.0), 8, 60))
     edges = np.linspace(float(y.min()) - 0.02 * reach, float(y.max()) + 0.02 * reach, bins + 1)
     counts = np.histogram(y, edges)[0].astype(np.float64)
-    at, middle, spread = 0.5 * (edges[1:] + edges[:-1]), population.fit.middle.median, population.fit.spread.median
+    centre, middle, spread = 0.5 * (edges[1:] + edges[:-1]), population.fit.middle.median, population.fit.spread.median
     sd = np.sqrt(spread**2 + float(np.median(measured.s)) ** 2)
     expected = (
-        y.size * (edges[1] - edges[0]) / (sd * math.sqrt(2.0 * math.pi)) * np.exp(-0.5 * ((at - middle) / sd) ** 2)
+        y.size * (edges[1] - edges[0]) / (sd * math.sqrt(2.0 * math.pi)) * np.exp(-0.5 * ((centre - middle) / sd) ** 2)
     )
-    x = np.exp(at) if measured.logarithm else at
+    x = np.exp(centre) if measured.logarithm else centre
     panel = Panel(
         measured.name,
         unit_module.typeset(measured.unit),
         "units",
         [Curve("units", x, counts), Curve("population with the records' errors", x, expected, "fitted")],
         log_x=measured.logarithm,
-        marks=[one for one in marks if one > 0.0 or not measured.logarithm],
+        marks=[mark for mark in marks if mark > 0.0 or not measured.logarithm],
         stairs=True,
         marked="data sheet's limit",
     )
@@ -124,14 +126,15 @@ def _histogram(population: Population, limits: Sequence[tuple[float, str]]) -> F
 def _control(batch: Batch) -> Markup | None:
     """Control charts of N and of the bias in the order of the dates: individuals and moving ranges. None: no dates."""
     when = [units[-1].recorded_at for units in batch.devices.values()]
-    charts = [one for one in batch.populations if one.measured.name.endswith((".N", ".bias"))]
-    if len({one[:10] for one in when if one}) < 2 or not charts:
+    charts = [population for population in batch.populations if population.measured.name.endswith((".N", ".bias"))]
+    if len({date[:10] for date in when if date}) < 2 or not charts:
         return None
     figures: list[Figure] = []
-    for one in charts[:MOST_PICTURES]:
-        measured = one.measured
+    for chart in charts[:MOST_PICTURES]:
+        measured = chart.measured
         order = sorted(
-            (k for k, at in enumerate(measured.at.tolist()) if when[at]), key=lambda k: when[int(measured.at[k])]
+            (k for k, device in enumerate(measured.at.tolist()) if when[device]),
+            key=lambda k: when[int(measured.at[k])],
         )
         if len(order) >= 3:
             y = np.asarray(np.exp(measured.y[order]) if measured.logarithm else measured.y[order], np.float64)

@@ -106,16 +106,16 @@ def own_pages(
 
     A page that is there of the same recording and options is not made anew. Returns where each is from the folder
     above."""
-    place = Path(folder)
-    place.mkdir(exist_ok=True)
+    pages = Path(folder)
+    pages.mkdir(exist_ok=True)
     jobs = {}
     for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_PAGES]:
         source = devices[name][-1].source
         known = keeper.place((source.path, source.content)).stem[:12]
-        jobs[name] = (str(Path(source.path).absolute()), str(place / f"{_UNSAFE.sub('_', name)[:60]}-{known}.html"))
+        jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{known}.html"))
     todo = [job for job in jobs.values() if not Path(job[1]).exists()]
     spread(partial(_paged, verbs, options), todo, settings={}, piece=1, count=count, lost=lambda _: [{}], verb="pages")
-    return {name: f"{place.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
+    return {name: f"{pages.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
 
 
 def _paged(verbs: Verbs, options: Options, job: Job) -> list[Row]:
@@ -136,9 +136,9 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     if "error" in axis:
         return {}
     checks = axis["checks"]
-    failed = {name: one for name, one in checks.items() if not one["passed"]}
+    failed = {name: check for name, check in checks.items() if not check["passed"]}
     marks = [name for name in failed if name in READINGS]
-    marks += [name for name, one in failed.items() if name in INNOVATIONS and _far(one)]
+    marks += [name for name, check in failed.items() if name in INNOVATIONS and _far(check)]
     lattice = checks.get("lattice", {})
     known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= LEAST_DISTINCT else {}
     return {"marks": list(dict.fromkeys(marks)), **known}

@@ -98,21 +98,21 @@ def spread(
     if count is not None and count < 1:
         raise UserError("--workers must be at least 1")
     store: Keeper | None = Store(Path(results), settings) if isinstance(results, Path | str) else results
-    pieces = [list(jobs[at : at + piece]) for at in range(0, len(jobs), piece)]
+    pieces = [list(jobs[start : start + piece]) for start in range(0, len(jobs), piece)]
     each = [1.0] * len(jobs) if weights is None else list(weights)
-    found: dict[int, list[Row]] = {}
+    finished: dict[int, list[Row]] = {}
     if store is not None:
-        found = {k: rows for k, work in enumerate(pieces) if (rows := store.read(k, work)) is not None}
-    waiting = [(k, work) for k, work in enumerate(pieces) if k not in found]
+        finished = {k: rows for k, work in enumerate(pieces) if (rows := store.read(k, work)) is not None}
+    waiting = [(k, work) for k, work in enumerate(pieces) if k not in finished]
     with _Remaining(verb, [sum(each[k * piece : (k + 1) * piece]) for k in range(len(pieces))], pieces) as remaining:
-        remaining.done(found)
+        remaining.done(finished)
         done = _cluster(function, waiting, scheduler, lost) if scheduler else _here(function, waiting, count, lost)
         for k, rows in done:
-            found[k] = rows
+            finished[k] = rows
             if store is not None:
                 store.write(k, pieces[k], rows)
             remaining.advance(k)
-    return [row for k in range(len(pieces)) for row in found[k]]
+    return [row for k in range(len(pieces)) for row in finished[k]]
 
 
 class _Remaining:
@@ -314,16 +314,16 @@ class Store:
         """The rows of piece `k`, None if it is absent or was of fewer jobs. Raises UserError for other settings."""
         from pyarrow import ArrowException, parquet
 
-        place = self.place(k)
-        if not place.exists():
+        path = self.place(k)
+        if not path.exists():
             return None
         try:
-            table = parquet.read_table(place)
+            table = parquet.read_table(path)
         except (ArrowException, OSError) as error:
-            raise UserError(f"{place}: cannot be read ({first_line(error)}): delete it to have it made anew") from error
+            raise UserError(f"{path}: cannot be read ({first_line(error)}): delete it to have it made anew") from error
         made = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
         if made.get("selfcal.settings") != self.key:
-            raise UserError(f"{place}: is of other settings: give --results another folder")
+            raise UserError(f"{path}: is of other settings: give --results another folder")
         if made.get("selfcal.jobs") != str(len(jobs)) or "selfcal.keys" not in made:
             return None
         keys = json.loads(made["selfcal.keys"])

@@ -51,8 +51,8 @@ class Unit:
 
     def causes(self, axis: str) -> list[str]:
         """The causes that `diagnose` finds on an axis."""
-        found: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get("causes", [])
-        return found
+        causes: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get("causes", [])
+        return causes
 
     def small(self, axis: str) -> set[str]:
         """Those of them that change no number by as much as matters."""
@@ -92,7 +92,9 @@ def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
         unjudged = unit.record.get("diagnosis", {}).get(name, {}).get("error")
         known |= {} if unjudged is None else {"error": f"not diagnosed: {unjudged}"}
         coefficients = {
-            column: one for of in axis.get("regressors", {}).values() for column, one in of["coefficients"].items()
+            column: coefficient
+            for of in axis.get("regressors", {}).values()
+            for column, coefficient in of["coefficients"].items()
         }
         for parameter, estimate in {**axis["parameters"][law], **coefficients, "bias": bias_of(axis)}.items():
             numbers = {key: estimate[key] for key in ("median", "q05", "q95")}

@@ -45,8 +45,8 @@ def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) ->
     block = min(BLOCK, bank_block(model.sensor_rate_hz, model.bank_rate_hz))
     rate_hz = block * model.bank_rate_hz
     tables = make_tables(model, rate_hz, (axis,))
-    place = list(model.hypotheses).index(law)
-    rng = np.random.default_rng([seed, place])
+    index = list(model.hypotheses).index(law)
+    rng = np.random.default_rng([seed, index])
     truth = draw(model.group_of(axis), law, rng)
     drawn = 1
     while not has_nodes(model.laws[law], truth, tables):

@@ -132,8 +132,8 @@ class Part:
     @classmethod
     def of(cls, law: str, seeds: Sequence[int], *, noise: float = 1.0) -> Part:
         """Parts of a law; `noise` scales every error there is."""
-        found = [_part(law, seed, noise) for seed in seeds]
-        return cls(**{name: np.stack([one[name] for one in found]) for name in found[0]})
+        parts = [_part(law, seed, noise) for seed in seeds]
+        return cls(**{name: np.stack([part[name] for part in parts]) for name in parts[0]})
 
 
 def _part(law: str, seed: int, noise: float) -> dict[str, Any]:
@@ -283,8 +283,8 @@ def cross(v: Floats) -> Floats:
 
 def nees(errors: Floats, covariance: Floats) -> Floats:
     """Normalised estimation error squared, [filters]: of a filter that is consistent, chi-squared of JUDGED degrees."""
-    found: Floats = np.einsum("bi,bi->b", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
-    return found
+    squares: Floats = np.einsum("bi,bi->b", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
+    return squares
 
 
 def true_noise(law: str) -> list[Mapping[str, float]]:

@@ -26,7 +26,7 @@ MOST_CAUSES = 5
 EXPLAINED = "adis16405_run1.npz"
 
 
-def with_reason(told: Sequence[Told], log: Path, diagnose: Callable[..., Mapping[str, Any]]) -> list[Told]:
+def with_reason(figures: Sequence[Told], log: Path, diagnose: Callable[..., Mapping[str, Any]]) -> list[Told]:
     """The figures of the real records, Fig. 5 with what the diagnosis finds in one of them."""
     entry = diagnose(log, axes=[section4.AXIS], decimate=1.0)["axes"][section4.AXIS]
     causes = [
@@ -38,24 +38,27 @@ def with_reason(told: Sequence[Told], log: Path, diagnose: Callable[..., Mapping
         f"The diagnosis of {log.name}, {section4.AXIS}, finds in 1 s means "
         f"{', '.join(causes[:MOST_CAUSES]) or 'nothing'}{more}, and neither law has these."
     )
-    return [replace(one, why=why) if one.verdict == "differs" and one.name == "Fig. 5, real" else one for one in told]
+    return [
+        replace(figure, why=why) if figure.verdict == "differs" and figure.name == "Fig. 5, real" else figure
+        for figure in figures
+    ]
 
 
-def page(told: Sequence[Told], records: int, seed: int) -> str:
+def page(figures: Sequence[Told], records: int, seed: int) -> str:
     """One self-contained page: a table of all figures, then each with its pictures."""
-    pictures = [[one.figures] if isinstance(one.figures, Figure) else one.figures for one in told]
-    drawn = [[draw(figure) for figure in figures] for figures in pictures]
-    return str(render("paper.html", figures=list(zip(told, drawn, strict=True)), records=records, seed=seed))
+    pictures = [[figure.figures] if isinstance(figure.figures, Figure) else figure.figures for figure in figures]
+    drawn = [[draw(picture) for picture in own] for own in pictures]
+    return str(render("paper.html", figures=list(zip(figures, drawn, strict=True)), records=records, seed=seed))
 
 
-def show(told: Sequence[Told], output: Path | str) -> None:
+def show(figures: Sequence[Told], output: Path | str) -> None:
     """A line a figure, and the place of the page."""
     console = console_of()
     table = Table(box=box.SIMPLE_HEAD)
     for heading in ("figure", "here", ""):
         table.add_column(heading)
-    for one in told:
-        table.add_row(one.name, one.here, one.verdict)
+    for figure in figures:
+        table.add_row(figure.name, figure.here, figure.verdict)
     console.width = max(console.width, 100)
     console.print(table)
     console.print(printable(f"page: {output}"), highlight=False, markup=False, soft_wrap=True)

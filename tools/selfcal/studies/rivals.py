@@ -78,7 +78,7 @@ def of_recording(
     recording = load(log, sensors=loaded.sensors, **reading)
     names = chosen_axes(recording, loaded, axes)
     loaded = for_record(loaded, recording, names)
-    found: dict[str, Any] = {}
+    answers: dict[str, Any] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("rivals", total=len(names) * len(chosen))
@@ -89,13 +89,13 @@ def of_recording(
                 progress.update(task, description=f"{name}: {rival.title}")
                 entries[rival.name] = measured(rival, problem, recording.columns[name].unit)
                 progress.advance(task)
-            found[name] = {
+            answers[name] = {
                 "samples": int(problem.y.size),
                 "samples_left_out": left_out,
                 "interval_s": problem.dt_s,
                 "rivals": entries,
             }
-    document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": found}
+    document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": answers}
     if json is not None:
         write_json(document, json)
     return document
@@ -196,8 +196,8 @@ def problem_of(recording: Recording, name: str, model: Model, decimate: float | 
             f"{recording.path}: {name}: {y.size} averages of {tables.dt_s:g} s without a gap are too few, "
             f"{FEWEST} are needed: record longer, or give --decimate HZ"
         )
-    one = replace(group, axes=(name,))
-    return Problem(y, tables.dt_s, one, laws), int(np.isfinite(mean).sum()) - y.size
+    alone = replace(group, axes=(name,))
+    return Problem(y, tables.dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
 
 
 def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -214,10 +214,10 @@ def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
         return {"title": rival.title, "error": rival.missing}
     try:
         with workers(1) as pool:
-            found = pool.submit(_alone, rival, problem, unit).result()
+            answer = pool.submit(_alone, rival, problem, unit).result()
     except BrokenProcessPool:
-        found = {"error": "it ended without an answer"}
-    return {"title": rival.title, **found}
+        answer = {"error": "it ended without an answer"}
+    return {"title": rival.title, **answer}
 
 
 def _alone(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:

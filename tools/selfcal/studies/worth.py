@@ -66,7 +66,7 @@ def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], 
 
     bank = Bank(make_tables(model, 1.0, (axis,), bank_rate_hz=1.0))
     bank.push(y[:, None])
-    told = np.array(bank.raw.predict(0, [float(s) for s in SECONDS]))
+    predicted = np.array(bank.raw.predict(0, [float(s) for s in SECONDS]))
     level: dict[str, Callable[[Group, Floats], float]] = {
         "last": lambda _, seen: float(seen[-LAST_S:].mean()),
         "rest": lambda _, seen: float(seen.mean()),
@@ -75,8 +75,8 @@ def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], 
         "none": lambda _, __: 0.0,
     }
     group = model.group_of(axis)
-    found = {name: np.full(len(SECONDS), method(group, y)) for name, method in level.items()}
-    return {"bank": told[:, 0], **found}, told[:, 1]
+    levels = {name: np.full(len(SECONDS), method(group, y)) for name, method in level.items()}
+    return {"bank": predicted[:, 0], **levels}, predicted[:, 1]
 
 
 def heading_error(rate: Floats) -> float:
@@ -128,8 +128,8 @@ class After:
 
     def errors(self, unit: str) -> dict[str, Floats]:
         """Of the minute's corrected readings, by method."""
-        found = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
-        return {name: convert(error, self.unit, unit) for name, error in found.items()}
+        errors = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
+        return {name: convert(error, self.unit, unit) for name, error in errors.items()}
 
     def row(self, case: str, rest: int, truth: Floats) -> Row:
         """Errors of the bias, `truth` at HORIZONS_S."""
@@ -160,8 +160,8 @@ def simulated(model: Model, job: Job) -> list[Row]:
         y, truth[axis] = simulate(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)
         noise[axis] = (y - truth[axis])[job.rest_s :][:RECKONED_S]
         after[axis] = After.of(model, axis, convert(y, AXES[axis], model.group_of(axis).unit), job.rest_s)
-    at = [job.rest_s - 1 + h for h in HORIZONS_S]
-    row = after["gx"].row(job.law, job.rest_s, convert(truth["gx"][at], AXES["gx"], after["gx"].unit))
+    samples = [job.rest_s - 1 + h for h in HORIZONS_S]
+    row = after["gx"].row(job.law, job.rest_s, convert(truth["gx"][samples], AXES["gx"], after["gx"].unit))
     row |= _heading(after["gx"]) | _position(after["gx"], after["ax"])
     row[f"heading_deg.{KNOWN}"] = heading_error(noise["gx"])
     row[f"position_m.{KNOWN}"] = position_error(noise["gx"], noise["ax"])
@@ -192,19 +192,19 @@ def recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
     for name, mean in means.items():
         across = means.get(ACROSS.get(name, ""))
         both = mean if across is None else mean + across
-        at = longest_stretch(np.where(np.isfinite(both), np.arange(both.size), np.nan)).astype(int)
+        stretch = longest_stretch(np.where(np.isfinite(both), np.arange(both.size), np.nan)).astype(int)
         gyro = same_kind(model.group_of(name).unit, "rad/s")
         for rest in RESTS_S:
             span = rest + HORIZONS_S[-1] + REFERENCE_S
-            for start in range(0, at.size - span + 1, span):
-                piece = mean[at[start : start + span]]
+            for start in range(0, stretch.size - span + 1, span):
+                piece = mean[stretch[start : start + span]]
                 after = After.of(model, name, piece, rest)
                 truth = np.array([piece[rest + h - 1 : rest + h - 1 + REFERENCE_S].mean() for h in HORIZONS_S])
                 row = after.row(f"recorded {'gyros' if gyro else 'accelerometers'}", rest, truth)
                 if gyro:
                     row |= _heading(after)
                 elif across is not None:
-                    turning = After.of(model, ACROSS[name], across[at[start : start + span]], rest)
+                    turning = After.of(model, ACROSS[name], across[stretch[start : start + span]], rest)
                     row |= _position(turning, after)
                 rows.append(row)
     return rows
@@ -212,7 +212,7 @@ def recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
 
 def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """The document: rms errors by case and length of the rest."""
-    found = []
+    entries = []
     for case, rest in dict.fromkeys((row["case"], row["rest_s"]) for row in rows):
         mine = [row for row in rows if (row["case"], row["rest_s"]) == (case, rest)]
         entry: dict[str, Any] = {"case": case, "unit": mine[0]["unit"], "rest_s": rest, "rests": len(mine)}
@@ -223,8 +223,8 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
             for key in RECKONED
             if (having := [row for row in mine if f"{key}.bank" in row])
         }
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -236,12 +236,12 @@ def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
             groups["bias"].append({name: entry["rms_error"][name][horizon] for name in TITLES})
         for key, errors in entry["dead_reckoning"].items():
             groups[key].append({name: errors[name] for name in TITLES})
-    found: dict[str, dict[str, Any]] = {}
+    worst: dict[str, dict[str, Any]] = {}
     for name in TITLES:
         ratios = {key: [one[name] / min(one.values()) for one in group] for key, group in groups.items() if group}
-        told = {key: {"worst": max(all_), "median": float(np.median(all_))} for key, all_ in ratios.items()}
-        found[name] = {**told.pop("bias"), **told}
-    return found
+        spread = {key: {"worst": max(all_), "median": float(np.median(all_))} for key, all_ in ratios.items()}
+        worst[name] = {**spread.pop("bias"), **spread}
+    return worst
 
 
 def _rms(rows: Sequence[Row], key: str) -> float:

@@ -32,8 +32,8 @@ def grid(problem: Problem) -> Answer:
         weight /= weight.sum()
         estimates[law] = {}
         for name, ln_value in zip(NAMED[law].parameters, at, strict=True):
-            values, place = np.unique(ln_value, return_inverse=True)
-            mass = np.bincount(place, weight)
+            values, index = np.unique(ln_value, return_inverse=True)
+            mass = np.bincount(index, weight)
             low, high = np.interp([0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)
             estimates[law][name] = Value(math.exp(float(weight @ ln_value)), math.exp(low), math.exp(high))
     return Answer(estimates, probabilities(ln_evidence))

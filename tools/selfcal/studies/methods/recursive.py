@@ -23,13 +23,13 @@ STABLE = 0.99
 
 def recursive_least_squares(problem: Problem) -> Answer:
     """Estimates without an interval, as for `arma`. The method gives no weights of laws."""
-    found = {}
+    by_law = {}
     for law in problem.drifts:
         y = np.diff(problem.y) if law == "random_walk" else problem.y - problem.y.mean()
         scale = float(y.std()) or 1.0
         phi, theta, variance = coefficients(y / scale, pole=law != "random_walk")
-        found[law] = of_coefficients(law, phi, theta, variance * scale**2, problem.dt_s)
-    return Answer(found)
+        by_law[law] = of_coefficients(law, phi, theta, variance * scale**2, problem.dt_s)
+    return Answer(by_law)
 
 
 def coefficients(y: Floats, *, pole: bool) -> tuple[float, float, float]:

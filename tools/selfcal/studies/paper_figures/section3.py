@@ -52,12 +52,12 @@ def over_time(model: Model, axis: str, dt_s: float, y: Floats, marks: Sequence[i
 
     rate = 1.0 / dt_s
     bank = Bank(make_tables(model, rate, (axis,), bank_rate_hz=rate))
-    found, at = [], 0
+    reports, begin = [], 0
     for mark in marks:
-        bank.push(y[at:mark, None])
-        found.append(bank.report(0))
-        at = mark
-    return found
+        bank.push(y[begin:mark, None])
+        reports.append(bank.report(0))
+        begin = mark
+    return reports
 
 
 def own_seed(law: str, seed: int) -> int:
@@ -113,8 +113,8 @@ def figure_1(rows: Sequence[Row]) -> Told:
     )
     worst = float(np.max(np.abs(actual - calculated) / sd))
     below = (calculated < BELOW) & (actual < BELOW)
-    at = t[np.logical_and.accumulate(below[::-1])[::-1]]  # and stay there
-    here = f"both below 10 % from {at[0]:g} s on" if at.size else "not below 10 %"
+    below_s = t[np.logical_and.accumulate(below[::-1])[::-1]]  # and stay there
+    here = f"both below 10 % from {below_s[0]:g} s on" if below_s.size else "not below 10 %"
     some = [times.index(mark) for mark in (0, 100, 200, 300, 400, 600, TEXT_S)]
     return Told(
         "Fig. 1",
@@ -140,8 +140,8 @@ def figure_2(rows: Sequence[Row]) -> Told:
     mine = [[row for row in rows if row["t"] == mark and row["law"] == SECOND] for mark in times]
     panels, worst = [], 0.0
     for name, label in NAMES.items():
-        error = np.array([[row[f"mean.{name}"] - row[f"truth.{name}"] for row in at] for at in mine])
-        stated = np.array([[row[f"sd.{name}"] for row in at] for at in mine])
+        error = np.array([[row[f"mean.{name}"] - row[f"truth.{name}"] for row in rows_of] for rows_of in mine])
+        stated = np.array([[row[f"sd.{name}"] for row in rows_of] for rows_of in mine])
         real, calculated = np.sqrt((error**2).mean(axis=1)), np.sqrt((stated**2).mean(axis=1))
         sd = (error**2).std(axis=1) / math.sqrt(error.shape[1])  # of the mean square
         worst = max(worst, float(np.max(np.abs(real**2 - calculated**2) / sd)))

@@ -106,24 +106,26 @@ def _rms(values: Sequence[Sequence[float]], stated: Sequence[Sequence[float]], t
 def by_bank(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
     """Errors of the bank by (law that it filters for, parameter that the truth has), on an ensemble of `law`."""
     seen = [over_time(model, AXIS, 1.0, y, ALLAN_MARKS) for y in _drawn(law, TRUTHS[law], seed, SCATTER)]
-    found = {}
+    by_law = {}
     for filtered in model.hypotheses:
         for name, true in _compared(law, TRUTHS[law], filtered).items():
-            estimates = [[one.parameters[filtered][name] for one in reports] for reports in seen]
+            estimates = [[report.parameters[filtered][name] for report in reports] for reports in seen]
             medians, stated = ([[getattr(e, key) for e in row] for row in estimates] for key in ("median", "ln_sd"))
-            found[filtered, name] = _rms(medians, stated, true)
-    return found
+            by_law[filtered, name] = _rms(medians, stated, true)
+    return by_law
 
 
 def linear(model: Model, truth: Mapping[str, float], seed: int) -> dict[str, Rms]:
     """Real (16) and computed (17) rms errors of the walk's parameters, in their units, on an ensemble of `truth`."""
     drawn = _drawn("random_walk", truth, seed, SCATTER)
     seen = [[r.parameters["random_walk"] for r in over_time(model, AXIS, 1.0, y, ALLAN_MARKS)] for y in drawn]
-    found = {}
+    shares = {}
     for name, true in truth.items():
-        mean, sd = (np.array([[getattr(one[name], key) for one in row] for row in seen]) for key in ("mean", "sd"))
-        found[name] = Rms(np.sqrt(((mean - true) ** 2).mean(axis=0)), np.sqrt((sd**2).mean(axis=0)))
-    return found
+        mean, sd = (
+            np.array([[getattr(report[name], key) for report in row] for row in seen]) for key in ("mean", "sd")
+        )
+        shares[name] = Rms(np.sqrt(((mean - true) ** 2).mean(axis=0)), np.sqrt((sd**2).mean(axis=0)))
+    return shares
 
 
 def by_allan(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
@@ -132,12 +134,14 @@ def by_allan(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
     laws = tuple(model.hypotheses)
     drawn = _drawn(law, TRUTHS[law], seed, SCATTER)
     fits = [[fit(Problem(y[:mark], 1.0, group, laws)).estimates for mark in ALLAN_MARKS] for y in drawn]
-    found = {}
+    spreads = {}
     for filtered in laws:
         for name, true in _compared(law, TRUTHS[law], filtered).items():
-            values = [[_within(one[filtered][name].value, group.priors[name]) for one in row] for row in fits]
-            found[filtered, name] = _rms(values, [[_stated(one[filtered][name]) for one in row] for row in fits], true)
-    return found
+            values = [[_within(report[filtered][name].value, group.priors[name]) for report in row] for row in fits]
+            spreads[filtered, name] = _rms(
+                values, [[_stated(report[filtered][name]) for report in row] for row in fits], true
+            )
+    return spreads
 
 
 def _compared(law: str, truth: Mapping[str, float], filtered: str) -> dict[str, float]:
@@ -152,20 +156,20 @@ def _within(value: float, prior: Prior) -> float:
 
 def real(folder: Path, model: Model) -> dict[str, Floats]:
     """1 s means of the stretches; those whose file is absent are left out."""
-    found, loaded = {}, {}
+    records, loaded = {}, {}
     for name, start in STRETCHES:
-        place = folder / name
-        if not place.exists():
+        path = folder / name
+        if not path.exists():
             continue
         if name not in loaded:
-            loaded = {name: load(place)}
+            loaded = {name: load(path)}
         recording = loaded[name]
         samples = as_float(recording.in_unit(AXIS, "m/s^2")).astype(np.float64)
         block = round(recording.rate_hz)
         whole = samples[: samples.size // block * block].reshape(-1, block).mean(axis=1)
         run = name.removeprefix("adis16405_").removesuffix(".npz")
-        found[f"{run}, {start} s"] = whole[start : start + DURATION]
-    return found
+        records[f"{run}, {start} s"] = whole[start : start + DURATION]
+    return records
 
 
 def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Told]:
@@ -232,8 +236,8 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
             for title, seen in reports.items()
         ]
         about = "the medians of the four records" if real_ones else "the paper's values"
-        told = f"({letter}) {name}: the bank's own sd, beside the real rms error of simulated records with {about}."
-        rms_figures.append(Figure(f"Fig. 6 ({letter}), rms of {name}, {kind}", told, panels))
+        caption = f"({letter}) {name}: the bank's own sd, beside the real rms error of simulated records with {about}."
+        rms_figures.append(Figure(f"Fig. 6 ({letter}), rms of {name}, {kind}", caption, panels))
         ratio = rms.ratio
         said.append(
             f"{name}: computed {_span(sd[name])} at {DURATION} s; computed over real rms {_span(ratio)} at "
@@ -299,17 +303,17 @@ def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[To
                     y = np.array([_within(value[name].value, group.priors[name]) for value in values])
                     panels.append(Panel(title, "time, s", unit, [Curve("Allan fit", t, y / scale)], log_y=name == "K"))
             if panels:
-                told = f"{name} by a weighted fit of the Allan deviation, kept within the bank's prior."
+                caption = f"{name} by a weighted fit of the Allan deviation, kept within the bank's prior."
                 figure = f"Fig. 7 ({'a' if name == 'N' else 'b'}), {name}, {'real' if kind == 'run' else kind}"
-                estimates.append(Figure(figure, told, panels))
+                estimates.append(Figure(figure, caption, panels))
         panels = []
         for method, errors in (("Allan fit", allan), ("bank", bank)):
-            one = errors["random_walk"]["random_walk", name]
-            curves = [Curve("real", t, one.real), Curve("computed", t, one.computed, "fitted")]
+            errors_of = errors["random_walk"]["random_walk", name]
+            curves = [Curve("real", t, errors_of.real), Curve("computed", t, errors_of.computed, "fitted")]
             panels.append(Panel(method, "time, s", f"rms of ln {name}", curves, log_y=True))
         letter = "c" if name == "N" else "d"
-        told = f"({letter}) rms of ln {name} over {SCATTER} simulated records with the paper's values."
-        rms.append(Figure(f"Fig. 7 ({letter}), rms of {name}", told, panels))
+        caption = f"({letter}) rms of ln {name} over {SCATTER} simulated records with the paper's values."
+        rms.append(Figure(f"Fig. 7 ({letter}), rms of {name}", caption, panels))
         ours, theirs = (errors["random_walk"]["random_walk", name] for errors in (bank, allan))
         said.append(
             f"{name}: the Allan fit's real error is {_span(theirs.real / ours.real)} times the bank's; computed over "
@@ -396,7 +400,7 @@ def of_map_error(tables: Tables, y: Floats) -> tuple[float, tuple[float, float, 
 
 def figure_8(model: Model, seed: int) -> Told:
     """Shares of the records for which Gauss-Markov is the more probable, and the parameters found."""
-    shares, correct, found = {}, [], {}
+    shares, correct, fits = {}, [], {}
     rate = 1.0 / AREA_STEP_S
     tables = map_tables(model)
     for number, (area, (rms, minutes, noise)) in enumerate(AREAS.items()):
@@ -413,11 +417,11 @@ def figure_8(model: Model, seed: int) -> Told:
             chosen += p > 0.5
             correct.append(max(p, 1.0 - p))
             estimates.append(estimate)
-        shares[area], found[area] = 100.0 * chosen / AREA_RECORDS, np.array(estimates)
+        shares[area], fits[area] = 100.0 * chosen / AREA_RECORDS, np.array(estimates)
     figures = []
     for column, (what, limit) in enumerate((("process rms", "σm"), ("white noise", "N"))):
         panels = []
-        for area, values in found.items():
+        for area, values in fits.items():
             rms, minutes, noise = AREAS[area]
             interval = np.sort(values[:, 1])[[0, -1]]
             panels.append(
@@ -438,7 +442,7 @@ def figure_8(model: Model, seed: int) -> Told:
         figures.append(
             Figure(f"Fig. 8, {what}", f"{limit} over the correlation interval, {AREA_RECORDS} records an area.", panels)
         )
-    medians = {area: np.median(values, axis=0) for area, values in found.items()}
+    medians = {area: np.median(values, axis=0) for area, values in fits.items()}
     negligible = all(noise < 0.1 * rms for rms, _, noise in medians.values())
     paper_shares = ", ".join(f"{share}" for share in PAPER_SHARES.values())
     sure = 100.0 * float(np.mean(correct))
