@@ -17,9 +17,9 @@ from selfcal.readings.readings import mostly_beyond
 
 #: Bank samples a report needs (SELFCAL_REPORT_MIN).
 REPORT_MIN = 3
-#: Averages that are too few where the rest of the readings, all but this share, are in averages of which most is lost.
+#: Fewest whole averages, and the share of readings in them: too few, if other averages have lost most of their samples.
 FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
-#: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
+#: Bank intervals, gaps included, that the checks and the reference compute one by one.
 MOST_DENSE = 10_000_000
 
 

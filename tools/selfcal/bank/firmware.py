@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: Bytes of a frame's identifier and of the whole frame, as the module hands it over.
 IDENTIFIER, FRAME = 4, 12
-#: Rows between two looks at the frames.
+#: Rows between two reads of the frames.
 ROWS = 4096
 
 
@@ -51,7 +51,7 @@ class Played:
         return bool(self._module.ended) and not self._frames
 
     def recv(self, timeout: float) -> can.Message | None:
-        """The next frame; None once closed, or if ROWS rows went by without one."""
+        """The next frame; None once closed, or if ROWS rows gave no frame."""
         import can
 
         if not self._frames and not self._module.ended:

@@ -25,15 +25,15 @@ from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Gate, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.readings.rest import BIAS_SD, rest_of
 
-#: N is laid so far either way about the record's, and a drift beyond the default ratio to N by so much.
+#: Own prior of N: factor to each side of the record's N; of a drift: factor beyond the default ratio to N.
 DECADES, DRIFT_MARGIN = 100.0, 10.0
-#: Limits of N nearer than this factor are knowledge of the part (a warm start, a model by hand): they stay.
+#: Narrowest range of N, a factor, that is replaced: a narrower one is knowledge of the part (warm start, own model).
 NARROW = 10.0
-#: The record's N is outside a limit from so many of its own standard deviations on; that of ln N times sqrt(n).
+#: Distance of the record's N beyond a limit, in sd of ln N; the sd of ln N times sqrt(n).
 OUTSIDE_SD, MEDIAN_SD = 2.0, 1.2
-#: Its drift is outside where the deviation over some time is above all that the priors allow by so much.
+#: Factor of the Allan deviation above the largest that the priors allow, from which on the drift is outside.
 DRIFT_ABOVE = 1.5
-#: Means are the same that differ by less than this share of the largest: differences of a counter are rounded so.
+#: Largest difference of equal means, a share of the largest mean: a counter's differences are rounded by that.
 SAME = 1e-10
 #: Differences of neighbouring means that show a deviation.
 FEWEST, FEWEST_OF_DRIFT = 8, 24
@@ -41,25 +41,25 @@ FEWEST, FEWEST_OF_DRIFT = 8, 24
 MEDIAN_SQUARE = 0.4549364
 #: Greatest Allan deviation of a Gauss-Markov drift over its sigma_m.
 MARKOV_PEAK = 0.62
-#: A level is so many sd of the bias that is laid for it.
+#: Level over the sd of the own bias prior.
 LEVEL_SD = 2.0
 #: A posterior leans on an end that lies within two of its deviations of its median: this share of the way from the
 #: median to the nearer quantile is left to the end. The farther quantile is within a factor of e of it: beyond that the
 #: record leaves the parameter open, and its prior holds it.
 LEANS_LEFT, LEANS_WITHIN = 0.2, 1.0
-#: Limits that a posterior leans on move by this share of their width, so many times at most.
+#: Step of limits that a posterior leans on, a share of their width, and the most steps.
 LEANS_MOVE, LEANS_MOST = 2.0 / 3.0, 4
 #: Nats by which a law must gain: of records that a model's limits hold, at most 1 in 20 gain so much (Markov's bound).
 LEANS_GAIN = math.log(20.0)
-#: A law counts from this probability on.
+#: Least probability of a law that counts.
 LEANS_LAW = 0.01
-#: Bank intervals at most on which leaning is looked for.
+#: Most bank intervals in the search for leaning.
 LEANS_INTERVALS = 20_000
-#: What a record cannot tell from nothing: K and sigma_m below so many N / T and N / sqrt(T), alpha below 1 / T.
+#: Smallest visible drift over a record of T: K in N / T, sigma_m in N / sqrt(T); of alpha 1 / T.
 UNSEEN = 0.5
-#: The gate starts from so many times the noise: default.yaml has two to six.
+#: Noise of the gate over the record's noise: default.yaml has two to six.
 GATE_NOISE = 3.0
-#: What the JSON has of an axis's priors.
+#: Words of the JSON for an axis's priors.
 OF_MODEL, OF_RECORD = "model", "from this record"
 
 
@@ -80,7 +80,7 @@ class Seen:
 
 
 def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model:
-    """The model with own priors for those of `axes` that rested outside its own. Itself where there is none."""
+    """The model with own priors for those of `axes` that rested outside its own; else unchanged."""
     own: dict[str, dict[str, Prior]] = {}
     noise: dict[str, float] = {}
     for name in axes:
@@ -326,7 +326,7 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
 
 
 def _unseen(seen: Seen, length_s: float) -> dict[str, float]:
-    """Of each parameter of a drift what the record cannot tell from nothing."""
+    """Smallest visible value of each parameter of a drift."""
     size = UNSEEN * seen.N / math.sqrt(length_s)
     return {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
 

@@ -34,7 +34,7 @@ _FEWEST = 24
 #: Changes allowed when every second node is left out: of ln evidence, and of mean and sd in posterior sd. A probability
 #: moves by a quarter of the first at most, 1e-4, and the full lattice is many times better than the halved one.
 _LN_EVIDENCE, _MOMENT = 4e-4, 5e-3
-#: Nodes of one hypothesis beyond which a posterior counts as out of this engine's reach.
+#: Most nodes of a hypothesis: a larger posterior is out of this engine's reach.
 _MOST = 1_000_000
 #: Scan for modes: points in each drift parameter, by the number of those.
 _SCAN = {0: (), 1: (25,), 2: (11, 9)}

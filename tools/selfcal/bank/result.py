@@ -20,7 +20,7 @@ def of_mixture(
     weight: NDArray[np.float64], mean: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> tuple[float, float, float, float, float]:
     """Mean, sd, and quantiles 0.05, 0.5 and 0.95 of a sum of normals [m], `weight` of each not normalized."""
-    from scipy.special import ndtr  # a tenth of a second to import: for who has such a posterior alone
+    from scipy.special import ndtr  # a tenth of a second to import, for a mixture only
 
     held = weight > 1e-6 * weight.max()
     weight, mean, sd = weight[held] / weight[held].sum(), mean[held], sd[held]
@@ -39,7 +39,7 @@ def of_mixture(
 
 @dataclass(frozen=True)
 class Estimate:
-    """Posterior of one parameter under one hypothesis. `off_grid`: the grid of nodes does not bear it (selfcal.h)."""
+    """Posterior of one parameter under one hypothesis. `off_grid`: the grid of nodes is too coarse (selfcal.h)."""
 
     mean: float
     median: float

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from selfcal.bank.result import HALF_90, AxisResult, of_mixture
 from selfcal.model.regressors import Choice, coefficient_unit, ln_prior
 
-#: A law of this probability among those of a subset may be the true one: the widest of these states the coefficient. A
-#: record that does not tell a walk from a Gauss-Markov drift leaves a ramp twice to four times as open beside the walk:
-#: an average over the laws would hold 77 to 85 % of truths beside a walk (tests/noise_coverage.py).
+#: Least probability of a law of a subset that may be true: the widest of these laws states the coefficient. If a record
+#: does not separate a walk from a Gauss-Markov drift, a ramp is 2 to 4 times as uncertain under the walk. An average over
+#: the laws would cover 77 to 85 % of truths with a walk (tests/noise_coverage.py).
 LIKELY = 0.05
 
 

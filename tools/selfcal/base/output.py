@@ -1,4 +1,4 @@
-"""Output files are whole or absent: each is written under another name beside its place, then renamed."""
+"""Output files are whole or absent: each is written under another name in its folder, then renamed."""
 
 from __future__ import annotations
 
@@ -53,8 +53,8 @@ def whole(path: Path | str) -> Iterator[Path]:
 def together(path: Path | str, *others: Path | str) -> Iterator[tuple[Path, ...]]:
     """The same for files that belong together: all are on the disk before the first takes its place.
 
-    An older one of the `others` goes just before: none stands beside a `path` that it is not of. One whose temporary
-    file the block removes goes without a new one.
+    Older files of `others` are removed first, so that none is left of another `path`. If the block removes a temporary
+    file, its target is removed too.
     """
     target = Path(path)
     pending: list[_Pending] = []
@@ -130,7 +130,7 @@ def write_text(path: Path | str, text: str) -> None:
 
 def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
     """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
-    or that is there twice. None and '-' are none."""
+    or that is there twice. None and '-' are skipped."""
     taken = {Path(path).resolve() for path in inputs if path is not None}
     for file in files:
         if file is not None and str(file) != "-":
@@ -158,15 +158,15 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-#: Columns of a table at most, and of what is no terminal.
+#: Columns of a table at most, and of an output that is not a terminal.
 TABLE_WIDTH = 140
 _NO_WIDTH = 1000
-#: What a picture's name may end in.
+#: Suffixes of pictures.
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
 
 def check_picture(path: Path | str) -> None:
-    """Raise UserError for a file name that is no picture's."""
+    """Raise UserError for a file name without the suffix of a picture."""
     if Path(path).suffix not in PICTURES:
         raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 

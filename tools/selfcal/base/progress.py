@@ -1,4 +1,4 @@
-"""What a long verb does just now: a bar in a terminal, a plain line on stderr now and then where there is none."""
+"""Progress of a long verb: a bar in a terminal, otherwise a line on stderr now and then."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from rich.progress import Progress
 
 from selfcal.base.errors import note
 
-#: Between two lines without a terminal, s; and before the first one.
+#: Interval of lines without a terminal, and time before the first line, s.
 EVERY_S = 10.0
 
 

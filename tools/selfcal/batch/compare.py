@@ -16,7 +16,7 @@ from selfcal.base.errors import printable
 from selfcal.base.output import console_of
 
 SCHEMA = "selfcal.compare/1"
-#: A difference counts from so many standard deviations on: once in 1600 quantities by chance.
+#: Least difference that counts, in standard deviations: 1 in 1600 quantities exceeds it by chance.
 LIMIT = 3.4
 #: Estimates that are sizes of a cause; places in time belong to one recording alone.
 SIZES = ("coefficient", "slope", "amplitude", "frequency_hz", "B", "lag1", "ratio", "lsb", "limit")

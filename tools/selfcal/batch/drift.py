@@ -40,7 +40,7 @@ class Series:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom beside a line."""
+        """Degrees of freedom left by a line."""
         return self.y.size - 2
 
     def line(self, square: float) -> tuple[float, float, float]:

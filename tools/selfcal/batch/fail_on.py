@@ -10,7 +10,7 @@ from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, note
 from selfcal.batch.verdicts import PASS, Verdict, code_of
 
-#: What is not explained, or moves a number as much as matters; the latter alone; and, of two recordings, any change.
+#: Words for any finding that is unexplained or material, for a material one, and for a change between two recordings.
 INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
 
 
@@ -24,7 +24,7 @@ class Outcome:
 
 
 def check(wanted: str | None, more: Collection[str] = ()) -> None:
-    """Raise UserError for what is no cause. `more`: what the verb takes besides."""
+    """Raise UserError for an unknown cause. `more`: further words of the verb."""
     if wanted is None:
         return
     from selfcal.diagnosis import hidden  # a second of imports

@@ -17,16 +17,16 @@ from selfcal.base.errors import UserError, note, short
 from selfcal.base.limits import read_text
 from selfcal.logs.recording import meta_place
 
-#: A table of units: 10 000 lines of 100 letters are 1 MB.
+#: Bytes of a table of units: 10 000 lines of 100 letters are 1 MB.
 MOST_TABLE_BYTES = 1 << 26
 #: Columns of a table of units; the first two must be there.
 TABLE_COLUMNS = ("file", "device", "station", "lot", "date")
-#: Where a serial number comes from.
+#: Sources of a serial number.
 FROM_NAME, FROM_FIELD = "name", "field"
 #: A date of ISO 8601 in its extended form, with or without a time of day.
 _DATE = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d.*)?", re.ASCII)
 DATE_FORM = "2026-03-01 or 2026-03-01T14:30:00Z (ISO 8601)"
-#: Rows of a table of units that are named at most.
+#: Most rows of a table of units in a message.
 MOST_ROWS_NAMED = 5
 
 
@@ -142,7 +142,7 @@ def sources_of(
 
     A recording under two names of one device is one source. Under the names of two devices the second is a source
     with `copy_of`: that device has no recording of its own.
-    Raises UserError for a pattern without files, and for a table or a `serial_from` that is none.
+    Raises UserError for a pattern without files, and for an invalid table or `serial_from`.
     """
     named = _serials(matching(patterns, own), serial_from)
     units = {} if table is None else _table(Path(table), list(named))

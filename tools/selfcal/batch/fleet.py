@@ -12,7 +12,7 @@ from selfcal.batch.table import Unit
 from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
 
 SCHEMA = "selfcal.fleet/1"
-#: Names that are printed of a kind at most.
+#: Most names of a kind in the output.
 MOST_NAMES = 40
 
 

@@ -30,7 +30,7 @@ KINDS = {
     ),
     "not_judged": ("Not judged: record these again, or longer", "not judged"),
 }
-#: Of a chart of individuals and of one of moving ranges (n = 2): limits over the mean moving range.
+#: Limits of a chart of individuals and of a chart of moving ranges (n = 2), over the mean moving range.
 INDIVIDUALS, RANGES = 2.66, 3.267
 
 

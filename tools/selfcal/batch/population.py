@@ -28,25 +28,25 @@ from scipy.special import log_ndtr, ndtri
 from selfcal.bank.result import HALF_90, of_mixture
 
 Array = NDArray[np.float64]
-#: Units that make a population, and that make a group.
+#: Fewest units of a population and of a group.
 FEWEST, FEWEST_OF_GROUP = 5, 3
 #: Points of the grid of spreads, and its reach from the spread of the estimates: of five units the tail weighs.
 _POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
-#: A weight that counts for nothing, and has a logarithm.
+#: Smallest weight: it counts for nothing, and has a logarithm.
 _NO_WEIGHT = 1e-300
-#: Probability that a batch of sound units has one that is called unlike by a quantity.
+#: Probability that a quantity calls any unit of a sound batch unlike.
 FALSE_NAME = 0.03
-#: Probability that a batch without groups is said to have one, and that a unit without drift is said to drift.
+#: Probability of a false group in a batch, and of a false drift of a unit.
 FALSE_ALARM = 1e-3
 #: Standard deviation over the median absolute deviation, and of a median over that of a mean, of a normal.
 _MAD, _MEDIAN = 1.4826, 1.2533
-#: Probability of a unit as far off, below which one that is odd in something else is in no population.
+#: Least probability of a unit's deviation at which it is in the population although it is odd in another quantity.
 _ORDINARY = 0.01
-#: Share of the units that are odd at most, and numbers of odd ones that are tried at most.
+#: Largest share of odd units, and the most numbers of odd units that are tried.
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
 #: Rounds of fit and choice at most.
 _ROUNDS = 20
-#: Nats by which two groups must be better than one: 1 in 1000 normal batches of 8 to 24 units has so many.
+#: Evidence of two groups over one, nats: 1 in 1000 normal batches of 8 to 24 units exceeds it.
 _SPLIT = 8.0
 #: Distance of two groups in standard deviations of a unit: nearer ones, as of a uniform population, share units.
 _BETWEEN = 4.5
@@ -246,7 +246,7 @@ def _is_group(inside: int, units: int) -> bool:
     return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
 
 
-#: Groups that a test can tell, by the places of their units: kind, name and the only other name of each.
+#: Groups that a test can separate, by the places of their units: kind, name and the only other name of each.
 Groups = Mapping[tuple[int, ...], Sequence[tuple[str, str, str | None]]]
 
 

@@ -20,19 +20,19 @@ from selfcal.batch.spread import Job, Row, spread
 from selfcal.batch.table import Unit
 from selfcal.readings.tests import TESTS
 
-#: What is kept of an axis of `identify`, and of one of `diagnose`.
+#: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
-#: Checks of the readings themselves, and of the innovations; a mark is one so many standard deviations off.
+#: Checks of the readings, and of the innovations; deviation of a mark, in standard deviations.
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
-#: Distinct readings from which on their lattice is known.
+#: Fewest distinct readings with a known lattice.
 LEAST_DISTINCT = 8
-#: Devices that have an own page at most, and letters that a page's name does not have.
+#: Most devices with a page of their own, and the characters that its name lacks.
 MOST_PAGES = 20
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
-#: Why a recording whose workers die has no result.
+#: Error of a recording whose workers die.
 KILLED = "its worker process was killed each time, maybe for want of memory"
 
 
@@ -170,7 +170,7 @@ class ByContent:
         )
 
     def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
-        """The row of a recording; None if it has none, or a damaged one."""
+        """The row of a recording; None without a row, or with a damaged one."""
         try:
             row = json.loads(self.place(jobs[0]).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -185,6 +185,6 @@ class ByContent:
 
 
 def settings_of(options: Options, model: str, version: str) -> dict[str, Any]:
-    """All that decides a record beside its recording; `model`: its content."""
+    """All that decides a record apart from its recording; `model`: its content."""
     kept = [*IDENTIFIED, *DIAGNOSED]
     return {"schema": "selfcal.fleet/1", "kept": kept, **asdict(options), "model": model, "version": version}

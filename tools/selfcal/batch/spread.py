@@ -35,16 +35,16 @@ from selfcal.base.errors import UserError, first_line, install, note, printable,
 from selfcal.base.output import temporary_folder, whole
 from selfcal.base.progress import EVERY_S
 
-#: Whatever a function makes a record of; it is pickled.
+#: Argument of the function for a record; it is pickled.
 Job = Any
 Row = dict[str, Any]
 #: A piece: its place among the pieces, and its jobs.
 Work = tuple[int, list[Job]]
-#: s until a scheduler has answered.
+#: Timeout of a scheduler, s.
 PATIENCE_S = 10.0
 #: Seeds that the simulator takes.
 SEEDS = 2**64
-#: Workers that die over a piece until the piece is the reason.
+#: Dead workers of a piece after which the piece is the reason.
 DEATHS = 4
 _KILLED = "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"
 
@@ -282,7 +282,7 @@ def _cluster(
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """A library's log is none for the user: its failure is one line."""
+    """A library's log is not for the user: its failure is a line."""
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:

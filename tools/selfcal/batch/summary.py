@@ -33,20 +33,20 @@ from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
 
-#: Rounds in which the shares of the laws are found.
+#: Rounds of the search for the shares of the laws.
 SHARE_ROUNDS = 100
-#: Nats by which a unit's law must be better than the batch's, at most one in e^12 times by chance.
+#: Evidence of a unit's law over the batch's law, nats: at most 1 in e^12 by chance.
 OTHER_LAW = 12.0
-#: Relative difference of two lattices.
+#: Largest relative difference of equal lattices.
 LATTICE = 0.05
-#: Of a recording beside a normal prior, of a quantity or of its logarithm: with less it says nothing of the quantity.
+#: Least weight of a recording over that of a normal prior, of a quantity or its logarithm, that says anything.
 LEAST_WEIGHT = 0.1
-#: What groups units, by the attribute of a source.
+#: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Devices of a line at most.
+#: Most devices of a line.
 MOST_NAMED = 20
 SECONDS_A_DAY = 86400.0
-#: Times the batch's median from which on parts do not differ: a batch that sees no less names no unit by it.
+#: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0
 
 

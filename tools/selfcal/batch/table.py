@@ -31,7 +31,7 @@ class Unit:
         self.device: str = source.device or known.get("serial", "") or stem(source.path)
         dated: str = source.recorded_at or known.get("recorded_at", "")
         self.moment = moment(dated)
-        #: A date of its metadata that is none.
+        #: Invalid date of its metadata.
         self.undated = dated if self.moment is None else ""
         self.recorded_at = dated if self.moment is not None else ""
         self.error: str | None = record.get("error")
@@ -140,7 +140,7 @@ def write_csv(path: Path | str, columns: Sequence[str], rows: Iterator[dict[str,
 
 
 def _sound(value: Any) -> Any:
-    """A text without what a file's name may have that is none."""
+    """A text without the lone surrogates of a file's name."""
     return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 

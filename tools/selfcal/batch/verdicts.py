@@ -6,7 +6,7 @@ A limits file has an entry for each quantity, `AXIS.PARAMETER` or `GROUP.PARAMET
     accel.bias: {min: -50 mg, max: 50 mg}
 
 A unit passes a maximum if the upper 95 % bound of the quantity is within it. It fails if the lower 95 % bound is
-beyond. Between the two the record cannot tell yet. A unit that could not be judged has not passed.
+beyond. Between the two the record is too short for a verdict. A unit that could not be judged has not passed.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from selfcal.model.laws import PLACES, RATIOS
 
 SCHEMA = "selfcal.limits/1"
 PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
-#: A law of less probability is no law of the axis.
+#: Least probability of a law of the axis.
 LEAST_PROBABILITY = 0.05
-#: Chance that the verdict is there after the rest that is asked for; times the record that are asked for at most.
+#: Probability of a verdict after the rest that is asked for; longest such rest, in times the record.
 CHANCE, MOST_TIMES = 0.8, 1000.0
-#: How the upper bound of a quantity that the record does not identify falls with the record's length: to this power.
+#: Power of the record's length by which the upper bound of an unidentified quantity falls.
 FALLS = {"K": 1.0, "sigma_m": 0.5, "B": 0.5}
 
 
@@ -258,7 +258,7 @@ def _normal(x: float) -> float:
 
 
 def code_of(verdicts: Iterable[Verdict]) -> int:
-    """Exit code: 0 all pass, 1 one fails, 2 one cannot be told or judged."""
+    """Exit code: 0 all pass, 1 one fails, 2 one is open or not judged."""
     there = {verdict.verdict for verdict in verdicts}
     return 1 if FAIL in there else 2 if there & {OPEN, UNJUDGED} else 0
 

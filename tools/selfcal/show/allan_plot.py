@@ -1,4 +1,4 @@
-"""The picture of `identify --plot`: each axis's Allan deviation beside the model's, and where they part."""
+"""The picture of `identify --plot`: each axis's Allan deviation with the model's, and where they differ."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, printable
 from selfcal.base.output import plotter, save_picture
 
-#: The model's colour, and that of what does not fit.
+#: Colours of the model and of points outside it.
 MODEL, OUTSIDE = "tab:blue", "tab:red"
 
 

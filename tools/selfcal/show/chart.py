@@ -21,11 +21,11 @@ WIDTH, HEIGHT = 340, 220
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Size of a picture of strips, room for their names, and the height of each.
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
-#: Share of the points of a strip that may lie beyond its lower edge, and beyond its upper one.
+#: Share of a strip's points that may lie beyond each of its edges.
 USUAL = 0.02
 #: Rows of a table behind a picture at most.
 ROWS = 25
-#: Ticks on an axis, about.
+#: Approximate number of ticks of an axis.
 TICKS = 5
 
 Kind = Literal["measured", "fitted", "dots"]

@@ -30,9 +30,9 @@ from selfcal.show.template import number, render, spaced
 
 #: Bytes of the page at most, and of the line in place of a picture.
 SIZE_MOST, LINE = 995_000, 140
-#: Name of the figure that decides whether the Allan curve leaves its band, and the share of its points from which on it
-#: does. Each point of a fitting record lies outside the range of 20 with a probability of 2/21, and neighbours do so
-#: together: of 400 fitting records one had more than this share outside, nine more than a quarter.
+#: Name of the Allan figure, and the share of its points outside the band from which on the curve leaves it. Each point
+#: of a fitting record is outside the range of 20 with a probability of 2/21, neighbours together: 1 of 400 fitting
+#: records had more than this share outside, 9 more than a quarter.
 ALLAN, ALLAN_OUTSIDE = "Allan deviation", 0.35
 
 #: Options of the command line and their values, each as often as it was given.

@@ -19,7 +19,7 @@ from selfcal.base.output import console_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
 
-#: Characters of a line where no terminal shows it.
+#: Characters of a line without a terminal.
 WIDTH = 114
 
 

@@ -21,7 +21,7 @@ from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.show.chart import Band, Curve, Figure, Panel, envelope
 
-#: Simulated records a band is the range of.
+#: Simulated records of a band.
 RECORDS = 20
 #: Points of a curve at most.
 POINTS = 400
@@ -67,7 +67,7 @@ class _Pair:
 
 
 def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> tuple[list[Figure], list[list[Figure]]]:
-    """Overview figures of an axis, and those of each of its findings in the order of `one.findings`.
+    """Overview figures of an axis, and those of each of its findings in the order of its findings.
 
     `factor` turns the axis' inner unit into `unit`."""
     overview = [
@@ -447,7 +447,7 @@ def _effect(finding: Finding) -> Array:
 
 
 def _sides(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> Figure:
-    """The record beside one simulated record of the final model."""
+    """The record and a simulated record of the final model."""
     y = simulated(diagnosed.state, np.random.default_rng(20))
     panels = []
     for title, values in (("Measured", diagnosed.first.y), ("Simulated", y)):

@@ -16,13 +16,13 @@ from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import AxisReport, axis_unit
 
-#: Of the hypotheses, in the model's order.
+#: Colours of the hypotheses, in the model's order.
 COLORS = ("tab:green", "tab:blue", "tab:red", "tab:purple", "tab:orange", "tab:olive", "tab:brown", "tab:cyan")
-#: A law whose last probability is below this is drawn faint, and its values are not written.
+#: Least probability of a law that is drawn in full, with its values.
 FAINT = 0.01
-#: A true value beyond this is none: an integer may have any number of digits.
+#: Largest true value that is drawn: an integer may have any number of digits.
 LARGEST = 1e30
-#: Share of the reports, from the first on, whose intervals do not count for the scales: they are the prior's.
+#: Share of first reports that set no scale: their intervals are the prior's.
 SETTLING = 0.2
 
 

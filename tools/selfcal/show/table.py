@@ -24,13 +24,13 @@ from selfcal.readings.misread import MISREAD
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 
-#: Laws of smaller probability are not spoken of where the grid does not bear them.
+#: Least probability of a law that is named if the grid is too coarse for it.
 TOLD_OF = 0.01
-#: Stretches of motion that are listed at most.
+#: Most stretches of motion in a line.
 TIMES_MOST = 4
-#: Checks that state no cause, by the beginning of their names.
+#: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
-#: Jumps of two axes so close to each other, s, are one event.
+#: Largest distance of jumps of one event, s.
 ONE_EVENT_S = 30.0
 
 
@@ -66,7 +66,7 @@ def show(
 
 
 def _fitting(console: Console, tables: Sequence[Table]) -> Table:
-    """The first of `tables` that the terminal is wide enough for, else the last; the first where there is none."""
+    """The first of `tables` that the terminal is wide enough for, else the last; without a terminal the first."""
     if not console.is_terminal:
         return tables[0]
     wide = console.options.update(width=10 * TABLE_WIDTH)

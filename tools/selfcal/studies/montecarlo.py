@@ -22,9 +22,9 @@ from selfcal.model.file import Model
 from selfcal.model.tables import bank_block, make_tables
 
 SCHEMA = "selfcal.montecarlo/1"
-#: Bank samples; fewer say nothing.
+#: Fewest bank samples.
 MIN_SAMPLES = 10
-#: Of a record: 80 MB.
+#: Most samples of a record: 80 MB.
 MOST_SAMPLES = 10_000_000
 
 
@@ -33,7 +33,7 @@ MOST_SAMPLES = 10_000_000
 BLOCK = 10
 
 
-#: What of each estimate of the true law a row has.
+#: Keys of each estimate of the true law in a row.
 ESTIMATE = ("mean", "sd", "q05", "median", "q95")
 
 

@@ -29,15 +29,15 @@ from scipy.spatial.transform import Rotation
 from selfcal.base.units import STANDARD_GRAVITY, convert
 from selfcal.model.parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
 
-#: s of rest, and of the flight: with GPS, and after its outage.
+#: Lengths of the rest, and of the flight with GPS and after its outage, s.
 REST_S, GPS_S, OUTAGE_S = 1800, 300, 60
 #: Readings per s in flight.
 RATE_HZ = 10
-#: s by which a position is late, and the sd of its error by part; a position's own sd by axis, m.
+#: Latency of a position, and the sd of its error by part, s; a position's own sd by axis, m.
 LATENCY_S, LATENCY_SD_S, GPS_SD_M = 1, 0.1, 3.0
-#: sd of the start's errors: the tilt of the floor and the heading, deg; the position by axis, m.
+#: Sd of the start's errors: the tilt of the floor and the heading, deg; the position by axis, m.
 TILT_SD, HEADING_SD, START_SD_M = 0.1, 2.0, 3.0
-#: m/s of speed and its swing; deg/s of turn at most; s of the take-off and of the swings.
+#: Speed and its swing, m/s; largest turn, deg/s; take-off and periods of the swings, s.
 SPEED, SPEED_SWING, TURN, TAKE_OFF_S, SPEED_PERIOD_S, TURN_PERIOD_S = 20.0, 4.0, 10.0, 20.0, 47.0, 60.0
 #: Units of the filter, by AXES, and the size of each axis' unit in them.
 SI = {"deg/s": "rad/s", "m/s^2": "m/s^2"}

@@ -18,7 +18,7 @@ from selfcal.show.template import render
 from selfcal.studies.paper_figures import section4
 from selfcal.studies.paper_figures.told import Told
 
-#: Where the real recordings are looked for, beside the repository.
+#: Folder of the real recordings: beside the repository by default.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 #: Causes of one recording that the page names.
 MOST_CAUSES = 5

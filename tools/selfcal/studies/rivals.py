@@ -41,14 +41,14 @@ from selfcal.studies.methods.problem import Answer, Problem
 
 SCHEMA = "selfcal.rivals/1"
 ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
-#: The model of the ensemble, and the numbers of samples that it has unless told otherwise.
+#: The model of the ensemble, and its default numbers of samples.
 ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
 SAMPLES = (150, 600)
 #: Samples of a record of the ensemble at most: the slowest method takes eight minutes then.
 MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
-#: An interval from a value to so many times it says nothing: wider than any prior here.
+#: Ratio of an interval's ends that says nothing: wider than any prior here.
 LOOSE = 1e4
 #: Columns of a terminal that the table takes with the intervals, and without.
 WHOLE_WIDTH, BRIEF_WIDTH = 190, 110

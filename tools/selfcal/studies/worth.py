@@ -23,20 +23,20 @@ from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Fl
 from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"
-#: s of rest, and s after its end at which the bias is wanted.
+#: Lengths of rest, and times after it for the bias, s.
 RESTS_S, HORIZONS_S = (60, 300, 1800), (1, 10, 60, 300, 1000)
-#: s of "the last seconds".
+#: Length of "the last seconds", s.
 LAST_S = 10
 #: Corner of x-io Fusion's bias filter, Hz.
 CORNER_HZ = 0.02
-#: s of dead reckoning, and the seconds after a rest at which the bias is predicted.
+#: Length of dead reckoning, s, and its seconds after a rest.
 RECKONED_S = 60
 SECONDS = (*range(1, RECKONED_S + 1), *(h for h in HORIZONS_S if h > RECKONED_S))
 #: Its errors in the document, and in the table.
 RECKONED = {"heading_deg": "heading, deg", "position_m": "position, m"}
 #: The gyro that turns each horizontal accelerometer out of the level.
 ACROSS = {"ax": "gy", "ay": "gx"}
-#: s of real readings whose mean stands for the bias then.
+#: Length of the real readings whose mean is the bias then, s.
 REFERENCE_S = 30
 #: The methods, in the order of the table.
 TITLES = {
@@ -47,7 +47,7 @@ TITLES = {
     "kalman": "fixed-gain Kalman, data-sheet numbers",
     "none": "no correction",
 }
-#: Beside them, of simulated parts: dead reckoning with the bias known throughout has the white noise alone.
+#: Further method for simulated parts: dead reckoning with a known bias has the white noise alone.
 KNOWN = "known"
 
 
@@ -169,7 +169,7 @@ def simulated(model: Model, job: Job) -> list[Row]:
 
 
 def _means(recording: Recording, model: Model, name: str) -> Floats:
-    """Means of 1 s of a recorded axis, NaN where there is none."""
+    """Means of 1 s of a recorded axis, NaN in gaps."""
     from selfcal.bank.blocks import usable_blocks
 
     recording = recording.along(name)

@@ -55,7 +55,7 @@ def compare(
     report: Report = None,
     **reading: Unpack[Reading],
 ) -> Comparison:
-    """Identify and diagnose each of `logs`, and set every one beside the one before it.
+    """Identify and diagnose each of `logs`, and compare each with the one before it.
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
     distance in standard deviations; the `verdicts` by recording and axis; and the `quantities` that were set beside

@@ -74,7 +74,7 @@ def diagnose(
     `axes`: those reported on; every other column may explain them. A long recording is looked at twice: first its means
     of 1 s, whose findings go to stderr at once, then every sample. The second result is the final one, unless it shows
     nothing where the first one does. A further finding of the means stays in the axis' `only_in_means`. An axis that
-    the second look did not finish has the first one's result if it has none of its own. `full_rate`: no first look.
+    the second look did not finish without a result of its own has the first look's. `full_rate`: no first look.
     `decimate`: look at block means at this rate alone, Hz.
     `on`: a second recording, read as the first, on which each finding's gain is measured.
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not

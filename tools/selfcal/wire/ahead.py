@@ -21,9 +21,9 @@ from selfcal.wire.frames import AxisReport, names_of
 
 Array = NDArray[np.float64]
 
-#: s from a report to the middle of the readings that it is held against; their length, s: white noise averages out.
+#: Time from a report to the middle of the readings that test it, and their length, s: white noise averages out.
 AHEAD_S, MEAN_S = 300.0, 60.0
-#: Reports that make a figure.
+#: Fewest reports of a figure.
 LEAST = 3
 
 

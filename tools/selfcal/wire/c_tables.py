@@ -23,13 +23,12 @@ from selfcal.wire.frames import carries
 SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
 
 
-#: Nodes of a grid at least, of a model that has none.
+#: Nodes of the smallest grid, for a model without one.
 LEAST_GRID = 6
 
 
-#: By core: how finely a report integrates, and the lines it describes a spectrum by (on a Cortex-M0 as many as its RAM
-#: has room for: they do for 5000 bank samples); pushes between two steps of the nodes, of which a batch takes 4 sample
-#: periods at 819.2 Hz and 48 MHz there.
+#: Sizes by core: fineness of a report's integrals; lines of a spectrum (a Cortex-M0 has RAM for 20, enough for 5000 bank
+#: samples); pushes between two steps of the nodes (a batch takes 4 sample periods at 819.2 Hz and 48 MHz there).
 CORES = {
     "host": {"REPORT_QUALITY": 2, "LINES": 36, "PUSH_EVERY": 1},
     "cortex-m4f": {"REPORT_QUALITY": 1, "LINES": 32, "PUSH_EVERY": 1},
@@ -41,7 +40,7 @@ CORES = {
 WITHOUT_FPU = ("cortex-m0",)
 
 
-#: Bytes of the part's RAM that its image leaves for a model's nodes: 32 KB less 11 to 12 KB of the rest.
+#: RAM for a model's nodes, bytes: 32 KB less 11 to 12 KB of the image.
 ROOM = {"cortex-m0": 21_000}
 
 

@@ -37,11 +37,11 @@ STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
-#: nat; the item of an evidence difference ends there: so much less, or none at all.
+#: Largest evidence difference of its item, nats: that or more, or no evidence at all.
 LEAST_EVIDENCE = -(2**31) * 0.001
 
 COUNTER = 64  # the counter is modulo this
-JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
+JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward and backward are alike
 BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
 FOREIGN_STATUSES = 2  # whole statuses in a row that state another version, of a module that stated this one before
 TWINS = 3  # statuses that only two modules can have sent; a restart on the way of a status looks like one of them
@@ -90,7 +90,7 @@ def choices(message: str, signal: str) -> dict[int, str]:
     return {number: str(name) for number, name in named.items()}
 
 
-#: What the words of a reason mean (selfcal_reason_t), and what to do. Those of a judgement alone are not among them.
+#: Meaning and remedy of each word of a reason (selfcal_reason_t), without those of a judgement alone.
 REASONS = {
     "no_report": "no report yet: leave it at rest for three bank samples; none come: see the sensor's state",
     "moving": "moving: a report needs rest",
@@ -158,7 +158,7 @@ def frame_crc(frame_id: int, data: bytes) -> int:
 class Statistics:
     """Frames of one stream.
 
-    `lost` were sent but not accepted, as far as the counters tell; those that arrived `damaged` (checksum) are among
+    `lost` were sent but not accepted, by the counters; those that arrived `damaged` (checksum) are among
     them. `refused` had a wrong form (id, length, item), a value that cannot be, or a counter that repeats or goes back.
     `foreign` stated another version of the wire.
     """
@@ -243,7 +243,7 @@ class AxisReport:
         return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, moved, change)
 
     def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
-        """Mean, sd and probability of use of each regressor column that was told."""
+        """Mean, sd and probability of use of each regressor column that came."""
         return {
             name: (self.value(f"c{c}_mean"), self.value(f"c{c}_sd"), self.value(f"c{c}_probability"))
             for c, (name, _) in enumerate(names.columns)
@@ -360,7 +360,7 @@ class Decoder:
         self._corrects = False  # what comes belongs to that sample
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
-        #: The latest module time that a frame has told, unwrapped, ms. It goes back only if the module starts anew.
+        #: Latest module time of a frame, unwrapped, ms. It goes back only if the module starts anew.
         self.time_ms = 0
         #: The module has said that no sample will follow, and this was its last status.
         self.finished = False
@@ -583,7 +583,7 @@ class Decoder:
         return closed
 
     def _begun(self, second: int) -> int:
-        """Module time of a frame that tells its second alone, modulo 256: the nearest to what is known."""
+        """Module time of a frame that has its second alone, modulo 256: the nearest to what is known."""
         wrapped = self.time_ms % 2**32
         ahead = _ahead(second, wrapped // 1000, 256)
         return max(0, self.time_ms - wrapped % 1000 + 1000 * ahead)
@@ -606,7 +606,7 @@ def _starts() -> tuple[int, ...]:
 
 
 def _order(kind: _Kind, item: int) -> int:
-    """Place of a frame among all that a report may have. No more frames lie between two than their places tell."""
+    """Place of a frame among all that a report may have. Two places differ by the most frames between them."""
     return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
 
 
@@ -728,7 +728,7 @@ class Link:
         while not self.closed:
             try:
                 return self.bus.recv(max(0.0, end - time.monotonic()))
-            except (IndexError, ValueError):  # python-can slcan: a line cut short, a digit that is none
+            except (IndexError, ValueError):  # python-can slcan: a line cut short, an invalid digit
                 self.malformed += 1
             except can.CanOperationError as error:
                 if error.__cause__ is None or isinstance(error.__cause__, OSError):
@@ -784,7 +784,7 @@ class Link:
             self.closed = True
 
     def close(self) -> None:
-        """Close channel and line; one that is gone already is no error."""
+        """Close channel and line; closed ones are no error."""
         import can
 
         try:
@@ -801,7 +801,7 @@ class Link:
         self.close()
 
 
-#: s that a write to a serial line may take: on a pseudo-terminal that nobody reads it would never end.
+#: Timeout of a write to a serial line, s: on a pseudo-terminal that nobody reads it would never end.
 WRITE_S = 1.0
 #: Frames that wait in a UDP socket while the host is busy: a report of six axes is 322, and a datagram takes 768 bytes.
 UDP_BUFFER = 4 << 20
@@ -812,7 +812,7 @@ def open_bus(interface: str, channel: str, **options: Any) -> Link:
     takes. Raises UserError when that fails."""
     import can
 
-    logging.getLogger("can").setLevel(logging.CRITICAL)  # what its drivers lack is told by their errors
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # its drivers' errors say what they lack
     if interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise UserError(f"--interface {interface}: python-can has no such interface (there are {known})")

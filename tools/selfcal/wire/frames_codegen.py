@@ -24,7 +24,7 @@ from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTI
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 #: Messages of one axis, by what follows its name, with what their items are called in C. Those of all axes are alike.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
-#: Those that modules send.
+#: Messages that modules send.
 SENT = ("", "_H0", "_COEFFICIENTS", "_ADEQUACY")
 #: Headings of lib/WIRE.md, by what follows an axis's name or by message.
 HEADINGS = {
@@ -71,7 +71,7 @@ class Field:
 
 
 def _as_elsewhere(signal: Signal) -> bool:
-    """Its words are those of the judgement's reason: selfcal_reason_t."""
+    """Whether its words are the judgement's reasons: selfcal_reason_t."""
     return signal.name.startswith(f"{REASON}_")
 
 

@@ -1,4 +1,4 @@
-"""Which model a module runs: the one whose tables have the `model_id` that its status tells."""
+"""Which model a module runs: the one whose tables have the `model_id` of its status."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from selfcal.wire.frames import AXES, names_of
 
 class KnownModels:
     """The default model, and that of the file `path`, with the diagnosis `start` that its module was built from. Raises
-    UserError for a file that is no model, or a start that is not of it."""
+    UserError for an invalid model, or the start of another one."""
 
     def __init__(self, path: Path | str | None = None, start: Path | str | None = None) -> None:
         if start is not None and path is None:
@@ -30,7 +30,7 @@ class KnownModels:
         self._named = lru_cache(maxsize=32)(self._find)
 
     def names(self, status: Mapping[str, float]) -> Names:
-        """Names of the model that a module with this status runs; BY_PLACE if it is none of these, or not told yet."""
+        """Names of the model that a module with this status runs; BY_PLACE until the model is known."""
         known = tuple(status.get(key, math.nan) for key in ("model_id", "bank_interval", "bank_block"))
         return BY_PLACE if any(math.isnan(value) for value in known) else self._named(*known)
 

@@ -34,28 +34,28 @@ from selfcal.wire.frames import (
     status_text,
 )
 
-#: Of the status, what is told elsewhere or to programs alone.
+#: Status fields that this view omits.
 UNTOLD = {"time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent"}
 UNTOLD |= {f"reason_{axis}" for axis in AXES}
-#: What the user has to do something about.
-#: degC that a temperature must move before its coefficient is worth having: ArduPilot's rule (TCAL).
+#: Least change of the temperature for a coefficient, degC: ArduPilot's rule (TCAL).
 TEMPERATURE_NEEDED = 10.0
+#: States that need the user.
 TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refused"}
-#: Reasons that need somebody, the most urgent first; the others pass by themselves.
+#: Reasons that need the user, the most urgent first; the others pass by themselves.
 URGENT = ("retired", "stuck", "bad_sample", "outside_priors", "inadequate", "moving")
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 #: Cells of a probability bar and of the bias's sparkline, at least and at most. Many hypotheses leave no room for bars.
 BAR, SPARK = (4, 30), (8, 40)
-#: Of an axis's lines after the first.
+#: Indentation of an axis's further lines.
 INDENT = 2
-#: Lines of the status, at most.
+#: Most lines of the status.
 STATUS_LINES = 2
-#: s without a byte after which contact is lost, and how often the longest interval that was seen has to pass.
+#: Silence after which contact is lost: s, and times the longest interval so far.
 SILENT_S, INTERVALS = 3.0, 3.0
-#: s that a module may be silent before its second status has shown how often it speaks: it sends one every 10 s
-#: (STATUS_MS in port/app/app_frames.c), and a save takes up to 2 s.
+#: Silence of a module before its second status, s: it sends a status every 10 s (STATUS_MS in port/app/app_frames.c),
+#: and a save takes up to 2 s.
 FIRST_S = 12.0
-#: Characters that wait for a terminal, from which on it gets no more, and s that the end waits for it to read them.
+#: Most characters that wait for a terminal, and the time for it to read them at the end, s.
 MOST_WAITING, DRAIN_S = 1 << 16, 1.0
 BLOCKS = "▁▂▃▄▅▆▇█"
 #: Colours of a module's judgement of its model.
@@ -141,8 +141,8 @@ class Contact:
     """When the module was heard last, by the host's clock (`clock`, s).
 
     Contact is lost after SILENT_S, or after three times the longest interval that lay between two frames in a row,
-    whichever is longer. Intervals in which frames were lost tell nothing of how often the module speaks. Before its
-    second status nothing tells: contact is then lost after FIRST_S.
+    whichever is longer. Intervals with lost frames do not count. Before the module's second status its
+    interval is unknown: contact is then lost after FIRST_S.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -187,11 +187,11 @@ class Module:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why axes have no calibration to rely on, as it was told last."""
+        """Why axes have no calibration to rely on, by the last message."""
         return reasons(dict(self.decoder.status), dict(self.decoder.corrected))
 
     def now(self) -> float:
-        """Module time, s. If it goes back, the module has started anew and its reports of before are none any more."""
+        """Module time, s. If it goes back, the module has started anew and its earlier reports are void."""
         time_s = self.decoder.time_ms / 1000.0
         if time_s < self.time_s:
             self.last.clear()
@@ -362,7 +362,7 @@ class View:
 
     @staticmethod
     def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
-        """What the record cannot tell yet."""
+        """What the record is too short for."""
         judgements = [report.adequacy for report, _ in last.values()]
         moved = max(
             (
@@ -479,7 +479,7 @@ def frame_counts(streams: Streams | Decoder, source: Source) -> str:
 
 
 def told_of(report: AxisReport) -> int:
-    """How many hypotheses a report tells of, at least."""
+    """Fewest hypotheses of a report, by its values."""
     return max((k + 1 for k in range(len(BY_PLACE.hypotheses)) if f"h{k}_probability" in report.values), default=0)
 
 
@@ -497,7 +497,7 @@ def most_probable(report: AxisReport, names: Names = BY_PLACE) -> int | None:
 
 
 def _bar_cells(hypotheses: int, width: int) -> int:
-    """Cells of a bar; 0 where there is no room for one."""
+    """Cells of a bar; 0 without room."""
     cells = min(BAR[1], (width - 20) // max(1, hypotheses) - 8)
     return cells if cells >= BAR[0] else 0
 
@@ -609,7 +609,7 @@ def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> lis
 
 
 def _coefficients(report: AxisReport, names: Names) -> list[str]:
-    """Coefficients of the regressor columns that were told, with the probability that each is in use."""
+    """Coefficients of the regressor columns that came, with the probability that each is in use."""
     reading, units = axis_unit(report.axis), dict(names.columns)
     said = []
     for name, (mean, sd, probability) in report.coefficients(names).items():

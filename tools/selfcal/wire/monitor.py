@@ -34,14 +34,14 @@ from selfcal.wire.streams import Stream, content
 if TYPE_CHECKING:
     import can
 
-#: s without a frame after which a serial line is opened again: a module that saves hears nothing for 1 to 2 s, and one
-#: that has restarted says nothing until then.
+#: Silence after which a serial line is opened again, s: a module that saves is deaf for 1 to 2 s, and a restarted one
+#: waits for that.
 REOPEN_S = 3.0
-#: s between looks for a port that has gone.
+#: Interval of looks for a port that has gone, s.
 LOOK_S = 0.5
 #: Schema of the document of several modules.
 MODULES = "selfcal.modules/1"
-#: Reports of an axis that are kept for the plot: beyond it every other one goes.
+#: Most reports of an axis for the plot: beyond that every other report is dropped.
 KEPT = 2000
 
 
@@ -49,7 +49,7 @@ KEPT = 2000
 class Outcome(Statistics):
     """The frames, and whether the module was out of reach when the time was up or its port went.
 
-    An end that the user asked for is none of these. `twins`: two modules send as one node.
+    An end that the user asked for does not count. `twins`: two modules send as one node.
     """
 
     contact_lost: bool = False
@@ -140,8 +140,8 @@ class Run:
                 self.writer.report(entry, self.came_s)
 
     def reported(self, needed: bool) -> dict[int, dict[str, list[AxisReport]]]:
-        """The complete reports by node and axis, both in order. Raises UserError if every node is foreign, or if there
-        is none where one is `needed`."""
+        """The complete reports by node and axis, both in order. Raises UserError if every node is foreign, or if a
+        report is `needed` and none came."""
         known = self.streams.known
         foreign = [decoder.foreign for decoder in known.values() if decoder.foreign]
         if foreign and len(foreign) == len(known):

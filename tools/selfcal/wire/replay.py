@@ -48,16 +48,16 @@ from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, nam
 from selfcal.wire.live import View, frame_counts
 
 MAGIC = b"SELFCAL2"
-#: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
+#: Channels of every sample apart from the model's (port/port.h); not a number if the recording lacks them.
 SIDE = tuple(SIDE_CHANNELS.values())
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
 GONE_S = 2.0  # s without a frame after which none will come from firmware that has ended
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
-#: s without a frame from an emulated module: its reports are slow, and so may the machine be.
+#: Longest silence of an emulated module, s: its reports are slow, and so may the machine be.
 EMULATED_TIMEOUT_S = 600.0
-#: What a firmware is made of, and variables of the environment that its `make` file takes.
+#: Sources of a firmware, and the environment variables that its `make` file reads.
 SOURCES = (".c", ".h", ".ld", ".mk")
-#: Debian's packages of the programs that it takes to build and to run it.
+#: Debian packages of the programs that build and run it.
 PROGRAMS = {
     "make": "make",
     "cc": "gcc libc6-dev",

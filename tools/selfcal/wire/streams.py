@@ -30,11 +30,11 @@ from selfcal.wire.live import told_of
 if TYPE_CHECKING:
     import can
 
-#: Where the programs listen, or look, unless they are told otherwise: PlotJuggler's UDP server, Foxglove's websocket.
+#: Default ports of the programs: PlotJuggler's UDP server, Foxglove's websocket.
 PORTS = {"udp-json": 9870, "foxglove": 8765}
 KINDS = (*PORTS, "jsonl")
 HOST = "127.0.0.1"
-#: Statistics of a parameter that are told.
+#: Statistics of a parameter in a report.
 TOLD = ("mean", "median", "sd", "q05", "q95")
 
 
@@ -49,7 +49,7 @@ class Stream(Protocol):
 
 
 def content(report: AxisReport, names: Names) -> dict[str, Any]:
-    """A report as JSON has it, by the module's `names`; what did not arrive is not there, what is no number null."""
+    """A report as JSON has it, by the module's `names`; values that did not arrive are absent, NaN is null."""
     v, unit = report.values, axis_unit(report.axis)
     entry: dict[str, Any] = {
         "node": report.node,

@@ -16,7 +16,7 @@ from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, prob
 
 #: Nodes: of the ratio for a walk, of the ratio and of alpha, and of the white noise within its likelihood's width.
 WALK, MARKOV, NOISE = 160, (110, 40), 41
-#: Width of the last, in standard deviations of ln sigma_v.
+#: Width of the grid of white noise, in standard deviations of ln sigma_v.
 REACH = 7.0
 
 

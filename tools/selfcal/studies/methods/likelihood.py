@@ -12,7 +12,7 @@ from statsmodels.tsa.statespace.structural import UnobservedComponents
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, information_criteria, logarithmic
 
-#: What statsmodels calls the laws. All have a free level, so their likelihoods are of the same samples.
+#: Names of the laws in statsmodels. All have a free level, so their likelihoods are of the same samples.
 _MODEL = {"constant": {"level": "dconstant"}, "random_walk": {"level": "llevel"}}
 _MODEL["gauss_markov"] = {"level": "dconstant", "autoregressive": 1}  # type: ignore[dict-item]
 

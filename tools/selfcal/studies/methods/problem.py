@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 REACH = 1e5
 #: Step of a derivative, in the logarithm of a parameter: a tenth of the least posterior sd at 3000 samples.
 STEP = 1e-3
-#: A Kalman filter with a level begins at the first reading, with an sd of this many times the record's.
+#: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
 LEVEL_SD = 10.0
 
 
@@ -158,7 +158,7 @@ def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
 
 
 def inverse(information: Floats) -> Floats:
-    """The inverse of a positive definite matrix; NaN if it is none: the record does not determine the parameters."""
+    """The inverse of a positive definite matrix; NaN for another one: the record does not determine the parameters."""
     try:
         np.linalg.cholesky(information)
     except np.linalg.LinAlgError:

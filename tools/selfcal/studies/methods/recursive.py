@@ -15,7 +15,7 @@ from selfcal.studies.methods.problem import Answer, Floats, Problem
 
 #: Start of the covariance of the coefficients: a thousand times their greatest square.
 START = 1e3
-#: What the first sample forgets, and how much of this each further sample keeps: the early errors are poor.
+#: Forgetting of the first sample, and the share that each further sample keeps of it: the early errors are poor.
 FORGET, KEEP = 0.05, 0.99
 #: A root of the error polynomial beyond it has no stable filter.
 STABLE = 0.99

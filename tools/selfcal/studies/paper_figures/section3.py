@@ -26,7 +26,7 @@ from selfcal.studies.paper_figures.told import Told
 
 Floats = NDArray[np.float64]
 
-#: s, at which the bank reports: the ticks of the paper's axes (Fig. 1 to 600 s, Fig. 2 to 400 s), the T of its text,
+#: Times of the bank's reports, s: the ticks of the paper's axes (Fig. 1 to 600 s, Fig. 2 to 400 s), the T of its text,
 #: and times between. At 0 the prior holds.
 MARKS = (10, 20, 50, 100, 150, 200, 250, 300, 350, 400, 450, 500, 550, 600, 1000)
 #: False identification that the paper falls below, and its T.
