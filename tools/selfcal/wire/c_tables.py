@@ -27,7 +27,7 @@ SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
 LEAST_GRID = 6
 
 
-#: Sizes by core: fineness of a report's integrals; lines of a spectrum (a Cortex-M0 has RAM for 20, enough for 5000 bank
+#: Sizes by core: fineness of report integrals; lines of a spectrum (a Cortex-M0 has RAM for 20, enough for 5000 bank
 #: samples); pushes between two steps of the nodes (a batch takes 4 sample periods at 819.2 Hz and 48 MHz there).
 CORES = {
     "host": {"REPORT_QUALITY": 2, "LINES": 36, "PUSH_EVERY": 1},
