@@ -29,7 +29,7 @@ from selfcal.batch.fleet import document_with, judged_units
 from selfcal.batch.fleet_page import page
 from selfcal.batch.spread import DEATHS, Row, spread
 from selfcal.batch.summary import document_of, lines_of, summed_up
-from selfcal.batch.table import COLUMNS, Unit
+from selfcal.batch.unit_table import COLUMNS, Unit
 from selfcal.batch.verdicts import Limits
 from selfcal.logs.recording import save
 from selfcal.model.file import Model

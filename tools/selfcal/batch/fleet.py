@@ -8,7 +8,7 @@ from typing import Any
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of
 from selfcal.batch.fail_on import outcome
-from selfcal.batch.table import Unit
+from selfcal.batch.unit_table import Unit
 from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
 
 SCHEMA = "selfcal.fleet/1"

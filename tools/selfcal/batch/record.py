@@ -17,7 +17,7 @@ from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.base.errors import UserError, first_line, printable
 from selfcal.base.output import whole
 from selfcal.batch.spread import Job, Row, spread
-from selfcal.batch.table import Unit
+from selfcal.batch.unit_table import Unit
 from selfcal.readings.tests import TESTS
 
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.

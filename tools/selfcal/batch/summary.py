@@ -28,7 +28,7 @@ from selfcal.batch.population import (
     populations,
     sd_of,
 )
-from selfcal.batch.table import Unit, best, bias_of
+from selfcal.batch.unit_table import Unit, best, bias_of
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered

@@ -273,7 +273,7 @@ _COLUMNS = (
 
 def write_verdicts(path: Path | str, judged: Iterable[Judged]) -> None:
     """Write a CSV of a row for each limit of each recording."""
-    from selfcal.batch.table import write_csv
+    from selfcal.batch.unit_table import write_csv
 
     def rows() -> Iterator[dict[str, Any]]:
         for device, recording, verdicts in judged:

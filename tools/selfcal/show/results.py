@@ -208,7 +208,7 @@ class Identification(Document):
     axes: dict[str, IdentifiedAxis]
 
     def _print(self, console: Any) -> None:
-        from selfcal.show.table import show
+        from selfcal.show.identification import show
 
         show(self, console=console)
 

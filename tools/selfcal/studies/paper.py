@@ -16,7 +16,7 @@ from selfcal.base.output import console_of
 from selfcal.show.chart import Figure, draw
 from selfcal.show.template import render
 from selfcal.studies.paper_figures import section4
-from selfcal.studies.paper_figures.told import Told
+from selfcal.studies.paper_figures.reproduction import Reproduction
 
 #: Folder of the real recordings: beside the repository by default.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
@@ -26,7 +26,9 @@ MOST_CAUSES = 5
 EXPLAINED = "adis16405_run1.npz"
 
 
-def with_reason(figures: Sequence[Told], log: Path, diagnose: Callable[..., Mapping[str, Any]]) -> list[Told]:
+def with_reason(
+    figures: Sequence[Reproduction], log: Path, diagnose: Callable[..., Mapping[str, Any]]
+) -> list[Reproduction]:
     """The figures of the real records, Fig. 5 with what the diagnosis finds in one of them."""
     entry = diagnose(log, axes=[section4.AXIS], decimate=1.0)["axes"][section4.AXIS]
     causes = [
@@ -44,14 +46,14 @@ def with_reason(figures: Sequence[Told], log: Path, diagnose: Callable[..., Mapp
     ]
 
 
-def page(figures: Sequence[Told], records: int, seed: int) -> str:
+def page(figures: Sequence[Reproduction], records: int, seed: int) -> str:
     """One self-contained page: a table of all figures, then each with its pictures."""
     pictures = [[figure.figures] if isinstance(figure.figures, Figure) else figure.figures for figure in figures]
     drawn = [[draw(picture) for picture in own] for own in pictures]
     return str(render("paper.html", figures=list(zip(figures, drawn, strict=True)), records=records, seed=seed))
 
 
-def show(figures: Sequence[Told], output: Path | str) -> None:
+def show(figures: Sequence[Reproduction], output: Path | str) -> None:
     """A line a figure, and the place of the page."""
     console = console_of()
     table = Table(box=box.SIMPLE_HEAD)

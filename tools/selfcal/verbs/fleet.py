@@ -98,7 +98,7 @@ def fleet(
     from selfcal.batch.record import ByContent, Options, Verbs, examined, killed, own_pages, settings_of
     from selfcal.batch.spread import spread
     from selfcal.batch.summary import document_of, lines_of, summed_up
-    from selfcal.batch.table import Unit, check_table, rows_of, write_table
+    from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
     from selfcal.batch.verdicts import Limits, check_options, write
     from selfcal.model.file import Model
     from selfcal.model.file import settings_of as model_settings_of

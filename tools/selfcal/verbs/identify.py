@@ -211,7 +211,7 @@ def _suspect(document: dict[str, Any], recording: Recording, model: Model, names
 def show(document: Identification, given: Mapping[str, Any]) -> int:
     """Print the table; the exit code of `--fail-on` and the limits."""
     from selfcal.batch.fail_on import exit_code
-    from selfcal.show.table import show as table
+    from selfcal.show.identification import show as table
 
     table(document, to_stderr=to_stderr(given), datasheet=given.get("datasheet", False))
     return exit_code(document, given.get("fail_on"))

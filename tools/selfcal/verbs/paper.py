@@ -11,7 +11,7 @@ from selfcal.base.options import option
 from selfcal.verbs._shared import Results, Scheduler
 
 if TYPE_CHECKING:
-    from selfcal.studies.paper_figures.told import Told
+    from selfcal.studies.paper_figures.reproduction import Reproduction
 
 
 def paper(
@@ -27,7 +27,7 @@ def paper(
     tracks: Annotated[
         Path | str | None, option("Folder for the map errors of Section 4.2, a recording a track", metavar="DIR")
     ] = None,
-) -> list[Told]:
+) -> list[Reproduction]:
     """Write the page to `output`; returns its figures.
 
     `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
@@ -43,7 +43,7 @@ def paper(
     from selfcal.model.file import Model
     from selfcal.studies.paper import DATA, EXPLAINED, page, with_reason
     from selfcal.studies.paper_figures import section3, section4, survey
-    from selfcal.studies.paper_figures.told import Told
+    from selfcal.studies.paper_figures.reproduction import Reproduction
     from selfcal.verbs.diagnose import diagnose
 
     check_writable(output)
@@ -74,7 +74,7 @@ def paper(
                 " name their folder with --data DIR"
             )
             figures.append(
-                Told(
+                Reproduction(
                     "Figs 5, 6, real",
                     (),
                     "P(random walk) goes to 1 on four accelerometer records.",
@@ -91,7 +91,7 @@ def paper(
     return figures
 
 
-def show(figures: list[Told], given: Mapping[str, Any]) -> int:
+def show(figures: list[Reproduction], given: Mapping[str, Any]) -> int:
     """Print a line a figure."""
     from selfcal.studies.paper import show as table
 

@@ -146,7 +146,7 @@ def replay(
 
 def show(document: Identification, given: Mapping[str, Any]) -> int:
     """Print the table of `identify`."""
-    from selfcal.show.table import show as table
+    from selfcal.show.identification import show as table
 
     table(document, to_stderr=to_stderr(given))
     return 0

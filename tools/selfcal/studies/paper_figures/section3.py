@@ -22,7 +22,7 @@ from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import curve, fit
 from selfcal.studies.methods.problem import Problem
 from selfcal.studies.methods.whittle import whittle
-from selfcal.studies.paper_figures.told import Told
+from selfcal.studies.paper_figures.reproduction import Reproduction
 
 Floats = NDArray[np.float64]
 
@@ -95,7 +95,7 @@ def ensemble(
     return spread(partial(rows_of, model), jobs, settings=settings, scheduler=scheduler, results=results)
 
 
-def figure_1(rows: Sequence[Row]) -> Told:
+def figure_1(rows: Sequence[Row]) -> Reproduction:
     """False identification, calculated (19) and actual (20)."""
     times = (0, *MARKS)
     t = np.array(times, dtype=float)
@@ -116,7 +116,7 @@ def figure_1(rows: Sequence[Row]) -> Told:
     below_s = t[np.logical_and.accumulate(below[::-1])[::-1]]  # and stay there
     here = f"both below 10 % from {below_s[0]:g} s on" if below_s.size else "not below 10 %"
     some = [times.index(mark) for mark in (0, 100, 200, 300, 400, 600, TEXT_S)]
-    return Told(
+    return Reproduction(
         "Fig. 1",
         Figure(
             "Fig. 1",
@@ -133,7 +133,7 @@ def figure_1(rows: Sequence[Row]) -> Told:
     )
 
 
-def figure_2(rows: Sequence[Row]) -> Told:
+def figure_2(rows: Sequence[Row]) -> Reproduction:
     """Real (16) and calculated (17) rms errors under the second hypothesis."""
     times = (0, *(mark for mark in MARKS if mark <= FIGURE_2_S))
     t = np.array(times, dtype=float)
@@ -160,7 +160,7 @@ def figure_2(rows: Sequence[Row]) -> Told:
         )
     figures = [Figure(f"Fig. 2, {label.partition(',')[0]}", "", [panel]) for label, panel in panels]
     count = len(mine[0])
-    return Told(
+    return Reproduction(
         "Fig. 2",
         figures,
         "Real and calculated rms of σm, α and σv coincide over 400 s, from the priors' 0.43, 0.026 and 0.43 on.",
@@ -191,7 +191,7 @@ def choices(seed: int) -> dict[str, float]:
     return {tool: number / (CHOICES * len(ALIKE)) for tool, number in wrong.items()}
 
 
-def figures_3_and_4(seed: int) -> list[Told]:
+def figures_3_and_4(seed: int) -> list[Reproduction]:
     """Spectrum and Allan deviation of one record of each law with the true curves, and how well they choose a law."""
     group = Model.load(PAPER).group_of("gx")
     spectra: list[Panel] = []
@@ -214,7 +214,7 @@ def figures_3_and_4(seed: int) -> list[Told]:
     )
     wrong = choices(seed)
     return [
-        Told(
+        Reproduction(
             name,
             Figure(name, made, panels),
             f"The {many} of the two laws hardly differ, and give neither the law nor its parameters by themselves.",

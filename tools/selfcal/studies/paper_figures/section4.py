@@ -19,8 +19,8 @@ from selfcal.model.tables import Tables, make_tables
 from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import fit
 from selfcal.studies.methods.problem import Problem, Value
+from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section3 import PAPER, over_time
-from selfcal.studies.paper_figures.told import Told
 
 Floats = NDArray[np.float64]
 
@@ -172,7 +172,7 @@ def real(folder: Path, model: Model) -> dict[str, Floats]:
     return records
 
 
-def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Told]:
+def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Reproduction]:
     """Probability of the random walk, its parameters, and their rms, over time."""
     reports = {name: over_time(model, AXIS, 1.0, y, MARKS) for name, y in records.items()}
     t = np.array(MARKS, dtype=float)
@@ -193,7 +193,7 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
     short = {name: over_time(short_memory(model), AXIS, 1.0, y, [DURATION])[0] for name, y in records.items()}
     limited = ", ".join(f"{one.probability['random_walk']:.3f}" for one in short.values())
     ok = all(value > 0.9 for value in last.values())
-    fifth = Told(
+    fifth = Reproduction(
         f"Fig. 5, {'real' if real_ones else 'simulated'}",
         Figure(f"Fig. 5, {kind}", f"P(random walk) against Gauss–Markov, {AXIS}, {kind}.", panels),
         "The probability of the random walk goes to 1 on all four accelerometer records.",
@@ -247,7 +247,7 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
     own = [float(errors[name].ratio[-1]) for name in SHOWN]
     return [
         fifth,
-        Told(
+        Reproduction(
             f"Fig. 6 (a, b), {where}",
             figures,
             "N 0.025 (m/s²)/√Hz and K 2e-4 (m/s³)/√Hz, nearly the same in the four records.",
@@ -255,7 +255,7 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
             "agrees" if consistent else "differs",
             "" if consistent else "The stretches are parts of three runs, whose drift is not one walk (see Fig. 5).",
         ),
-        Told(
+        Reproduction(
             f"Fig. 6 (c, d), {where}",
             rms_figures,
             f"The computed rms falls over time, to {PAPER_N_SD:g} (m/s²)/√Hz of N and 6e-5 (m/s³)/√Hz of K.",
@@ -284,7 +284,7 @@ def _parameter(title: str, seen: Sequence[AxisResult], name: str, t: Floats, lin
     return Panel(title, "time, s", unit, curves, [Band("5 to 95 %", t, low, high, "spread")], log_y=name == "K")
 
 
-def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[Told]:
+def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[Reproduction]:
     """N and K by the Allan variance; the rms that it computes against the real one; and both on the other law."""
     group = replace(model.group_of(AXIS), axes=(AXIS,))
     t = np.array(ALLAN_MARKS, dtype=float)
@@ -322,7 +322,7 @@ def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[To
     K = allan["random_walk"]["random_walk", "K"]
     small = float(np.median(K.ratio)) < 1.0 / NEAR
     slower = float(np.median(K.real / bank["random_walk"]["random_walk", "K"].real)) > 1.0
-    seventh = Told(
+    seventh = Reproduction(
         "Fig. 7",
         [*estimates, *rms],
         "The same values at the end, slower to settle, rougher; the computed rms is too small for the real scatter.",
@@ -337,7 +337,7 @@ def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[To
 
 def _both_ways(
     allan: Mapping[str, Mapping[tuple[str, str], Rms]], bank: Mapping[str, Mapping[tuple[str, str], Rms]], t: Floats
-) -> Told:
+) -> Reproduction:
     """The claim of Fig. 7 on both truths, for the right law and the wrong one."""
     panels: dict[str, list[Panel]] = {"N": [], "drift": []}
     said: list[str] = []
@@ -364,7 +364,7 @@ def _both_ways(
         for key, shown in panels.items()
     ]
     agrees = all(theirs < ours and 1.0 / NEAR < ours < NEAR for theirs, ours in right)
-    return Told(
+    return Reproduction(
         "Fig. 7, both ways",
         figures,
         "The Allan variance's computed rms is smaller than its real error, the bank's is consistent.",
@@ -398,7 +398,7 @@ def of_map_error(tables: Tables, y: Floats) -> tuple[float, tuple[float, float, 
     return report.probability["gauss_markov"], (rms / MGAL, 1.0 / alpha / 60.0, noise / MGAL / math.sqrt(AREA_STEP_S))
 
 
-def figure_8(model: Model, seed: int) -> Told:
+def figure_8(model: Model, seed: int) -> Reproduction:
     """Shares of the records for which Gauss-Markov is the more probable, and the parameters found."""
     shares, correct, fits = {}, [], {}
     rate = 1.0 / AREA_STEP_S
@@ -447,7 +447,7 @@ def figure_8(model: Model, seed: int) -> Told:
     paper_shares = ", ".join(f"{share}" for share in PAPER_SHARES.values())
     sure = 100.0 * float(np.mean(correct))
     agrees = sure >= 95.0 and negligible
-    return Told(
+    return Reproduction(
         "Fig. 8 and the shares",
         figures,
         f"Gauss–Markov is the more probable in {paper_shares} % of the records, the mean calculated probability of "

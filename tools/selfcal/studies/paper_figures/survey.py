@@ -23,8 +23,8 @@ from selfcal.base.output import check_place
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.show.chart import Curve, Figure, Panel
+from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section4 import AREA_SAMPLES, AREA_STEP_S, MGAL, map_tables, of_map_error
-from selfcal.studies.paper_figures.told import Told
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ def write_tracks(folder: Path, areas: Mapping[str, Floats]) -> None:
             save(path, {"gravity": ("mGal", track)}, 1.0 / AREA_STEP_S, t=AREA_STEP_S * np.arange(track.size))
 
 
-def figure(model: Model, areas: Mapping[str, Floats]) -> Told:
+def figure(model: Model, areas: Mapping[str, Floats]) -> Reproduction:
     """The law of the errors by area, and whether more tracks make them smaller and longer."""
     tables = map_tables(model)
     fits = {area: [of_map_error(tables, MGAL * error) for error in errors] for area, errors in areas.items()}
@@ -120,7 +120,7 @@ def figure(model: Model, areas: Mapping[str, Floats]) -> Told:
     falls = medians[-1] < medians[0]
     agrees = bool(min(shares.values()) > 50.0 and falls[0] and falls[2] and not falls[1])
     sure = 100.0 * float(np.mean([max(p, 1.0 - p) for each in fits.values() for p, _ in each]))
-    return Told(
+    return Reproduction(
         "Section 4.2, one track left out",
         [errors, *by_area],
         "Gauss–Markov is the more probable in 78 to 100 % of an area's records; the more tracks, the lower the rms "
