@@ -43,18 +43,11 @@ def _list(items: Json, **more: Any) -> Json:
     return {"type": "array", "items": items, **more}
 
 
-def model() -> Json:
-    """Of a model file."""
-    limits: dict[str, Json] = {"law": {"enum": ["log_uniform", "uniform"]}, "min": NUMBER, "max": NUMBER}
-    prior = {
-        "oneOf": [
-            _only(limits, list(limits)),
-            _only({"law": {"const": "log_normal"}, "median": NUMBER, "sd": NUMBER}, ["law", "median", "sd"]),
-        ]
-    }
+def _group() -> Json:
+    """Of a group of axes."""
     bias = _only({"law": {"const": "normal"}, "sd": NUMBER}, ["law", "sd"])
     priors = {"bias": bias, **dict.fromkeys(PLACES, PRIOR)}
-    group = _only(
+    return _only(
         {
             "axes": _list({"type": "string"}, minItems=1, maxItems=MOST_AXES),
             "unit": TEXT,
@@ -66,6 +59,17 @@ def model() -> Json:
         },
         ["axes", "unit", "priors"],
     )
+
+
+def model() -> Json:
+    """Of a model file."""
+    limits: dict[str, Json] = {"law": {"enum": ["log_uniform", "uniform"]}, "min": NUMBER, "max": NUMBER}
+    prior = {
+        "oneOf": [
+            _only(limits, list(limits)),
+            _only({"law": {"const": "log_normal"}, "median": NUMBER, "sd": NUMBER}, ["law", "median", "sd"]),
+        ]
+    }
     kinds = [
         _only({"kind": {"const": kind}, "deviation": TEXT, **dict.fromkeys(keys, NUMBER)}, ["kind"])
         for kind, keys in KEYS_OF_TERM.items()
@@ -92,7 +96,7 @@ def model() -> Json:
         "sensor": _only(
             {"name": TEXT, "rate_hz": NUMBER, "filter_taps": COUNT | {"minimum": 1, "maximum": MOST_TAPS}}, ["rate_hz"]
         ),
-        "groups": _map(group, minProperties=1),
+        "groups": _map(_group(), minProperties=1),
         "hypotheses": {
             "type": "object",
             "properties": dict.fromkeys(NAMED, NUMBER),

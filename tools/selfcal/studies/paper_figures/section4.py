@@ -172,29 +172,29 @@ def real(folder: Path, model: Model) -> dict[str, Floats]:
     return records
 
 
-def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Reproduction]:
-    """Probability of the random walk, its parameters, and their rms, over time."""
-    reports = {name: over_time(model, AXIS, 1.0, y, MARKS) for name, y in records.items()}
+def _figure_5(
+    model: Model, records: Mapping[str, Floats], reports: Mapping[str, Sequence[AxisResult]], kind: str, where: str
+) -> Reproduction:
+    """Probability of the random walk over time. `reports` at MARKS; `kind`, `where`: words for the records."""
     t = np.array(MARKS, dtype=float)
-    kind = "real" if real_ones else "simulated with the paper's values"
     panels = [
         Panel(
             name,
             "time, s",
             "probability",
             [
-                Curve("random walk", t, np.array([one.probability["random_walk"] for one in seen])),
-                Curve("Gauss–Markov", t, np.array([one.probability["gauss_markov"] for one in seen]), "fitted"),
+                Curve("random walk", t, np.array([report.probability["random_walk"] for report in seen])),
+                Curve("Gauss–Markov", t, np.array([report.probability["gauss_markov"] for report in seen]), "fitted"),
             ],
         )
         for name, seen in reports.items()
     ]
     last = {name: seen[-1].probability["random_walk"] for name, seen in reports.items()}
     short = {name: over_time(short_memory(model), AXIS, 1.0, y, [DURATION])[0] for name, y in records.items()}
-    limited = ", ".join(f"{one.probability['random_walk']:.3f}" for one in short.values())
+    limited = ", ".join(f"{report.probability['random_walk']:.3f}" for report in short.values())
     ok = all(value > 0.9 for value in last.values())
-    fifth = Reproduction(
-        f"Fig. 5, {'real' if real_ones else 'simulated'}",
+    return Reproduction(
+        f"Fig. 5, {where}",
         Figure(f"Fig. 5, {kind}", f"P(random walk) against Gauss–Markov, {AXIS}, {kind}.", panels),
         "The probability of the random walk goes to 1 on all four accelerometer records.",
         "After 3000 s: "
@@ -203,6 +203,13 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
         "agrees" if ok else "differs",
         "The default prior lets a Gauss–Markov drift last 5000 s, longer than the record: nearly a random walk.",
     )
+
+
+def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Reproduction]:
+    """Probability of the random walk, its parameters, and their rms, over time."""
+    reports = {name: over_time(model, AXIS, 1.0, y, MARKS) for name, y in records.items()}
+    t = np.array(MARKS, dtype=float)
+    kind = "real" if real_ones else "simulated with the paper's values"
     figures = []
     for letter, (name, (_, scale, paper_value)) in zip("ab", SHOWN.items(), strict=True):
         line = [] if real_ones else [Curve("the paper", t[[0, -1]], np.full(2, paper_value / scale), "fitted")]
@@ -246,7 +253,7 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
     where = "real" if real_ones else "simulated"
     own = [float(errors[name].ratio[-1]) for name in SHOWN]
     return [
-        fifth,
+        _figure_5(model, records, reports, kind, where),
         Reproduction(
             f"Fig. 6 (a, b), {where}",
             figures,
