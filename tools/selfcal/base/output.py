@@ -12,7 +12,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from selfcal.base.limits import STREAMS, named_pipe
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 
 def check_place(path: Path | str) -> None:
@@ -182,6 +183,17 @@ def console_of(*, to_stderr: bool = False, fits: bool = False) -> Console:
     elif not fits:
         console.width = max(console.width, TABLE_WIDTH)
     return console
+
+
+def table_of(headings: Iterable[str], title: str | None = None, *, wraps: bool = False, **look: Any) -> Table:
+    """A table for a terminal, with these headings; its cells wrap, or have a line each. `look`: more of Table's."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", caption_justify="left", **look)
+    for heading in headings:
+        table.add_column(heading, no_wrap=not wraps, overflow="fold" if wraps else "ellipsis")
+    return table
 
 
 def plotter() -> Any:

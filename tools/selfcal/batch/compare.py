@@ -8,12 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich import box
-from rich.table import Table
-
 from selfcal.bank.result import HALF_90
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 
 SCHEMA = "selfcal.compare/1"
 #: Least difference that counts, in standard deviations: 1 in 1600 quantities exceeds it by chance.
@@ -131,9 +128,8 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """One line a change."""
     console = console_of(to_stderr=to_stderr)
-    table = Table(box=box.SIMPLE_HEAD, title="changes beyond what the recordings leave open", title_justify="left")
-    for heading in ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings"):
-        table.add_column(heading, no_wrap=True)
+    headings = ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings")
+    table = table_of(headings, "changes beyond what the recordings leave open")
     for name, axis in document["axes"].items():
         for row in changes_of(axis):
             changed = row["what"] == "changed"

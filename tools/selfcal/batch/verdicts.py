@@ -16,7 +16,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import Any
 
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
@@ -315,9 +315,6 @@ def _counts(verdicts: Sequence[Verdict]) -> dict[str, str]:
 def _clean(text: str) -> str:
     """A text that XML can have."""
     return printable(text)
-
-
-P = ParamSpec("P")
 
 
 def write_unjudged(given: Mapping[str, Any], reason: str) -> None:

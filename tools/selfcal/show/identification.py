@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -17,7 +16,7 @@ from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.base import units
 from selfcal.base.errors import called, printable
-from selfcal.base.output import TABLE_WIDTH, console_of
+from selfcal.base.output import TABLE_WIDTH, console_of, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
@@ -55,7 +54,7 @@ def show(
     summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
     laws = _fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
-    first.title, first.title_justify = title, "left"
+    first.title = title
     if numbered:
         console.print(summary)
     console.print(laws)
@@ -85,9 +84,8 @@ _NUMBERS = {
 
 def _summary_table(axes: Mapping[str, Any], left_out: int) -> Table:
     """The numbers of a data sheet; without the intervals of the last `left_out` columns."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=left_out == 0, collapse_padding=left_out > 0)
-    for heading in ("axis", "", "in the recording's units", "as in data sheets"):
-        table.add_column(heading, no_wrap=True)
+    headings = ("axis", "", "in the recording's units", "as in data sheets")
+    table = table_of(headings, pad_edge=left_out == 0, collapse_padding=left_out > 0)
     for name, axis in axes.items():
         unit = axis["bias_now"]["unit"]
         kind = next((k for k, of in enumerate(("rad/s", "m/s^2")) if units.same_kind(unit, of)), 2)
@@ -184,19 +182,13 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
     """The table without the intervals of its last `left_out` columns."""
     brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        collapse_padding=left_out > 0,
-        pad_edge=left_out == 0,
-        caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
-        "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
-        caption_justify="left",
-    )
     known = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
     drift = "K or sigma_m" if "B" not in known else "K, sigma_m or B"
     second = "1/alpha, s" + (", or ratio" if known & set(RATIOS) else "")
-    for heading in ("law", "P", "N", drift, second):
-        table.add_column(heading, no_wrap=True)
+    caption = f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
+    caption += "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else "")
+    headings = ("law", "P", "N", drift, second)
+    table = table_of(headings, caption=caption, collapse_padding=left_out > 0, pad_edge=left_out == 0)
     for name, axis in axes.items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]
@@ -343,13 +335,8 @@ def _ahead(axes: Mapping[str, Any]) -> list[str]:
 
 
 def _regressor_table(axes: Mapping[str, Any]) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        caption="coefficients if in use: medians [5 %, 95 %]; the laws' parameters are those of each law's best subset",
-        caption_justify="left",
-    )
-    for heading in ("axis", "regressor", "P(in use)", "coefficient", "unit"):
-        table.add_column(heading, no_wrap=True)
+    caption = "coefficients if in use: medians [5 %, 95 %]; the laws' parameters are those of each law's best subset"
+    table = table_of(("axis", "regressor", "P(in use)", "coefficient", "unit"), caption=caption)
     for name, axis in axes.items():
         entries = list(axis.get("regressors", {}).items())
         for regressor, entry in entries:

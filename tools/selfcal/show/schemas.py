@@ -27,11 +27,9 @@ COUNT: Json = {"type": "integer", "minimum": 0}
 _OF = {str: "string", bool: "boolean", int: "integer", float: "number"}
 
 
-def _map(values: Json, names: Sequence[str] | None = None, **more: Any) -> Json:
-    """A mapping of these `values`; of these names alone, if there are any."""
-    return {"type": "object", "additionalProperties": values, **more} | (
-        {"propertyNames": {"enum": list(names)}} if names else {}
-    )
+def _map(values: Json, **more: Any) -> Json:
+    """A mapping of these `values`."""
+    return {"type": "object", "additionalProperties": values, **more}
 
 
 def _only(entries: Mapping[str, Json], needed: Sequence[str] = ()) -> Json:

@@ -12,11 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
 from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.tables import bank_block, make_tables
@@ -122,13 +120,9 @@ def _chosen(row: Row) -> str:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The table of calculated against actual."""
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=f"{document['records_per_law']} records per law, {document['duration_s']:g} s, axis {document['axis']}",
-        title_justify="left",
-    )
-    for heading in ("law", "parameter", "truth in 90 %", "rms actual (16)", "rms calculated (17)", "ratio"):
-        table.add_column(heading, no_wrap=True)
+    title = f"{document['records_per_law']} records per law, {document['duration_s']:g} s, axis {document['axis']}"
+    headings = ("law", "parameter", "truth in 90 %", "rms actual (16)", "rms calculated (17)", "ratio")
+    table = table_of(headings, title)
     for law, entry in document["laws"].items():
         for name, p in entry["parameters"].items():
             table.add_row(

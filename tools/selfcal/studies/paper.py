@@ -8,11 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich import box
-from rich.table import Table
-
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 from selfcal.show.chart import Figure, draw
 from selfcal.show.template import render
 from selfcal.studies.paper_figures import section4
@@ -56,9 +53,7 @@ def page(figures: Sequence[Reproduction], records: int, seed: int) -> str:
 def show(figures: Sequence[Reproduction], output: Path | str) -> None:
     """A line a figure, and the place of the page."""
     console = console_of()
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("figure", "here", ""):
-        table.add_column(heading)
+    table = table_of(("figure", "here", ""), wraps=True)
     for figure in figures:
         table.add_row(figure.name, figure.here, figure.verdict)
     console.width = max(console.width, 100)

@@ -18,7 +18,6 @@ from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -28,7 +27,7 @@ from selfcal.adequacy.identify import chosen_axes
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
-from selfcal.base.output import check_writable, console_of, write_json
+from selfcal.base.output import check_writable, console_of, table_of, write_json
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
 from selfcal.logs.recording import Recording, as_float, load
@@ -274,13 +273,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 
 
 def _table(name: str, axis: Mapping[str, Any], *, brief: bool) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=f"{printable(name)}: {axis['samples']} averages of {axis['interval_s']:g} s",
-        title_justify="left",
-    )
-    for heading in ("method", "law", "weight", "N", "K or sigma_m", "1/alpha, s", "time", "memory"):
-        table.add_column(heading, no_wrap=True)
+    title = f"{printable(name)}: {axis['samples']} averages of {axis['interval_s']:g} s"
+    table = table_of(("method", "law", "weight", "N", "K or sigma_m", "1/alpha, s", "time", "memory"), title)
     for entry in axis["rivals"].values():
         if "error" in entry:
             continue
@@ -317,19 +311,9 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
         cells.setdefault((entry["samples"], entry["law"]), []).append(entry)
     for (samples, law), entries in cells.items():
         names = NAMED[law].parameters
-        table = Table(
-            box=box.SIMPLE_HEAD,
-            title=f"{law}, {samples} samples, {entries[0]['records']} records, truth: {document['truth']}",
-            title_justify="left",
-        )
-        for heading in (
-            "method",
-            *(f"error of ln {name} over ML's" for name in names),
-            "90 % intervals hold",
-            "none",
-            "time",
-        ):
-            table.add_column(heading, no_wrap=True)
+        title = f"{law}, {samples} samples, {entries[0]['records']} records, truth: {document['truth']}"
+        errors = (f"error of ln {name} over ML's" for name in names)
+        table = table_of(("method", *errors, "90 % intervals hold", "none", "time"), title)
         for entry in entries:
             p = entry["parameters"]
             table.add_row(
@@ -340,9 +324,8 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
                 _seconds(entry["seconds"]),
             )
         console.print(table)
-    table = Table(box=box.SIMPLE_HEAD, title="choice of the law, mean over the laws", title_justify="left")
-    for heading in ("samples", "method", "by", "right", *document_laws(document), "log score"):
-        table.add_column(heading, no_wrap=True)
+    headings = ("samples", "method", "by", "right", *document_laws(document), "log score")
+    table = table_of(headings, "choice of the law, mean over the laws")
     for entry in document["choice"]:
         table.add_row(
             str(entry["samples"]),

@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 from scipy import signal
 
 from selfcal.base.errors import UserError, printable
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
 from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, as_float, load
@@ -260,9 +258,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         reckoned = entries[0]["dead_reckoning"]
         if reckoned:
             title += f"; of {RECKONED_S} s of dead reckoning"
-        table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-        for heading in ("rest", "method", *(f"after {h} s" for h in HORIZONS_S), *(RECKONED[key] for key in reckoned)):
-            table.add_column(heading, no_wrap=True)
+        after = (f"after {h} s" for h in HORIZONS_S)
+        table = table_of(("rest", "method", *after, *(RECKONED[key] for key in reckoned)), title)
         for entry in entries:
             columns = [{name: errors[str(h)] for name, errors in entry["rms_error"].items()} for h in HORIZONS_S]
             columns += entry["dead_reckoning"].values()
@@ -281,13 +278,14 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             if any(known):
                 table.add_row("", "  the white noise alone", *known, end_section=True)
         console.print(table)
-    table = Table(box=box.SIMPLE_HEAD, title="error over the least of all methods: median, worst", title_justify="left")
     regrets = document["regret"]
     reckoned = [key for key in RECKONED if key in regrets["bank"]]
-    for heading in ("method", "bias", *(RECKONED[key].partition(",")[0] for key in reckoned)):
-        table.add_column(heading, no_wrap=True)
+    headings = ("method", "bias", *(RECKONED[key].partition(",")[0] for key in reckoned))
+    table = table_of(headings, "error over the least of all methods: median, worst")
     for name, ratio in regrets.items():
-        shown = (f"{one['median']:.3g}, {one['worst']:.3g}" for one in (ratio, *(ratio[key] for key in reckoned)))
+        shown = (
+            f"{spread['median']:.3g}, {spread['worst']:.3g}" for spread in (ratio, *(ratio[key] for key in reckoned))
+        )
         table.add_row(TITLES[name], *shown)
     console.print(table)
     if document["recordings"]:

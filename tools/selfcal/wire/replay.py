@@ -327,19 +327,18 @@ def ms(period_s: float) -> int:
     return math.ceil(float(f"{period_s:.6f}") * 1000.0)
 
 
-def can_bus(channel: str, port: int | None = None) -> tuple[str, Link]:
+def can_bus(channel: str) -> tuple[str, Link]:
     """A CAN bus between programs of this machine: its name for the firmware (port/posix/can.h), and the host's link.
 
-    The CAN device `channel`, or else UDP in python-can's multicast group at `port` (default: one that is free).
+    The CAN device `channel`, or else UDP in python-can's multicast group at a free port.
     """
     from can.interfaces.udp_multicast import UdpMulticastBus
 
     if channel:
         return channel, open_bus("socketcan", channel)
-    if port is None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("", 0))
-            port = free.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
     group = UdpMulticastBus.DEFAULT_GROUP_IPv4
     return f"{group}:{port}", open_bus("udp_multicast", group, port=port)
 

@@ -24,7 +24,7 @@ from selfcal.studies.paper_figures.section3 import PAPER, over_time
 
 Floats = NDArray[np.float64]
 
-AXIS, UNIT = "ax", "m/s²"
+AXIS = "ax"
 #: The paper's result, of which the simulated records are made: m/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
 PAPER_N, PAPER_K = 0.025, 2e-4
 #: Units of the pictures, with the size of one, and the paper's value.
