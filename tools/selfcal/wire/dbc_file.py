@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from selfcal.base.errors import remark
+from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
 
 PATTERN = Path(__file__).parent / "frames.dbc"
@@ -231,29 +232,13 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
             )
             where = offset("GX_H0") + HYPOTHESES * index + k
             add("GX_H0", where, f"{big}_{small[k].upper()}", _hypothesis(names, k, unit), comment)
-    return "\n".join(_text([line.replace("MODULE", sender) for line in head], messages, whole, sender))
-
-
-def _text(head: Sequence[str], messages: Sequence[Pattern], whole: str, sender: str) -> list[str]:
-    """The lines of the file. Comments of signals stand at the first message that has them."""
-    lines = list(head)
-    for message in messages:
-        lines.append(f"BO_ {message.id} {message.name}: 8 {message.sender.replace('MODULE', sender)}")
-        for signal in message.signals:
-            lines.append(f' SG_ {signal.name}{signal.before}"{signal.unit}"{signal.after.replace("MODULE", sender)}')
-        lines.append("")
-    lines.append(whole)
     said: set[tuple[str, str]] = set()
-    for message in messages:
-        lines.append(f'CM_ BO_ {message.id} "{message.comment}";')
-        for signal in message.signals:
-            if signal.comment and ((signal.name, signal.comment) not in said):
-                lines.append(f'CM_ SG_ {message.id} {signal.name} "{signal.comment}";')
-                said.add((signal.name, signal.comment))
-    lines.append("")
-    for message in messages:
-        lines += [f"VAL_ {message.id} {signal.name} {signal.choices} ;" for signal in message.signals if signal.choices]
-    lines.append("")
-    for message in messages:
-        lines += [f"SIG_VALTYPE_ {message.id} {signal.name} : 1;" for signal in message.signals if signal.is_float]
-    return [*lines, ""]
+
+    def first_with(signal: Signal) -> bool:
+        """Whether this is the first signal of its name with its comment."""
+        known = len(said)
+        said.update([(signal.name, signal.comment)] if signal.comment else [])
+        return len(said) > known
+
+    values = {"head": head, "messages": messages, "whole": whole, "sender": sender, "first_with": first_with}
+    return of_code(Path(__file__).parent / "templates").get_template("module.dbc.jinja").render(values)

@@ -9,10 +9,12 @@ import argparse
 import re
 import textwrap
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
+from jinja2 import Template
 
 from selfcal.base.errors import UserError
 from selfcal.base.templates import of_code
@@ -53,13 +55,17 @@ class Field:
     kind: str  # uint, int or float
     scale: float
     unit: str
-    comment: str
-    choices: str
+    meaning: str
 
     @property
     def macro(self) -> str:
         """Name in C, less the prefix."""
         return self.name.upper()
+
+    @property
+    def shape(self) -> str:
+        """Kind, scale and bits in words."""
+        return f"{self.kind}{self.length}" + (f" × {self.scale:g}" if self.scale != 1.0 else "") + self.bits
 
     @property
     def bits(self) -> str:
@@ -75,8 +81,11 @@ def _as_elsewhere(signal: Signal) -> bool:
     return signal.name.startswith(f"{REASON}_")
 
 
-def _words(signal: Signal) -> str:
-    return ", ".join(f"{number} {name}" for number, name in (signal.choices or {}).items())
+def _meaning(signal: Signal) -> str:
+    """Comment and choices of a signal."""
+    words = ", ".join(f"{number} {name}" for number, name in (signal.choices or {}).items())
+    words = "" if _as_elsewhere(signal) else words
+    return (signal.comment or "").rstrip(".") + (f": {words}" if words else "")
 
 
 def _field(message: Message, signal: Signal) -> Field:
@@ -98,8 +107,7 @@ def _field(message: Message, signal: Signal) -> Field:
         kind="float" if signal.is_float else "int" if signal.is_signed else "uint",
         scale=float(signal.conversion.scale),
         unit=signal.unit or "",
-        comment=(signal.comment or "").rstrip("."),
-        choices="" if _as_elsewhere(signal) else _words(signal),
+        meaning=_meaning(signal),
     )
 
 
@@ -167,8 +175,7 @@ def header(database: Database) -> str:
         **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES, "PLACES": PLACES},
         "STATISTICS": STATISTICS,
     }
-    templates = of_code(Path(__file__).parent / "templates")
-    return templates.get_template("selfcal_frames.h.jinja").render(values)
+    return _template("selfcal_frames.h.jinja").render(values)
 
 
 def _choices(message: Message) -> list[tuple[str, int, str]]:
@@ -177,49 +184,34 @@ def _choices(message: Message) -> list[tuple[str, int, str]]:
     return [(signal.name, number, str(word)) for signal in signals for number, word in (signal.choices or {}).items()]
 
 
-def _entry(head: str, text: str) -> str:
-    """An item of a list, as long lines as the documents have."""
-    return textwrap.fill(
-        f"- {head}: {text}", 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
-    )
-
-
 def table(database: Database) -> str:
     """Every signal of every message for lib/WIRE.md, as Markdown lists."""
     check(database)
-    lines = ["Every frame:", "", _entry("bits 0 to 31, `value`", "as the item says")]
-    status = database.get_message_by_name(STATUS)
-    for name, (start, length) in COMMON.items():
-        comment = (status.get_signal_by_name(name).comment or "").rstrip(".")
-        lines.append(_entry(f"bits {start} to {start + length - 1}, `{name}`", comment))
-    titles = {}
+    status, command = map(database.get_message_by_name, (STATUS, COMMAND))
+    messages: list[tuple[str, str, list[Field], dict[str, str]]] = []
     for suffix in OF_AXIS:
-        ids = [database.get_message_by_name(a.upper() + suffix).frame_id for a in AXES]
-        said = ", ".join(f"`0x{id_:X}` {a.upper()}{suffix}" for id_, a in zip(ids, AXES, strict=True))
+        first, *_, last = of_axes = [database.get_message_by_name(axis.upper() + suffix) for axis in AXES]
+        ids = ", ".join(f"`0x{message.frame_id:X}` {message.name}" for message in of_axes)
         more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
-        titles[AXES[0].upper() + suffix] = said + more
-    titles |= {
-        name: f"`0x{database.get_message_by_name(name).frame_id:X}` {name}" for name in (STATUS, CORRECTED, ANSWER)
+        units = {field.name: field.unit for field in fields(last)}
+        messages.append((HEADINGS[suffix], ids + more, fields(first), units))
+    for message in map(database.get_message_by_name, (STATUS, CORRECTED, ANSWER)):
+        messages.append((HEADINGS[message.name], f"`0x{message.frame_id:X}` {message.name}", fields(message), {}))
+    values = {
+        "COMMON": COMMON,
+        "comments": {name: (status.get_signal_by_name(name).comment or "").rstrip(".") for name in COMMON},
+        "messages": messages,
+        "command": command,
+        "orders": [(s.start, s.start + s.length - 1, s.name, _meaning(s)) for s in command.signals],
     }
-    for name, title in titles.items():
-        lines += ["", f"### {HEADINGS[name.removeprefix(AXES[0].upper())]}", "", *textwrap.wrap(title, 120), ""]
-        suffix = name.removeprefix(AXES[0].upper())
-        theirs = [database.get_message_by_name(AXES[-1].upper() + suffix)] if suffix in OF_AXIS else []
-        accel = {field.name: field.unit for message in theirs for field in fields(message)}
-        for field in fields(database.get_message_by_name(name)):
-            kind = f"{field.kind}{field.length}" + (f" × {field.scale:g}" if field.scale != 1.0 else "")
-            unit = f", {field.unit}" if field.unit else ""
-            if accel.get(field.name, field.unit) != field.unit:
-                unit += f" (accelerometers: {accel[field.name]})"
-            meaning = field.comment + (f": {field.choices}" if field.choices else "")
-            lines.append(_entry(f"{field.item} `{field.name}`, {kind}{field.bits}{unit}", meaning))
-    command = database.get_message_by_name(COMMAND)
-    lines += ["", "### Command, from the host", "", f"`0x{command.frame_id:X}` COMMAND", ""]
-    for signal in command.signals:
-        choices = _words(signal)
-        meaning = (signal.comment or "").rstrip(".") + (f": {choices}" if choices else "")
-        lines.append(_entry(f"bits {signal.start} to {signal.start + signal.length - 1}, `{signal.name}`", meaning))
-    return "\n".join(lines) + "\n"
+    return _template("WIRE.md.jinja").render(values)
+
+
+def _template(name: str) -> Template:
+    templates = of_code(Path(__file__).parent / "templates")
+    wrap = partial(textwrap.fill, width=120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    templates.filters |= {"entry": lambda text: wrap(f"- {text}"), "wrapped": partial(textwrap.fill, width=120)}
+    return templates.get_template(name)
 
 
 def page(text: str, database: Database) -> str:
