@@ -16,7 +16,7 @@ from selfcal.base.output import write_text
 from selfcal.batch.population import Array, Population
 from selfcal.batch.summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
-from selfcal.show.template import number, render
+from selfcal.show.template import render
 
 #: Most of what the page shows: lines of a list, those not folded, units of the matrix, pictures, points of a chart.
 MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES, MOST_POINTS = 150, 15, 100, 48, 400
@@ -53,7 +53,9 @@ def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) ->
         "pages": pages,
         "commands": {name: f"selfcal diagnose {shlex.quote(path)} --report page.html" for name, path in paths.items()},
         "groups": list(group_lines(batch)),
-        "populations": [_row(population) for population in batch.populations],
+        "populations": batch.populations,
+        "plain": plain,
+        "seen_from": seen_from_words,
         "unidentified": list(unidentified_lines(batch)),
         "distributions": _drawn(
             _histogram(population, _limits(document, population.measured.name)) for population in histograms
@@ -69,25 +71,6 @@ def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) ->
 
 def _drawn(figures: Iterable[Figure]) -> Markup:
     return Markup().join(map(draw, figures))
-
-
-def _row(population: Population) -> list[str]:
-    """Cells of a quantity's population."""
-    measured, middle, spread = (
-        population.measured,
-        plain(population.measured, population.fit.middle),
-        population.fit.spread,
-    )
-    return [
-        measured.name,
-        str(measured.y.size),
-        f"{number(middle.median)} [{number(middle.q05)}, {number(middle.q95)}]",
-        unit_module.typeset(measured.unit),
-        f"{number(spread.median, 2)} [{number(spread.q05, 2)}, {number(spread.q95, 2)}]"
-        + (" of ln" if measured.logarithm else ""),
-        seen_from_words(population),
-        str(int((~population.kept).sum())),
-    ]
 
 
 def _limits(document: Mapping[str, Any], name: str) -> list[tuple[float, str]]:
@@ -154,24 +137,21 @@ def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
     x = np.asarray(shown + 1.0, np.float64)
     whole: Array = np.ones(shown.size)
     low, high = mean - INDIVIDUALS * mean_range, mean + INDIVIDUALS * mean_range
-    individuals = Panel(
-        f"{name}, individuals",
-        "unit in the order of the dates",
-        unit,
-        [Curve("units", x, y[shown], "dots")],
-        [Band("limits by the moving range", x, low * whole, high * whole, "spread")],
-    )
-    moving = Panel(
-        f"{name}, moving range",
-        "unit in the order of the dates",
-        unit,
-        [Curve("units", x, ranges[shown], "dots")],
-        [Band("limits by the moving range", x, 0.0 * whole, RANGES * mean_range * whole, "spread")],
-    )
+    charts = {"individuals": (y, low, high), "moving range": (ranges, 0.0, RANGES * mean_range)}
+    panels = [
+        Panel(
+            f"{name}, {chart}",
+            "unit in the order of the dates",
+            unit,
+            [Curve("units", x, values[shown], "dots")],
+            [Band("limits by the moving range", x, least * whole, most * whole, "spread")],
+        )
+        for chart, (values, least, most) in charts.items()
+    ]
     thinned = f" One in {every} is shown, and each beyond the limits." if every > 1 else ""
     return [
-        Figure(f"{name} by date", f"{beyond[0]} of {y.size} units lie beyond the limits.{thinned}", [individuals]),
-        Figure(f"{name}, moving range", f"{beyond[1]} ranges lie beyond the limits.{thinned}", [moving]),
+        Figure(f"{name} by date", f"{beyond[0]} of {y.size} units lie beyond the limits.{thinned}", panels[:1]),
+        Figure(f"{name}, moving range", f"{beyond[1]} ranges lie beyond the limits.{thinned}", panels[1:]),
     ]
 
 

@@ -13,7 +13,7 @@ from markupsafe import Markup
 from selfcal.base.output import write_text
 from selfcal.base.units import typeset
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
-from selfcal.show.template import number, render, spaced
+from selfcal.show.template import render
 
 #: Characters that a picture's title has room for.
 LONGEST_TITLE = 22
@@ -34,7 +34,7 @@ def page(document: Mapping[str, Any], curves: Curves) -> str:
     changes.sort(key=lambda change: -abs(change[1].get("distance_sd", np.inf)))
     title = f"Comparison of {' and '.join(names.values())}"
     values = {"document": document, "title": title, "names": names, "axes": axes, "changes": changes}
-    return str(render("comparison.html", **values, value=_value, distance=_distance, causes=_causes))
+    return str(render("comparison.html", **values))
 
 
 @dataclass(frozen=True)
@@ -73,24 +73,6 @@ def _short(recordings: Sequence[str]) -> dict[str, str]:
     """File names of the recordings; whole paths where two have one name."""
     short = [Path(log).name for log in recordings]
     return dict(zip(recordings, short if len(set(short)) == len(short) else recordings, strict=True))
-
-
-def _value(change: Mapping[str, Any], side: str) -> str:
-    if change["what"] == "changed":
-        return number(change[side], 5)
-    return "found" if (change["what"] == "appeared") == (side == "after") else "–"
-
-
-def _distance(change: Mapping[str, Any]) -> str:
-    return f"{change['distance_sd']:+.1f}".replace("-", "−") if "distance_sd" in change else ""
-
-
-def _causes(judged: Mapping[str, Any]) -> str:
-    """The causes that matter or have no name, and how many small ones there are."""
-    named = [cause for cause in judged["causes"] if cause in (*judged["material"], "unexplained")]
-    small = len(judged["causes"]) - len(named)
-    causes = ", ".join([*map(spaced, named), *([f"{small} small"] if small else [])])
-    return f": {causes}" if causes else ""
 
 
 def _deviations(name: str, curves: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]) -> Markup:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,6 @@ from markupsafe import Markup
 from selfcal.base import units
 from selfcal.base.ending import Stopped
 from selfcal.base.output import write_text
-from selfcal.diagnosis import words
 from selfcal.diagnosis.events import UNEXPLAINED, parted, times_of
 from selfcal.diagnosis.extend import fitted_law
 from selfcal.diagnosis.finding import Diagnosed, Finding
@@ -85,11 +85,12 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "inflated": inflated,
         "inflated_heads": [f"{key} without / with" for key in inflated],
         "not_found": _not_found(results),
-        "commands": _commands(document, options),
+        "log": shlex.join(recording.get("paths", [recording["path"]])),
+        "given": partial(_given, options),
         "model": _model(document),
         "records": pictures.RECORDS,
     }
-    functions = {"id": _id, "whole": _whole, "facts": _facts, "gained": _gained, "factor": _factor, "outside": _outside}
+    functions = {"id": _id, "whole": _whole, "gained": _gained, "factor": _factor, "outside": _outside}
     text = render("diagnosis.html", **values, **functions)
     if _leave_out([picture for axis in axes for picture in axis.pictures], len(_bytes(text)) - SIZE_MOST):
         text = render("diagnosis.html", **values, **functions)
@@ -267,29 +268,6 @@ def _match(finding: Entry, candidates: Sequence[Finding]) -> int | None:
     return min(same, key=lambda k: abs(candidates[k].look.gain - _nats(finding)), default=None)
 
 
-def _facts(finding: Entry) -> Iterator[tuple[str, str]]:
-    """Name and text of what is known of a finding."""
-    yield "Size (half of the 90 % interval)", words.sizes(finding["estimate"])
-    when = finding.get("when")
-    if when:
-        yield "When", f"{number(when[0], 6)} s" + ("" if when[0] == when[1] else f" to {number(when[1], 6)} s")
-    yield "Evidence when found", words.evidence(finding, _whole)
-    if finding.get("shared_with"):
-        yield "One with", ", ".join(finding["shared_with"])
-    if finding.get("also_possible"):
-        yield "It may also be", ", ".join(map(spaced, finding["also_possible"]))
-    if finding.get("record_next"):
-        yield "To make sure", str(finding["record_next"])
-    if finding.get("gain"):
-        yield "Held-out gain", f"{_gained(finding['gain'])} nats a sample"
-    elif finding.get("gain_reason"):
-        yield "Held-out gain", f"none: {finding['gain_reason']}"
-    for line in words.carried(finding):
-        yield "On the second recording", line
-    if finding.get("inflation_words"):
-        yield "Inflation", str(finding["inflation_words"])
-
-
 def _gained(gain: Entry) -> str:
     score = gain["log_score_per_sample"]
     more = score["after"] - score["before"]
@@ -329,23 +307,10 @@ def _least(key: str, value: Any) -> str:
     return f"{spaced(key.removesuffix('_hz').removesuffix('_s'))} {text}{unit}"
 
 
-def _commands(document: Entry, options: Options) -> list[str]:
-    """The commands that reproduce the page."""
-
-    def given(*left_out: str) -> str:
-        wanted = [(name, value) for name, value in options if name not in left_out]
-        return "".join(f" {name} {shlex.quote(value)}" if value else f" {name}" for name, value in wanted)
-
-    recording = document["recording"]
-    log = shlex.join(recording.get("paths", [recording["path"]]))
-    # A simulated recording states all that.
-    how_read = ("--rate", "--column", "--unit", "--scale", "--no-time", "--skip-bad")
-    return [
-        f"selfcal diagnose {log}{given()} --report report.html --json report.json --write-model extended.yaml",
-        "selfcal simulate extended.yaml -o simulated.npz --seed 1",
-        f"selfcal diagnose simulated.npz{given(*how_read)}",
-        f"selfcal identify {log}{given('--model')} --model extended.yaml",
-    ]
+def _given(options: Options, leave: Sequence[str] = ()) -> str:
+    """Options as they are typed, but those to `leave`."""
+    wanted = [(name, value) for name, value in options if name not in leave]
+    return "".join(f" {name} {shlex.quote(value)}" if value else f" {name}" for name, value in wanted)
 
 
 def _model(document: Entry) -> str:
