@@ -71,12 +71,12 @@ def identify_axis(
     block: int = 1,
     ahead_s: float = 0.0,
 ) -> AxisResult:
-    """Posterior of one axis under the continuous priors of its group.
+    """Posterior of an axis under the continuous priors of its group.
 
     `y` float64[n] in the group's unit every `dt` s, NaN where a sample is missing; `r` float64[n] is the factor on the
     white noise variance of each (None: 1). `hypotheses`: prior probability by name. `z` float64[n, p] are the columns
     of the regressors in use, less their references, with the prior `coefficient_sd` of each. `y` are means of `block`
-    samples. The bias is the one `ahead_s` after the last of them. Raises UserError without a sample, and when a
+    samples. The bias is at `ahead_s` after the last of them. Raises UserError without a sample, and when a
     posterior would take more than `_MOST` nodes.
     Source: Stepanov & Motorin (2017), equations (11) to (14).
     """

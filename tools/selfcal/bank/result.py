@@ -1,4 +1,4 @@
-"""What an engine says of one axis; every number in the units of the axis, continuous time (units.py)."""
+"""The answer of an engine on an axis; every number in the units of the axis, continuous time (units.py)."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def of_mixture(
 
 @dataclass(frozen=True)
 class Estimate:
-    """Posterior of one parameter under one hypothesis. `off_grid`: the grid of nodes is too coarse (selfcal.h)."""
+    """Posterior of a parameter under a hypothesis. `off_grid`: the grid of nodes is too coarse (selfcal.h)."""
 
     mean: float
     median: float
@@ -69,7 +69,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class AxisResult:
-    """Posterior of one axis. Keys are hypothesis names, then parameter names (N, K, sigma_m, alpha).
+    """Posterior of an axis. Keys are hypothesis names, then parameter names (N, K, sigma_m, alpha).
 
     `n` bank samples; `log_evidence` in nats; `bias` is x0 + drift at the last bank sample, with regressors in use x0 +
     drift + c z there. `coefficients`: mean and sd by hypothesis, in the order of the columns in use.

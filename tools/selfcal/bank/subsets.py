@@ -20,7 +20,7 @@ LIKELY = 0.05
 
 @dataclass(frozen=True)
 class Coefficient:
-    """Posterior of one column's coefficient if it is in use, over all subsets with it; of each subset under the law
+    """Posterior of a column's coefficient if it is in use, over all subsets with it; of each subset under the law
     that leaves it most open (LIKELY)."""
 
     column: str
@@ -45,7 +45,7 @@ class Scored:
     """All subsets of the regressors weighed together.
 
     `result`: probabilities, evidence and bias over all subsets; parameters of each law are those of its most probable
-    subset. `probability` [subsets] of each choice; `best` is the most probable one.
+    subset. `probability` [subsets] of each choice; `best` is the most probable.
     """
 
     result: AxisResult

@@ -1,4 +1,4 @@
-"""Files from strangers: the largest sizes that are read, and one line for whatever a library raises over one."""
+"""Files from strangers: the largest sizes that are read, and a line for whatever a library raises over them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MOST_META_BYTES, MOST_MODEL_BYTES = 1 << 20, 1 << 18
 MOST_MODEL_VALUES = 10_000
 #: Lowest and highest sampling rate, Hz.
 LEAST_RATE_HZ, MOST_RATE_HZ = 1e-6, 1e6
-#: Sampling rates in one recording.
+#: Sampling rates in a recording.
 MOST_CLOCKS = 8
 #: Longest span of a recording: seconds, and samples, missing ones included. A law takes 20 000 intervals, each of at
 #: most 10^6 s and 2^32 samples (lib/bank.c).

@@ -51,7 +51,7 @@ def incomparable(verdicts: Mapping[str, Mapping[str, Any] | None]) -> str | None
 
 
 def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Any]:
-    """Verdict and causes of an axis of one recording, or why one of the two has no result."""
+    """Verdict and causes of an axis of a recording, or why one of the two has no result."""
     error = diagnosed.get("error", identified.get("error"))
     if error is not None:
         return {"error": error}

@@ -1,11 +1,11 @@
-"""The drift of a unit from recording to recording: the slope of each quantity over the dates, and whether it is one.
+"""The drift of a unit from recording to recording: the slope of each quantity over the dates, if it is significant.
 
 A unit's quantity y (ln N, ln K, ... or the bias itself) at the day d, measured with the error s of its posterior:
 
     y = a + b d + e,    e ~ N(0, s^2 + r^2)
 
-r is how far a quantity comes out differently at each new start. All units that have three dates or more have one r:
-the one whose weighted squares of the residuals are as many as their degrees of freedom. So b over its standard
+r is how far a quantity comes out differently at each new start. All units with three dates or more share an r:
+the weighted squares of their residuals are as many as their degrees of freedom. So b over its standard
 deviation is Student's t of as many. A unit that scatters more than the others has an r of its own.
 """
 
@@ -55,7 +55,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Drift:
-    """The slope of a device's quantity, of its logarithm or of itself, a day; `log_p` of so steep a one by chance."""
+    """The slope of a device's quantity, of its logarithm or of itself, a day; `log_p` of so steep a slope by chance."""
 
     at: int
     quantity: str
@@ -75,7 +75,7 @@ class Drift:
 
 
 def drifts_of(series: Iterable[Series]) -> list[Drift]:
-    """The slope of each. FALSE_ALARM, that a unit without drift has one, is shared among its quantities."""
+    """The slope of each. Its quantities share FALSE_ALARM, the probability of a drift of a unit without drift."""
     quantities: dict[str, list[Series]] = {}
     of_unit: dict[int, int] = {}
     for history in series:

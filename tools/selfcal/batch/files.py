@@ -51,7 +51,7 @@ class Source:
 
 
 def matching(patterns: Sequence[str], own: Sequence[Path]) -> list[str]:
-    """The files that the patterns name, each once, in the order of their names. A folder is one of ROS 2.
+    """The files that the patterns name, each once, in the order of their names. A folder is a recording of ROS 2.
 
     `own`: outputs of this command, files or folders, which a pattern may match as well. They are no recordings.
     A line names each link to nothing, pipe and device. It names a folder only where `patterns` names it, as a shell's
@@ -140,7 +140,7 @@ def sources_of(
     """The recordings of the patterns but the outputs `own`, with device, station, lot and date by the table of units.
     A file that the table does not name has its device by `serial_from`.
 
-    A recording under two names of one device is one source. Under the names of two devices the second is a source
+    A recording under two names of the same device is one source. Under the names of two devices the second is a source
     with `copy_of`: that device has no recording of its own.
     Raises UserError for a pattern without files, and for an invalid table or `serial_from`.
     """

@@ -242,7 +242,7 @@ def populations(
 
 
 def _is_group(inside: int, units: int) -> bool:
-    """Whether so many of the units are a group beside the others: not the larger part, and neither too few."""
+    """Whether so many of the units are a group among the others: not the larger part, and neither too few."""
     return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
 
 
@@ -264,7 +264,7 @@ def _groups(groupings: Sequence[Grouping]) -> Groups:
 
 
 def _apart(measured: Measured, groups: Groups, limit: float, group_limit: float) -> list[Apart]:
-    """The groups of a quantity that differ, the one that differs most first."""
+    """The groups of a quantity that differ, the largest difference first."""
     apart: list[Apart] = []
     y = measured.y.copy()
     for _ in range(_ROUNDS):
@@ -316,7 +316,7 @@ def _seen_from(y: Array, s: Array, limit: float) -> float:
 
 
 def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
-    """The units [n] that are not odd: `limit` is the ln probability of one that is."""
+    """The units [n] that are not odd: `limit` is the ln probability of an odd unit."""
     middle, spread = robust(y, s)
     order = np.argsort(-np.abs(y - middle) / np.hypot(spread, s))
     most = min(math.ceil(MOST_ODD * y.size), y.size - FEWEST)
@@ -331,7 +331,7 @@ def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
 
 
 def _split(measured: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
-    """The smaller of two groups in which the units lie, if two are better than one by _SPLIT.
+    """The smaller of two groups in which the units lie, if two are better than a single group by _SPLIT.
 
     Each cut of the sorted units gives two normals of one spread. Their likelihood counts each unit's group as drawn."""
     order = np.flatnonzero(kept)[np.argsort(y[kept])]

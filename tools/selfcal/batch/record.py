@@ -119,7 +119,7 @@ def own_pages(
 
 
 def _paged(verbs: Verbs, options: Options, job: Job) -> list[Row]:
-    """Write the page of one recording. `job`: its absolute path, the page's place."""
+    """Write the page of a recording. `job`: its absolute path, the page's place."""
     with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(UserError, MemoryError):
         given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
         verbs.diagnose(job[0], report=job[1], **given)

@@ -67,7 +67,7 @@ def record_seeds(records: int, seed: int) -> list[int]:
 
 
 def checked_seed(seed: int) -> int:
-    """The seed. Raises UserError for one that the simulator does not take."""
+    """The seed. Raises UserError for a seed that the simulator does not take."""
     if not 0 <= seed < SEEDS:
         raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {shown(seed)}")
     return seed
@@ -90,7 +90,7 @@ def spread(
 
     `settings`: everything that decides the rows beside the jobs; a folder of other settings is refused. `piece`: jobs
     that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this package.
-    `results`: the folder, or what keeps the pieces. `count`: workers here, by default one for each processor. `lost`:
+    `results`: the folder, or what keeps the pieces. `count`: workers here, by default as many as processors. `lost`:
     the rows of a job whose workers die; without it such a job ends the work. `weights` [jobs]: the work of each, for
     the remaining time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.
     Raises UserError for a package that is absent and a scheduler that does not answer.
@@ -185,7 +185,7 @@ def _end_with_the_command() -> None:
 
 @contextmanager
 def workers(count: int | None = None) -> Iterator[ProcessPoolExecutor]:
-    """Processes that work for this one; `count`: one for each processor by default.
+    """Processes that work for this process; `count`: as many as processors by default.
 
     A worker that is killed ends the work that waits for it with BrokenProcessPool. Leaving the block by an exception
     ends the workers at once.

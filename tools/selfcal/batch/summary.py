@@ -159,7 +159,7 @@ def group_of(kind: str, unit: Unit) -> str:
 
 
 def sound_of(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list[Mapping[str, Any]]]:
-    """The results of an axis by device, of the devices that have one."""
+    """The results of an axis, by device."""
     results = {
         name: [unit.axes[axis] for unit in units if axis in unit.axes and "error" not in unit.axes[axis]]
         for name, units in devices.items()
@@ -173,16 +173,16 @@ def axes_of(devices: Mapping[str, Sequence[Unit]]) -> list[str]:
 
 
 def _behind(axis: Mapping[str, Any]) -> dict[str, float]:
-    """How many nats each law is behind the best one."""
+    """Evidence of each law below the best law, nats."""
     evidence = {law: value for law, value in axis["log_evidence"].items() if value is not None}
     best = max(evidence.values())
     return {law: best - value if math.isfinite(value) else math.inf for law, value in evidence.items()}
 
 
 def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
-    """The law that the batch has, by axis: most units are of it where each is of one law, by the greatest likelihood.
+    """The law that the batch has, by axis: the law of most units, by the greatest likelihood of their shares.
 
-    An odd unit counts as one, however many nats it has. Expectation and maximization in turn find the shares."""
+    An odd unit weighs no more than another, however many nats it has. Expectation and maximization find the shares."""
     laws_of: dict[str, str] = {}
     for axis in axes_of(devices):
         behind = [_behind(result) for axes in sound_of(devices, axis).values() for result in axes]
@@ -224,7 +224,7 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
 
 
 def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: Sequence[Regressor]) -> dict[str, Known]:
-    """What one recording says of each parameter of a law, each coefficient of a regressor, and the bias.
+    """Parameters of a law, coefficients of regressors, and the bias, by a recording.
 
     A unit whose own law has N where the batch's has no number is compared by its own."""
     parameters: Mapping[str, Mapping[str, Any]] = axis["parameters"][law]
@@ -268,7 +268,7 @@ def _coefficient(estimate: Mapping[str, Any], sd: float) -> Known | None:
 
 
 def _without(known: Known, mean: float, sd: float) -> Known | None:
-    """Less a normal prior, which is one more measurement. None: hardly anything is left."""
+    """A quantity without its normal prior. None: hardly anything is left."""
     own = known.s**-2 - sd**-2
     if own < LEAST_WEIGHT * sd**-2:
         return None
@@ -278,7 +278,7 @@ def _without(known: Known, mean: float, sd: float) -> Known | None:
 def _measured(
     known: Mapping[str, OfAxis], names: Sequence[str], laws: Mapping[str, str], unidentified: dict[str, tuple[int, int]]
 ) -> Iterator[Measured]:
-    """Each quantity over the devices. Several recordings of one count together; of the bias the last counts.
+    """Each quantity over the devices. Recordings of a device count together; of the bias the last counts.
 
     A quantity that too few units identify goes to `unidentified`."""
     index = {name: k for k, name in enumerate(names)}
@@ -457,7 +457,7 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
 
 
 def lines_of(batch: Batch) -> Iterator[str]:
-    """A line for each population, each quantity without one, axis left out, group that is apart and shared cause."""
+    """A line for each population, quantity without population, axis left out, group apart, and shared cause."""
     for population in batch.populations:
         measured = population.measured
         middle, spread = plain(measured, population.fit.middle), population.fit.spread

@@ -76,7 +76,7 @@ def bias_of(axis: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
-    """The rows of a recording. A recording, or an axis, without a result is one row with its `error`."""
+    """The rows of a recording. A recording, or an axis, without a result is a row with its `error`."""
     source = unit.source
     head = dict(zip(COLUMNS, (unit.device, source.path, unit.recorded_at, source.station, source.lot), strict=False))
     head |= {"sha256": source.sha256, "version": version}
@@ -128,7 +128,7 @@ def write_table(path: Path | str, rows: Iterator[dict[str, Any]]) -> None:
 
 
 def write_csv(path: Path | str, columns: Sequence[str], rows: Iterator[dict[str, Any]]) -> None:
-    """Write rows with these columns; one that is absent or None is an empty cell."""
+    """Write rows with these columns; a value that is absent or None is an empty cell."""
     with (
         whole(path) as temporary,
         temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream,

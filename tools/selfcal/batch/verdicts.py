@@ -258,7 +258,7 @@ def _normal(x: float) -> float:
 
 
 def code_of(verdicts: Iterable[Verdict]) -> int:
-    """Exit code: 0 all pass, 1 one fails, 2 one is open or not judged."""
+    """Exit code: 0 all pass, 1 a limit fails, 2 a limit is open or not judged."""
     there = {verdict.verdict for verdict in verdicts}
     return 1 if FAIL in there else 2 if there & {OPEN, UNJUDGED} else 0
 
@@ -286,7 +286,7 @@ def write_verdicts(path: Path | str, judged: Iterable[Judged]) -> None:
 def write_junit(path: Path | str, judged: Sequence[Judged]) -> None:
     """Write JUnit's XML: a suite for each recording, a case for each limit.
 
-    A case without a verdict is an error, not a skipped one: a line must not take it for passed.
+    A case without a verdict is an error, not skipped: a line must not take it for passed.
     """
     whole_batch = _counts([verdict for _, _, verdicts in judged for verdict in verdicts])
     del whole_batch["skipped"]  # the schema has it of a suite alone

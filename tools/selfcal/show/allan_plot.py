@@ -65,7 +65,7 @@ def figure_of(document: Mapping[str, Any], *, datasheet: bool = False) -> Any:
         Patch(color=MODEL, alpha=0.15, label="where the recording may lie"),
         Line2D([], [], color=OUTSIDE, marker="o", markersize=9, fillstyle="none", linestyle="", label="outside"),
     ]
-    # Four in a row are wider than the picture of one axis.
+    # Four in a row are wider than the picture of an axis.
     figure.legend(handles=handles, loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
     return figure
 

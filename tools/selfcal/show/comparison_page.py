@@ -70,7 +70,7 @@ def _axis(
 
 
 def _short(recordings: Sequence[str]) -> dict[str, str]:
-    """File names of the recordings; whole paths where two have one name."""
+    """File names of the recordings; whole paths where two names are equal."""
     short = [Path(log).name for log in recordings]
     return dict(zip(recordings, short if len(set(short)) == len(short) else recordings, strict=True))
 

@@ -1,8 +1,8 @@
 """Noise parameters in the form other programs read, a template of `templates/export/` a format.
 
 Each takes the worst axis of a kind (largest median) and says which in a comment. K is that of the random-walk law;
-under a Gauss-Markov drift that is what the drift does over times short against 1/alpha. Beside each number stands the
-other estimate: of the medians the overbound (overbound.py), of the overbound the median.
+under a Gauss-Markov drift it is the drift over times short against 1/alpha. A comment has the
+other estimate of each number: of the medians the overbound (overbound.py), of the overbound the median.
 """
 
 from __future__ import annotations

@@ -110,7 +110,7 @@ def _number(spread: Mapping[str, Any], number: Mapping[str, Any], *, brief: bool
 
 
 def _by_reason(axes: Iterable[tuple[Reason, str]]) -> dict[Reason, str]:
-    """The axes that share a reason, in one text. `axes`: each reason with the name of its axis."""
+    """Names of the axes of each reason. `axes`: each reason with the name of its axis."""
     names_of: dict[Reason, list[str]] = {}
     for reason, name in axes:
         names_of.setdefault(reason, []).append(name)
@@ -264,7 +264,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
 
 
 def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
-    """What speaks against the laws: a line an event or source. The statistics of an axis that shows one are its own."""
+    """Evidence against the laws: a line an event or source, which covers the statistics of its axes."""
     events: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
     named: set[str] = set()
     for name, axis in axes.items():
@@ -311,7 +311,7 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
 
 
 def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether two axes fail a check by one event or source."""
+    """Whether two axes fail a check by the same event or source."""
     match check:
         case "jump":
             return bool(abs(a["time_s"] - b["time_s"]) < ONE_EVENT_S)
@@ -361,7 +361,7 @@ def _interval(
     datasheet: str = "",
     brief: bool = False,
 ) -> str:
-    """Median and interval of the one of `names` that a law has, `brief` without the interval; `datasheet`: unit of the
+    """Median and interval of the law's parameter among `names`, `brief` without the interval; `datasheet`: unit of the
     axis, to be turned into that of data sheets."""
     name = next((name for name in names if name in parameters), None)
     if name is None:

@@ -59,7 +59,7 @@ class Compared:
 
 @dataclass
 class _Pair:
-    """Curve and band of one state."""
+    """Curve and band of a state."""
 
     measured: Array
     low: Array
@@ -86,7 +86,7 @@ def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> t
 
 
 def _ensembles(items: Sequence[Compared]) -> dict[tuple[int, int], _Pair]:
-    """Every band. Each state is simulated once for all the pictures that need it: one record in memory at a time."""
+    """Every band. Each state is simulated once for all the pictures that need it: with a record in memory at a time."""
     jobs: dict[int, list[tuple[int, int, Compared]]] = {}
     states: dict[int, State] = {}
     for number, item in enumerate(items):

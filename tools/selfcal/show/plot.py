@@ -38,7 +38,7 @@ def plot_run(
     """Save the picture of complete reports by axis; the suffix of `path` chooses the format. `names`: of hypotheses and
     parameters; each parameter has a panel.
 
-    Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales that axes of one unit share; alpha
+    Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales, alike for axes of a unit; alpha
     as 1/alpha in s. Above each panel stands the last report's verdict, or the median and interval of its likeliest law.
     `units` of the axes' readings; default: telemetry's. `sent_in`: what the reports of axes of other names are in.
     `truth`, of a simulated recording: per axis its `hypothesis` and parameters, drawn dashed. Raises UserError if it
@@ -140,7 +140,7 @@ def _values(reports: Sequence[AxisReport], signal: str) -> NDArray[np.float64]:
 
 
 def _verdict(last: Mapping[int, float], truth: Any, hypotheses: Sequence[str]) -> tuple[str, str]:
-    """The most probable hypothesis with its probability and the true one, if there is one; and its colour."""
+    """The most probable hypothesis with its probability, the true one if known; and its colour."""
     finite = {k: probability for k, probability in last.items() if math.isfinite(probability)}
     if not finite:
         return "outside the priors", "black"
@@ -152,7 +152,7 @@ def _verdict(last: Mapping[int, float], truth: Any, hypotheses: Sequence[str]) -
 
 
 def _true(truth: Any, parameter: str, unit: str) -> float | None:
-    """A parameter's true value in the picture's unit, if the recording states one that can be drawn."""
+    """A parameter's true value in the picture's unit; None if the recording states none that can be drawn."""
     if not isinstance(truth, Mapping):
         return None
     value = truth.get("N_with_lattice", truth.get("N")) if parameter == "N" else truth.get(parameter)

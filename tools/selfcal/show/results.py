@@ -91,7 +91,7 @@ class Recording(Object):
 
 
 class Posterior(Object):
-    """Of one parameter under one law, in `unit`; q05 and q95 bound the 90 % interval. `identified`: the record says
+    """A parameter under a law, in `unit`; q05 and q95 bound the 90 % interval. `identified`: the record says
     more than the prior. `off_grid`: the truth may lie beyond what the model's grid of nodes can show."""
 
     mean: float
@@ -228,7 +228,7 @@ class Identification(Document):
                     }
 
     def plot(self, path: Path | str | None = None, *, datasheet: bool = False) -> Picture | None:
-        """The Allan deviation of each axis beside the model's, as `identify --plot` has it: a picture, which a notebook
+        """The Allan deviation of each axis with the model's, as `identify --plot` has it: a picture, which a notebook
         shows, or the file `path`. `datasheet`: in the units of data sheets. Raises UserError."""
         from selfcal.base.output import check_picture, png_of
         from selfcal.show.allan_plot import figure_of, plot_allan

@@ -1,4 +1,4 @@
-"""Pages out of the templates in `templates/`: every text is escaped, numbers and units are set in one way."""
+"""Pages out of the templates in `templates/`: every text is escaped, numbers and units are set alike."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def number(value: float, digits: int = 4) -> str:
 
 
 def interval(estimate: Mapping[str, Any] | None) -> str:
-    """A parameter with its 90 % interval, if it has one."""
+    """A parameter with its 90 % interval, if known."""
     if not estimate or estimate.get("median") is None:
         return "–"
     q05, q95 = estimate.get("q05"), estimate.get("q95")

@@ -217,7 +217,7 @@ class Filters:
         self.update(measure, gps - expected, np.full((1, 3), GPS_SD_M**2))
 
     def move(self, readings: Floats) -> None:
-        """Strapdown by the readings [filters or 1, 6] of one interval."""
+        """Strapdown by the readings [filters or 1, 6] of an interval."""
         dt = 1.0 / RATE_HZ
         corrected = readings - self.constant - self.drift
         rate, force = corrected[:, :3], corrected[:, 3:]
@@ -242,7 +242,7 @@ class Filters:
         self.predict(move, kept, variance, noise)
 
     def predict(self, move: Floats, kept: Floats, variance: Floats, noise: Floats | float = 0.0) -> None:
-        """The drift and the covariance over one interval."""
+        """The drift and the covariance over an interval."""
         self.drift = self.drift * kept
         self.covariance = move @ self.covariance @ move.transpose(0, 2, 1) + noise
         np.einsum("...ii->...i", self.covariance)[:, _DRIFT] += variance

@@ -17,7 +17,7 @@ from selfcal.studies.paper_figures.reproduction import Reproduction
 
 #: Folder of the real recordings: beside the repository by default.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
-#: Causes of one recording that the page names.
+#: Causes of a recording that the page names.
 MOST_CAUSES = 5
 #: A look at the real records that explains a difference: this recording, by 1 s means.
 EXPLAINED = "adis16405_run1.npz"

@@ -29,7 +29,7 @@ LEAST = 3
 
 @dataclass(frozen=True)
 class Known:
-    """The bias at a time, s of the recording, and the coefficients [p] of the model's columns; 0 of one not in use."""
+    """The bias at a time, s of the recording, and the coefficients [p] of the model's columns; 0 if not in use."""
 
     time_s: float
     bias: float

@@ -1,7 +1,7 @@
 """DBC files of modules, written from the pattern `frames.dbc`.
 
 The pattern holds one message of each kind, for axis gx and hypothesis 0. Here it becomes a file with a message for
-every axis and hypothesis: `lib/selfcal.dbc`, whose names are places, or that of one module, whose names are a model's.
+every axis and hypothesis: `lib/selfcal.dbc`, with names of places, or the file of a module, with a model's names.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ PATTERN = Path(__file__).parent / "frames.dbc"
 AXIS_UNITS = {"gx": "deg/s", "gy": "deg/s", "gz": "deg/s", "ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}
 #: Identifier of node 0's first message, identifiers of a node, and nodes of a bus.
 BASE, NODE_IDS, NODES = 0x200, 128, 12
-#: Hypotheses, parameters of one hypothesis, and regressor columns that telemetry has room for.
+#: Hypotheses, parameters of a hypothesis, and regressor columns that telemetry has room for.
 HYPOTHESES, PLACES, COLUMNS = 8, 3, 6
 #: Names of the places where no model gives better ones.
 PLACE_NAMES = ("N", "p1", "p2")
@@ -136,7 +136,7 @@ def _in_unit(unit: str) -> Callable[[Signal], Signal]:
 
 
 def _hypothesis(names: Names, k: int, reading: str) -> Callable[[Signal], Signal | None]:
-    """Signals of one hypothesis: a place that it lacks has none."""
+    """Signals of a hypothesis, without the places that it lacks."""
 
     def change(signal: Signal) -> Signal | None:
         place, _, statistic = signal.name.partition("_")

@@ -42,9 +42,9 @@ LEAST_EVIDENCE = -(2**31) * 0.001
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward and backward are alike
 BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
-FOREIGN_STATUSES = 2  # whole statuses in a row that state another version, of a module that stated this one before
-TWINS = 3  # statuses that only two modules can have sent; a restart on the way of a status looks like one of them
-RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter; a stream is no stranger's from then
+FOREIGN_STATUSES = 2  # whole statuses in a row with another version, of a module that stated this version before
+TWINS = 3  # statuses that only two modules can have sent; a restart within a status looks like it
+RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is no stranger's from then
 
 
 #: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
@@ -105,7 +105,7 @@ REASONS = {
 
 def reasons(*messages: Mapping[str, float]) -> dict[str, str]:
     """Why each axis has no calibration to rely on, in the DBC's words; axes without a reason are left out. `messages`:
-    status and corrected sample, as far as they came; of two the later one counts."""
+    status and corrected sample, as far as they came; of two the later counts."""
     known: dict[str, str] = {}
     latest = -math.inf
     for values in messages:
@@ -155,7 +155,7 @@ def frame_crc(frame_id: int, data: bytes) -> int:
 
 @dataclass
 class Statistics:
-    """Frames of one stream.
+    """Frames of a stream.
 
     `lost` were sent but not accepted, by the counters; those that arrived `damaged` (checksum) are among
     them. `refused` had a wrong form (id, length, item), a value that cannot be, or a counter that repeats or goes back.
@@ -171,7 +171,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class AxisReport:
-    """What arrived of one axis's report.
+    """What arrived of an axis's report.
 
     `values` by signal name, units as in the DBC; those of hypothesis k begin with `hk_`. `time_s`: module time when it
     was begun, to the second below if the opening frame is missing.
@@ -343,7 +343,7 @@ def node_of(identifier: int) -> int | None:
 
 
 class Decoder:
-    """Turns the frames of one node into reports and keeps the count of what went wrong.
+    """Turns the frames of a node into reports and keeps the count of what went wrong.
 
     `from_start`: the stream is watched from the module's first frame, so frames lost before the first accepted one
     count too.
@@ -366,9 +366,9 @@ class Decoder:
         #: Module time of the first status, ms, and of the last.
         self.status_ms: tuple[int, int] | None = None
         self._good = 0  # frames of a right form and checksum since the last status
-        self._last_sent: int | None = None  # its frames_sent, and the one from which a status went back
+        self._last_sent: int | None = None  # its frames_sent, and the count from which a status went back
         self._left_sent: int | None = None
-        self._twins = 0  # statuses that one module cannot have sent
+        self._twins = 0  # statuses that a single module cannot have sent
         self._counter: int | None = COUNTER - 1 if from_start else None
         self._origin: int | None = 0 if from_start else None  # frames_sent of the first frame watched
         self._sent = 0  # frames sent since then, as far as known
@@ -382,7 +382,7 @@ class Decoder:
     def foreign(self) -> str:
         """What is wrong if the module speaks another version of the wire; empty if it does not.
 
-        A module that has spoken this one has to state another in FOREIGN_STATUSES whole statuses in a row.
+        A module that has spoken this version has to state another in FOREIGN_STATUSES whole statuses in a row.
         """
         if self._other is None or self._ours:
             return ""
@@ -393,7 +393,7 @@ class Decoder:
 
     @property
     def twins(self) -> str:
-        """What is wrong if two modules send as this node; empty if they do not. Their reports are none of either."""
+        """What is wrong if two modules send as this node; empty if they do not. Their reports are of neither."""
         return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= TWINS else ""
 
     @property
@@ -402,7 +402,7 @@ class Decoder:
         return bool(self.foreign) and self._others >= FOREIGN_STATUSES
 
     def feed(self, message: can.Message) -> list[AxisReport]:
-        """Take one frame; return the reports that it closes (none, one or two)."""
+        """Take a frame; return the reports that it closes (none, one or two)."""
         kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
         if (
             kind is None
@@ -495,7 +495,7 @@ class Decoder:
             self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
 
     def _look_for_twin(self, sent: int) -> None:
-        """Count a status that no one module can have sent, by the frames that have come since the last one.
+        """Count a status that no single module can have sent, by the frames that have come since the last one.
 
         More have come than were sent. Or the count goes on from where it was before it went back, and too few have come
         for that: after a restart the count begins anew."""
@@ -633,9 +633,9 @@ def _whole(values: Mapping[str, float]) -> bool:
 
 
 class Streams:
-    """The decoders of all nodes that are heard, one each.
+    """The decoders of all nodes that are heard, by node.
 
-    A node is heard from its first good frame on: its form and its checksum are right. `node`: look at this one alone.
+    A node is heard from its first good frame on: its form and its checksum are right. `node`: look at this node alone.
     """
 
     def __init__(self, *, node: int | None = None) -> None:
@@ -645,7 +645,7 @@ class Streams:
 
     @staticmethod
     def of(decoder: Decoder) -> Streams:
-        """Those of one decoder that is there already."""
+        """Streams of a decoder that is there already."""
         streams = Streams(node=decoder.node)
         streams.decoders[decoder.node] = decoder
         return streams
@@ -858,7 +858,7 @@ def _leave_out_line_feeds(port: Any) -> None:
 
 
 def _check_port(interface: str, channel: str) -> None:
-    """Raises UserError if a channel can be no serial port, `PATH` or `PATH@BAUD`; a URL of pyserial's may be one."""
+    """Raises UserError if a channel can be no serial port, `PATH` or `PATH@BAUD`; a URL of pyserial's may be a port."""
     if "://" in channel:
         return
     name, _, baud = channel.partition("@")

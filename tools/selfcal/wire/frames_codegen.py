@@ -24,7 +24,7 @@ from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTI
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
-#: Messages of one axis, by what follows its name, with what their items are called in C. Those of all axes are alike.
+#: Messages of an axis, by what follows its name, and the name of their items in C; alike for all axes.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
 #: Messages that modules send.
 SENT = ("", "_H0", "_COEFFICIENTS", "_ADEQUACY")
@@ -46,7 +46,7 @@ LATER = re.compile(r"c[1-9]_")
 
 @dataclass(frozen=True)
 class Field:
-    """One signal of one item: bits `start` to `start + length - 1` of the 32-bit value."""
+    """One signal of an item: bits `start` to `start + length - 1` of the 32-bit value."""
 
     name: str
     item: int

@@ -1,4 +1,4 @@
-"""The live view of the telemetry of one module or several, for the terminal."""
+"""The live view of the telemetry of a module or several, for the terminal."""
 
 from __future__ import annotations
 
@@ -114,8 +114,8 @@ class Patient(io.TextIOBase):
 
 @contextmanager
 def patient() -> Iterator[None]:
-    """Within, stderr is a Patient where it is a terminal: a view on one that nobody reads ends as any other. It stays
-    one where the terminal still does not read at the end."""
+    """Within, a terminal's stderr is a Patient: a view that nobody reads ends as any other. It stays a Patient if the
+    terminal still does not read at the end."""
     if not sys.stderr.isatty():
         yield
         return
@@ -276,7 +276,7 @@ class View:
         width = self._console.width
         modules = {node: self._module(node) for node in self._streams.known}
         first = next(iter(modules.values()), None)
-        numbered = not set(modules) <= {0}  # a bus of which node 0 is not the only one
+        numbered = not set(modules) <= {0}  # a bus with other nodes than node 0
         title = Text(self._title, "bold") if numbered else self._title_of(self._title, first)
         parts: list[RenderableType] = [_line(self._verdict(modules)), _line(title)]
         if self._total_s is not None and not whole:
@@ -334,7 +334,7 @@ class View:
         return f"{names}: {REASONS.get(word, word)}" if word else ""
 
     def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
-        """What is to be seen of one module, below its title; `height` lines at most."""
+        """What is to be seen of a module, below its title; `height` lines at most."""
         foreign = module.decoder.foreign
         if foreign:
             return [*_flow([Text(word, "bold red") for word in foreign.split()], width, 1), self._counts(module)]
@@ -389,7 +389,7 @@ class View:
         ]
 
     def _counts(self, module: Module) -> Text:
-        """The frames of one module, and, if it is the only one, of strangers."""
+        """The frames of a module, and of strangers if it is alone."""
         whole = len(self._streams.known) == 1
         said = frame_counts(self._streams, self._source) if whole else counted(module.decoder.statistics)
         return _line(Text(said, "dim"))
@@ -465,7 +465,7 @@ def _told(status: Mapping[str, float], name: str) -> str:
 
 
 def counted(s: Statistics) -> str:
-    """What became of the frames of one stream."""
+    """What became of the frames of a stream."""
     foreign = f", {s.foreign} foreign" if s.foreign else ""
     return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused{foreign}"
 
@@ -481,8 +481,8 @@ def told_of(report: AxisReport) -> int:
 
 
 def most_probable(report: AxisReport, names: Names = BY_PLACE) -> int | None:
-    """The hypothesis with the greatest probability; None if one that did not arrive, or is no number, could be
-    greater. Where the report does not tell how many there are, a model's `names` do."""
+    """The hypothesis with the greatest probability; None if a missing probability, or NaN, could be
+    greater. If the report lacks their number, a model's `names` have it."""
     count = report.hypotheses or (len(names.hypotheses) if names.known else None)
     signals = {k: f"h{k}_probability" for k in range(told_of(report))}
     known = {k: report.values[signal] for k, signal in signals.items() if signal in report.values}
@@ -579,7 +579,7 @@ def _spark(trend: Sequence[float], sd: float, cells: int) -> str:
 
 
 def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> list[str]:
-    """The parameters of the most probable hypothesis, medians with their intervals; first N, or why there is none.
+    """The parameters of the most probable hypothesis, medians with their intervals; first N, or why it is missing.
     `named`: its name before them, as without a model's names."""
     k = most_probable(report, names)
     if k is None:

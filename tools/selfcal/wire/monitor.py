@@ -1,4 +1,4 @@
-"""`selfcal monitor`: live view of the telemetry of one module or several on any python-can interface, or of a log."""
+"""`selfcal monitor`: live view of the telemetry of a module or several on any python-can interface, or of a log."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Axes of any name and unit on the wire of the host's module: each takes the message of an axis that it does not have.
 
 Telemetry has messages for six axes in fixed units. A number in it has no unit of its own, so any axis fits. Axes of one
-group take messages of one unit, those of the accelerometer first: the gate watches a gyro in its own way.
+group take messages of the same unit, the accelerometer's first: the gate watches a gyro in its own way.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from selfcal.wire.dbc_file import AXIS_UNITS
 
 
 def places(model: Model, axes: Sequence[str]) -> dict[str, str]:
-    """By axis the one whose message it takes: itself where it has one. Raises UserError for a standard axis in another
-    unit, and where there is no room."""
+    """Message of each axis, by the axis it is named after; a standard axis has its own. Raises UserError for a standard
+    axis in another unit, and without room."""
     for name in axes:
         unit = model.group_of(name).unit
         if name in AXIS_UNITS and AXIS_UNITS[name] != unit:

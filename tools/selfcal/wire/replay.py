@@ -358,8 +358,8 @@ def running(
     """The running firmware, the channel its telemetry comes by, and what it said before; killed at the end. The host's
     ends by itself where this process is killed before.
 
-    `more`: arguments for the host's (port/posix/main.c). The channel is empty if the firmware did not get as far as
-    having one: then it is ending.
+    `more`: arguments for the host's (port/posix/main.c). The channel is empty if the firmware ended before it opened
+    a channel.
     """
     with socket.create_server(("127.0.0.1", 0)) if TARGETS[target].board else nullcontext() as server:
         if server is None:

@@ -66,7 +66,7 @@ def own_seed(law: str, seed: int) -> int:
 
 
 def rows_of(model: Model, job: tuple[str, int]) -> list[Row]:
-    """A row for each mark of one record, and one of the prior, at 0."""
+    """A row for each mark of a record, and one of the prior, at 0."""
     law, seed = job
     group = model.group_of("gx")
     truth = draw(group, law, np.random.default_rng([seed, list(NAMED).index(law)]))
