@@ -340,8 +340,8 @@ def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float
 
 
 def _moved(key: str, prior: Prior, end: int, least: Mapping[str, float]) -> Prior:
-    """A prior of the same width, moved towards an end, but to no invisible size, and to no drift that is white noise to the
-    bank."""
+    """A prior of the same width, moved towards an end, but to no invisible size, and to no drift that the bank takes for
+    white noise."""
     if key == "alpha" and end > 0:
         return prior
     width = prior.max / prior.min

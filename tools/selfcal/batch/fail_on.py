@@ -16,8 +16,8 @@ INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
 
 @dataclass(frozen=True)
 class Outcome:
-    """Exit code: 0 every axis was judged and passed, 1 it applies to an axis, 2 an axis could not be judged. `lines`: the
-    reasons, by axis."""
+    """Exit code: 0 every axis was judged and passed, 1 it applies to an axis, 2 an axis could not be judged. `lines`:
+    the reasons, by axis."""
 
     code: int
     lines: list[str] = field(default_factory=list)

@@ -1,7 +1,8 @@
 """`fleet --write-model`: the batch as the priors of a module's model file.
 
 A new unit's parameter is drawn from the population: log-normal about its mean. Its sd has the spread between units, how
-well the batch determines this spread and the mean, and what sets lots apart. A station's or a day's part does not count.
+well the batch determines this spread and the mean, and what sets lots apart. The part of a station or a day is left
+out.
 """
 
 from __future__ import annotations
