@@ -340,7 +340,7 @@ def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float
 
 
 def _moved(key: str, prior: Prior, end: int, least: Mapping[str, float]) -> Prior:
-    """A prior of the same width, moved towards an end, but to no invisible size, and to no drift that the bank takes for
+    """A prior of the same width, moved towards an end, but to no invisible size, and to no drift the bank takes for
     white noise."""
     if key == "alpha" and end > 0:
         return prior
