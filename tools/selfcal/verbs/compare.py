@@ -9,19 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError, called
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ, Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    ModelFile,
-    Report,
-    Start,
-    Verdicts,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Recording
@@ -33,8 +21,8 @@ def compare(
         Sequence[Path | str | Recording], argument(f"Recordings of one part: {READ}", "LOG LOG...", kind=list[Path])
     ],
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
     decimate: Annotated[
         float | None, option("Diagnose block means at this rate; default: every sample", metavar="HZ")
     ] = None,
@@ -45,14 +33,14 @@ def compare(
             metavar="changed|inadequate|material|CAUSE",
         ),
     ] = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    start_s: Start = None,
-    end_s: End = None,
-    gate: Gate = False,
-    json: Json = None,
-    report: Report = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    gate: shared.Gate = False,
+    json: shared.Json = None,
+    report: shared.Report = None,
     **reading: Unpack[Reading],
 ) -> Comparison:
     """Identify and diagnose each of `logs`, and compare each with the one before it.
@@ -152,5 +140,5 @@ def show(document: Comparison, given: Mapping[str, Any]) -> int:
     from selfcal.batch.compare import show as table
     from selfcal.batch.fail_on import exit_code
 
-    table(document, to_stderr=to_stderr(given))
+    table(document, to_stderr=shared.to_stderr(given))
     return exit_code(document, given.get("fail_on"))

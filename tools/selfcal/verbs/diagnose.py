@@ -10,23 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError, note
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    FailOn,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    Logs,
-    ModelFile,
-    Report,
-    SincePowerOn,
-    Start,
-    Verdicts,
-    on_a_line,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.base.ending import Held
@@ -38,34 +22,34 @@ if TYPE_CHECKING:
     from selfcal.show.results import Diagnosis
 
 
-@on_a_line
+@shared.on_a_line
 def diagnose(
-    log: Logs,
+    log: shared.Logs,
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
     decimate: Annotated[
         float | None, option("Look at means at this rate alone; default: means of 1 s, then every sample", metavar="HZ")
     ] = None,
     full_rate: Annotated[
         bool, option("Look at every sample at once, not at means of 1 s first", "--full-rate")
     ] = False,
-    json: Json = None,
-    report: Report = None,
+    json: shared.Json = None,
+    report: shared.Report = None,
     write_model: Annotated[
         Path | str | None, option("Write the model file with what was found in it", metavar="MODEL.yaml")
     ] = None,
     on: Annotated[
         Path | str | None, option("Measure each finding's gain on a second recording of the part", metavar="LOG")
     ] = None,
-    fail_on: FailOn = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    gate: Gate = False,
+    fail_on: shared.FailOn = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    gate: shared.Gate = False,
     details: Annotated[bool, option("Print every finding of each axis too", "--details")] = False,
     **reading: Unpack[Reading],
 ) -> Diagnosis:
@@ -186,42 +170,33 @@ def _looked(
 ) -> tuple[Record, dict[str, Diagnosed], dict[str, Diagnosed], dict[str, str]]:
     """The look at means, whose findings go to stderr, then at every sample: the record, what the first look found, what
     both found together, and why the other axes have no result."""
-    from selfcal.diagnosis.diagnose import (
-        FIRST_FROM,
-        FIRST_HZ,
-        LEAST_HZ,
-        below_lattice,
-        by_identify,
-        less_stated,
-        looked_at,
-        show_first,
-        why_not,
-    )
+    from selfcal.diagnosis import diagnose as looks
     from selfcal.diagnosis.loop import INTERRUPTED
     from selfcal.diagnosis.record import of_recording
     from selfcal.diagnosis.verdict import joined
 
     first: dict[str, Diagnosed] = {}
     record = of_recording(recording, model, decimate, names)
-    if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
+    long = recording.samples >= looks.FIRST_FROM and recording.rate_hz >= looks.LEAST_HZ
+    if decimate is None and not full_rate and long:
         means = None
         with suppress(UserError):  # a recording that is too short for means is looked at once
-            means = of_recording(recording, model, FIRST_HZ, names)
+            means = of_recording(recording, model, looks.FIRST_HZ, names)
         if means is not None and record.axes:
-            first = looked_at(means, names, ending, doing)
-            show_first(recording, first, [name for name in names if name in record.axes], ending)
-    seen = looked_at(record, names, ending, doing, first) if not ending.asked else {}
+            first = looks.looked_at(means, names, ending, doing)
+            looks.show_first(recording, first, [name for name in names if name in record.axes], ending)
+    seen = looks.looked_at(record, names, ending, doing, first) if not ending.asked else {}
     diagnosed: dict[str, Diagnosed] = {}
     for name in names:
-        only_means = name not in seen and below_lattice(record, name)
+        only_means = name not in seen and looks.below_lattice(record, name)
         axis = first.get(name) if only_means else joined(seen.get(name), first.get(name), INTERRUPTED)
         if axis is not None:
-            diagnosed[name] = less_stated(axis, model)
+            diagnosed[name] = looks.less_stated(axis, model)
     if not ending.asked:
         doing.now("checks")
-        by_identify(diagnosed, recording, model)
+        looks.by_identify(diagnosed, recording, model)
     errors = {
-        name: seen[name].unfinished if name in seen else why_not(recording, model, record, name)
+        name: seen[name].unfinished if name in seen else looks.why_not(recording, model, record, name)
         for name in names
         if name not in diagnosed
     }
@@ -233,5 +208,5 @@ def show(document: Diagnosis, given: Mapping[str, Any]) -> int:
     from selfcal.batch.fail_on import exit_code
     from selfcal.show.findings import show as table
 
-    table(document, to_stderr=to_stderr(given), details=bool(given.get("details")))
+    table(document, to_stderr=shared.to_stderr(given), details=bool(given.get("details")))
     return exit_code(document, given.get("fail_on"))

@@ -9,22 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError, note, short
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    FailOn,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    ModelFile,
-    Scheduler,
-    SincePowerOn,
-    Start,
-    Verdicts,
-    Workers,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.batch.files import Named
@@ -50,26 +35,26 @@ def fleet(
         Path | str | None, option("Columns file, device, and station, lot, date", metavar="UNITS.csv")
     ] = None,
     diagnose: Annotated[bool, option("Look for causes too; slower", "--diagnose")] = False,
-    fail_on: FailOn = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    json: Json = None,
+    fail_on: shared.FailOn = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    json: shared.Json = None,
     report: Annotated[Path | str | None, option("Write a page of the batch", metavar="FILE.html")] = None,
     write_model: Annotated[
         Path | str | None, option("Write the model with the batch as a new unit's priors", metavar="FILE.yaml")
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
     results: Annotated[
         Path | str | None, option("Folder of finished recordings; default: FILE.parts", metavar="DIR")
     ] = None,
-    axes: Axes = (),
-    model: ModelFile = None,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    gate: Gate = False,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    gate: shared.Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Identify every recording of the batch and write the table `output`, .csv or .parquet.
@@ -199,5 +184,5 @@ def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     """Print the devices that need a look; the exit code of the batch."""
     from selfcal.batch.fleet import show as table
 
-    table(document, to_stderr=to_stderr(given))
+    table(document, to_stderr=shared.to_stderr(given))
     return int(document["code"])

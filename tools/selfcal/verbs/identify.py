@@ -11,22 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 from selfcal.base.errors import UserError, say_once
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    FailOn,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    Logs,
-    ModelFile,
-    SincePowerOn,
-    Start,
-    Verdicts,
-    on_a_line,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.likelihood.state import Look
@@ -38,17 +23,17 @@ if TYPE_CHECKING:
 LARGEST_OVERBOUND = 0.99999
 
 
-@on_a_line
+@shared.on_a_line
 def identify(
-    log: Logs,
+    log: shared.Logs,
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
     engine: Annotated[Literal["library", "reference", "fixed"], option("What computes")] = "library",
     decimate: Annotated[
         float | None, option("Rate of the block means instead of the model file's", metavar="HZ")
     ] = None,
-    json: Json = None,
+    json: shared.Json = None,
     plot: Annotated[
         Path | str | None, option("Save the Allan deviations beside the model's (.png .pdf .svg)", metavar="FILE")
     ] = None,
@@ -78,14 +63,14 @@ def identify(
         bool,
         option("No second look at the axes that are not adequate", "--no-suspicion", kind=bool, made=operator.not_),
     ] = True,
-    fail_on: FailOn = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    gate: Gate = False,
+    fail_on: shared.FailOn = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    gate: shared.Gate = False,
     **reading: Unpack[Reading],
 ) -> Identification:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
@@ -213,5 +198,5 @@ def show(document: Identification, given: Mapping[str, Any]) -> int:
     from selfcal.batch.fail_on import exit_code
     from selfcal.show.identification import show as table
 
-    table(document, to_stderr=to_stderr(given), datasheet=given.get("datasheet", False))
+    table(document, to_stderr=shared.to_stderr(given), datasheet=given.get("datasheet", False))
     return exit_code(document, given.get("fail_on"))

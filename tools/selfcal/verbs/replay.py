@@ -10,29 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 from selfcal.base.errors import UserError, note, say_once
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    From,
-    Gate,
-    Json,
-    Logs,
-    ModelFile,
-    SincePowerOn,
-    Start,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.show.results import Identification
 
 
 def replay(
-    log: Logs,
+    log: shared.Logs,
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
-    start: From = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
+    start: shared.From = None,
     target: Annotated[
         Literal["host", "cortex-m4f", "cortex-m0"], option("Where the firmware runs: here, or in QEMU")
     ] = "host",
@@ -45,11 +34,11 @@ def replay(
     report_every: Annotated[
         float | None, option("Seconds between reports; default: 100 in all, fewer in QEMU", metavar="S")
     ] = None,
-    gate: Gate = False,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    json: Json = None,
+    gate: shared.Gate = False,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    json: shared.Json = None,
     plot: Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")] = None,
     **reading: Unpack[Reading],
 ) -> Identification:
@@ -148,5 +137,5 @@ def show(document: Identification, given: Mapping[str, Any]) -> int:
     """Print the table of `identify`."""
     from selfcal.show.identification import show as table
 
-    table(document, to_stderr=to_stderr(given))
+    table(document, to_stderr=shared.to_stderr(given))
     return 0
