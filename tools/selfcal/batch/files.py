@@ -188,10 +188,10 @@ def _serials(paths: Sequence[str], serial_from: str | None) -> dict[str, str]:
         return {path: _within(pattern, path) if pattern else stem(path) for path in paths}
     if kind:
         raise UserError(f"--serial-from takes name, name:PATTERN or field, not '{short(serial_from or '')}'")
-    return _told_apart({path: stem(path) for path in paths})
+    return _with_folders({path: stem(path) for path in paths})
 
 
-def _told_apart(named: Mapping[str, str]) -> dict[str, str]:
+def _with_folders(named: Mapping[str, str]) -> dict[str, str]:
     """Names that several files have become their paths."""
     counted: dict[str, int] = {}
     for name in named.values():

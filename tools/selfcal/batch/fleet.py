@@ -16,13 +16,6 @@ SCHEMA = "selfcal.fleet/1"
 MOST_NAMES = 40
 
 
-def version_of_package() -> str:
-    """The version that a table states."""
-    import selfcal
-
-    return str(selfcal.__version__)
-
-
 def judged_units(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
     """The verdicts of each recording. A group's limit holds for the axes that any recording of the batch has."""
     stated = limits.of({name for unit in batch for name in unit.axes})

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -275,12 +275,12 @@ def write_verdicts(path: Path | str, judged: Iterable[Judged]) -> None:
     """Write a CSV of a row for each limit of each recording."""
     from selfcal.batch.unit_table import write_csv
 
-    def rows() -> Iterator[dict[str, Any]]:
-        for device, recording, verdicts in judged:
-            for verdict in verdicts:
-                yield {"device": device, "recording": recording, **verdict.entry()}
-
-    write_csv(path, _COLUMNS, rows())
+    rows = (
+        {"device": device, "recording": recording, **verdict.entry()}
+        for device, recording, verdicts in judged
+        for verdict in verdicts
+    )
+    write_csv(path, _COLUMNS, rows)
 
 
 def write_junit(path: Path | str, judged: Sequence[Judged]) -> None:
@@ -292,14 +292,16 @@ def write_junit(path: Path | str, judged: Sequence[Judged]) -> None:
     del whole_batch["skipped"]  # the schema has it of a suite alone
     suites = ElementTree.Element("testsuites", {"name": "selfcal limits", **whole_batch})
     for device, recording, verdicts in judged:
-        suite = ElementTree.SubElement(suites, "testsuite", {"name": _clean(device), **_counts(verdicts), "time": "0"})
+        suite = ElementTree.SubElement(
+            suites, "testsuite", {"name": printable(device), **_counts(verdicts), "time": "0"}
+        )
         properties = ElementTree.SubElement(suite, "properties")
-        ElementTree.SubElement(properties, "property", {"name": "recording", "value": _clean(recording)})
+        ElementTree.SubElement(properties, "property", {"name": "recording", "value": printable(recording)})
         for verdict in verdicts:
-            head = {"classname": _clean(device), "name": _clean(verdict.limit.name), "time": "0"}
+            head = {"classname": printable(device), "name": printable(verdict.limit.name), "time": "0"}
             case = ElementTree.SubElement(suite, "testcase", head)
             if verdict.verdict != PASS:
-                kind = {"message": _clean(verdict.words), "type": verdict.verdict}
+                kind = {"message": printable(verdict.words), "type": verdict.verdict}
                 ElementTree.SubElement(case, "failure" if verdict.verdict == FAIL else "error", kind)
     ElementTree.indent(suites)
     with whole(path) as temporary:
@@ -310,11 +312,6 @@ def _counts(verdicts: Sequence[Verdict]) -> dict[str, str]:
     failures = sum(verdict.verdict == FAIL for verdict in verdicts)
     errors = sum(verdict.verdict in (OPEN, UNJUDGED) for verdict in verdicts)
     return {"tests": str(len(verdicts)), "failures": str(failures), "errors": str(errors), "skipped": "0"}
-
-
-def _clean(text: str) -> str:
-    """A text that XML can have."""
-    return printable(text)
 
 
 def write_unjudged(given: Mapping[str, Any], reason: str) -> None:

@@ -74,10 +74,11 @@ def fleet(
     """
     from functools import partial
 
+    import selfcal
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.fail_on import check
     from selfcal.batch.files import DATE_FORM
-    from selfcal.batch.fleet import document_with, judged_units, version_of_package
+    from selfcal.batch.fleet import document_with, judged_units
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
     from selfcal.batch.record import ByContent, Options, Verbs, examined, killed, own_pages, settings_of
@@ -113,7 +114,7 @@ def fleet(
         {**reading, **({} if dbc is None else {"dbc": str(Path(dbc).absolute())})},
         {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
     )
-    version = version_of_package()
+    version = str(selfcal.__version__)
     keeper = ByContent(folder, settings_of(options, model_settings_of(loaded), version))
     sources = [source for source in named.sources if not source.copy_of]
     records = spread(
