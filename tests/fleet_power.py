@@ -32,7 +32,7 @@ from selfcal.base import units
 from selfcal.batch.files import Source
 from selfcal.batch.population import FALSE_NAME, fit
 from selfcal.batch.summary import OTHER_LAW, Batch, summed_up
-from selfcal.batch.table import Unit
+from selfcal.batch.unit_table import Unit
 from selfcal.model.file import DEFAULT, Model, read_yaml
 from selfcal.model.tables import make_tables
 from selfcal.studies.montecarlo import simulate_bank_samples

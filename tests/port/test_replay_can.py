@@ -24,7 +24,7 @@ from test_replay import SHIPPED, part_of_shipped
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
-from selfcal.show.table import show
+from selfcal.show.identification import show
 from selfcal.verbs.demo import demo
 from selfcal.verbs.monitor import monitor
 from selfcal.verbs.replay import replay

@@ -38,7 +38,7 @@ from selfcal.logs.recording import as_float, save
 from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN, named
 from selfcal.model.tables import make_tables
-from selfcal.show.table import show
+from selfcal.show.identification import show
 from selfcal.verbs.identify import identify
 
 from conftest import shared_recording

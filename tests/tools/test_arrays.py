@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 import selfcal
 from selfcal import Recording, UserError
+from selfcal.show.identification import show
 from selfcal.show.results import Identification, Picture
-from selfcal.show.table import show
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path[:0] = [str(ROOT / "tests" / room) for room in ("", "cases", "tools")]  # where this is run as a program

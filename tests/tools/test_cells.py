@@ -16,7 +16,7 @@ import h5py
 import numpy as np
 import pytest
 
-from selfcal.batch.table import COLUMNS, write_csv
+from selfcal.batch.unit_table import COLUMNS, write_csv
 from selfcal.logs.recording import load
 from selfcal.verbs.convert import convert
 

@@ -13,7 +13,7 @@ from test_page import HOSTILE, Page
 
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
-from selfcal.show.compare_page import page
+from selfcal.show.comparison_page import page
 from selfcal.verbs.compare import compare
 
 

@@ -6,6 +6,7 @@ Truth: the files that a test writes, their parameters, and the bytes of an undis
 from __future__ import annotations
 
 import csv
+import html
 import importlib.util
 import json
 import math
@@ -25,10 +26,10 @@ from selfcal.base.errors import UserError
 from selfcal.base.units import factor
 from selfcal.batch.files import Source
 from selfcal.batch.fleet import document_with, judged_units
-from selfcal.batch.page import page
+from selfcal.batch.fleet_page import page
 from selfcal.batch.spread import DEATHS, Row, spread
 from selfcal.batch.summary import document_of, lines_of, summed_up
-from selfcal.batch.table import COLUMNS, Unit
+from selfcal.batch.unit_table import COLUMNS, Unit
 from selfcal.batch.verdicts import Limits
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
@@ -514,7 +515,7 @@ def test_the_page_stays_small(tmp_path: Path) -> None:
     assert len(text.encode()) < 1_000_000
     assert "<script" not in text and "http://" not in text and "https://" not in text
     assert "broken &lt;b&gt;" in text and "<b>d00107</b>: gx.K " in text
-    assert text.count("<svg viewBox") > 9 and "data sheet&#x27;s limit" in text
+    assert text.count("<svg viewBox") > 9 and "data sheet's limit" in html.unescape(text)
     assert set(summary.unlike) >= {f"d{k:05}" for k in range(7, len(batch), 100) if k % 200 != 3}
     out = os.environ.get("SELFCAL_PAGE")
     if out:

@@ -24,7 +24,7 @@ from selfcal.logs.recording import save
 from selfcal.model.file import NODES, Model, Prior
 from selfcal.model.laws import PLAIN
 from selfcal.model.tables import make_tables
-from selfcal.show.table import show
+from selfcal.show.identification import show
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 

@@ -37,7 +37,7 @@ from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, outside_of
-from selfcal.show.page import page, write_page
+from selfcal.show.diagnosis_page import page, write_page
 
 from conftest import run
 

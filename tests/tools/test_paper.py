@@ -22,7 +22,7 @@ from selfcal.model.file import Model
 from selfcal.show.chart import Figure, Panel
 from selfcal.studies.paper import show
 from selfcal.studies.paper_figures import section3, section4, survey
-from selfcal.studies.paper_figures.told import Told
+from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.verbs.identify import identify
 from selfcal.verbs.paper import paper
 from selfcal.verbs.part import part
@@ -87,7 +87,7 @@ def test_the_laws_of_figs_3_and_4_share_no_noise() -> None:
     assert abs(np.corrcoef(steps)[0, 1]) < 4.0 / math.sqrt(599)
 
 
-def panels_of(told: Told) -> Sequence[Panel]:
+def panels_of(told: Reproduction) -> Sequence[Panel]:
     """The panels of a figure of one picture."""
     assert isinstance(told.figures, Figure)
     return told.figures.panels

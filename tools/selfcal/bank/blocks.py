@@ -17,9 +17,9 @@ from selfcal.readings.readings import mostly_beyond
 
 #: Bank samples a report needs (SELFCAL_REPORT_MIN).
 REPORT_MIN = 3
-#: Averages that are too few where the rest of the readings, all but this share, are in averages of which most is lost.
+#: Fewest whole averages, and the share of readings in them: too few, if other averages have lost most of their samples.
 FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
-#: Bank intervals, gaps included, that are worked out one by one for the checks and the reference.
+#: Bank intervals, gaps included, that the checks and the reference compute one by one.
 MOST_DENSE = 10_000_000
 
 
@@ -60,7 +60,7 @@ def usable_blocks(
     present = blocks.mean[np.isfinite(blocks.mean)]
     needed = REPORT_MIN + len(tables.regressors)
     kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
-    found = f"{present.size} averages of {tables.dt_s:g} s"
+    averages = f"{present.size} averages of {tables.dt_s:g} s"
     whole = float((tables.block / blocks.r[np.isfinite(blocks.mean)]).sum())
     each = int(np.isfinite(samples).sum())
     if most := mostly_beyond(samples, group):
@@ -68,9 +68,9 @@ def usable_blocks(
     alone = f": --decimate {tables.block / tables.dt_s:.6g} takes each reading alone"
     if present.size < needed:
         more = alone if tables.block > 1 and each >= needed else ""
-        raise UserError(f"too short: {found}, {needed} are needed (samples kept out: {kept}){more}")
+        raise UserError(f"too short: {averages}, {needed} are needed (samples kept out: {kept}){more}")
     if present.size < FEWEST_WHOLE and whole < WHOLE_SHARE * each:
-        raise UserError(f"too few whole averages: {found} hold {whole:.0f} of the {each} readings{alone}")
+        raise UserError(f"too few whole averages: {averages} hold {whole:.0f} of the {each} readings{alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
         raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")
@@ -104,18 +104,18 @@ def block_means(
     reasons = kept_out(samples, group)
     usable = ~np.logical_or.reduce(list(reasons.values()))
     counts = {"missing": int(missing_before.sum()), **{what: int(mask.sum()) for what, mask in reasons.items()}}
-    at = np.cumsum(missing_before)
-    at += np.arange(samples.size)
+    position = np.cumsum(missing_before)
+    position += np.arange(samples.size)
     if not usable.any():
         raise UserError(f"no usable sample: all are saturated (range {group.range:g} {group.unit}) or stuck")
-    begin = int(at[np.argmax(usable)] - at[0])
-    at -= at[np.argmax(usable)]
+    begin = int(position[np.argmax(usable)] - position[0])
+    position -= position[np.argmax(usable)]
     columns = np.empty((samples.size, 0)) if columns is None else columns
-    count = min(int(at[-1] + 1) // block, MOST_DENSE + 1)
+    count = min(int(position[-1] + 1) // block, MOST_DENSE + 1)
     if not usable.all():
-        samples, at, columns = samples[usable], at[usable], columns[usable]
-    after = int(at[-1] + 1) % block
-    index = np.floor_divide(at, block, out=at)
+        samples, position, columns = samples[usable], position[usable], columns[usable]
+    after = int(position[-1] + 1) % block
+    index = np.floor_divide(position, block, out=position)
     end = int(np.searchsorted(index, count))
     values, index, rows = samples[:end], index[:end], columns[:end]
     used = np.bincount(index, minlength=count)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 #: Bytes of a frame's identifier and of the whole frame, as the module hands it over.
 IDENTIFIER, FRAME = 4, 12
-#: Rows between two looks at the frames.
+#: Rows between two reads of the frames.
 ROWS = 4096
 
 
@@ -27,11 +27,11 @@ class Played:
     malformed = 0
 
     def __init__(self, model: Model, tables: Tables, rows: Path, period_ms: int, gate: bool) -> None:
-        found = gate_table(model, tables)
+        table = gate_table(model, tables)
         watched = None
-        if found is not None:
-            numbers = (found.window, found.false_alarm, found.hold, found.settle, found.memory)
-            watched = (*numbers, list(found.sigma), list(found.is_rate))
+        if table is not None:
+            numbers = (table.window, table.false_alarm, table.hold, table.settle, table.memory)
+            watched = (*numbers, list(table.sigma), list(table.is_rate))
         self._module: Any = _firmware.Module(
             *arguments(tables),
             _columns(tables),
@@ -51,14 +51,14 @@ class Played:
         return bool(self._module.ended) and not self._frames
 
     def recv(self, timeout: float) -> can.Message | None:
-        """The next frame; None once closed, or if ROWS rows went by without one."""
+        """The next frame; None once closed, or if ROWS rows gave no frame."""
         import can
 
         if not self._frames and not self._module.ended:
             sent: bytes = self._module.play(ROWS)
-            for at in range(0, len(sent), FRAME):
-                identifier = int.from_bytes(sent[at : at + IDENTIFIER], "little")
-                self._frames.append((identifier, sent[at + IDENTIFIER : at + FRAME]))
+            for start in range(0, len(sent), FRAME):
+                identifier = int.from_bytes(sent[start : start + IDENTIFIER], "little")
+                self._frames.append((identifier, sent[start + IDENTIFIER : start + FRAME]))
         if not self._frames:
             return None
         identifier, data = self._frames.popleft()

@@ -109,7 +109,7 @@ class Bank:
             raise UserError(str(error)) from error
 
     def report(self, axis: int, mask: int = 0, ahead_s: float = 0.0) -> AxisResult:
-        """Posterior of one axis, with the columns of `mask` in use, a bit each. The bias is the one `ahead_s` after the
+        """Posterior of an axis, with the columns of `mask` in use, a bit each. The bias is at `ahead_s` after the
         last bank interval, with the columns' values of that interval. Raises UserError of an axis that failed, with too
         few bank samples, and where the priors leave nothing (with regressors an evidence of -inf)."""
         if self.raw.retired(axis):

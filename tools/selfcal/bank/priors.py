@@ -25,15 +25,15 @@ from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Gate, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.readings.rest import BIAS_SD, rest_of
 
-#: N is laid so far either way about the record's, and a drift beyond the default ratio to N by so much.
+#: Own prior of N: factor to each side of the record's N; of a drift: factor beyond the default ratio to N.
 DECADES, DRIFT_MARGIN = 100.0, 10.0
-#: Limits of N nearer than this factor are knowledge of the part (a warm start, a model by hand): they stay.
+#: Narrowest range of N, a factor, that is replaced: a narrower one is knowledge of the part (warm start, own model).
 NARROW = 10.0
-#: The record's N is outside a limit from so many of its own standard deviations on; that of ln N times sqrt(n).
+#: Distance of the record's N beyond a limit, in sd of ln N; the sd of ln N times sqrt(n).
 OUTSIDE_SD, MEDIAN_SD = 2.0, 1.2
-#: Its drift is outside where the deviation over some time is above all that the priors allow by so much.
+#: Factor of the Allan deviation above the largest that the priors allow, from which on the drift is outside.
 DRIFT_ABOVE = 1.5
-#: Means are the same that differ by less than this share of the largest: differences of a counter are rounded so.
+#: Largest difference of equal means, a share of the largest mean: a counter's differences are rounded by that.
 SAME = 1e-10
 #: Differences of neighbouring means that show a deviation.
 FEWEST, FEWEST_OF_DRIFT = 8, 24
@@ -41,25 +41,25 @@ FEWEST, FEWEST_OF_DRIFT = 8, 24
 MEDIAN_SQUARE = 0.4549364
 #: Greatest Allan deviation of a Gauss-Markov drift over its sigma_m.
 MARKOV_PEAK = 0.62
-#: A level is so many sd of the bias that is laid for it.
+#: Level over the sd of the own bias prior.
 LEVEL_SD = 2.0
 #: A posterior leans on an end that lies within two of its deviations of its median: this share of the way from the
 #: median to the nearer quantile is left to the end. The farther quantile is within a factor of e of it: beyond that the
 #: record leaves the parameter open, and its prior holds it.
 LEANS_LEFT, LEANS_WITHIN = 0.2, 1.0
-#: Limits that a posterior leans on move by this share of their width, so many times at most.
+#: Step of limits that a posterior leans on, a share of their width, and the most steps.
 LEANS_MOVE, LEANS_MOST = 2.0 / 3.0, 4
 #: Nats by which a law must gain: of records that a model's limits hold, at most 1 in 20 gain so much (Markov's bound).
 LEANS_GAIN = math.log(20.0)
-#: A law counts from this probability on.
+#: Least probability of a law that counts.
 LEANS_LAW = 0.01
-#: Bank intervals at most on which leaning is looked for.
+#: Most bank intervals in the search for leaning.
 LEANS_INTERVALS = 20_000
-#: What a record cannot tell from nothing: K and sigma_m below so many N / T and N / sqrt(T), alpha below 1 / T.
+#: Smallest visible drift over a record of T: K in N / T, sigma_m in N / sqrt(T); of alpha 1 / T.
 UNSEEN = 0.5
-#: The gate starts from so many times the noise: default.yaml has two to six.
+#: Noise of the gate over the record's noise: default.yaml has two to six.
 GATE_NOISE = 3.0
-#: What the JSON has of an axis's priors.
+#: Words of the JSON for an axis's priors.
 OF_MODEL, OF_RECORD = "model", "from this record"
 
 
@@ -80,7 +80,7 @@ class Seen:
 
 
 def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model:
-    """The model with own priors for those of `axes` that rested outside its own. Itself where there is none."""
+    """The model with own priors for those of `axes` that rested outside its own; else unchanged."""
     own: dict[str, dict[str, Prior]] = {}
     noise: dict[str, float] = {}
     for name in axes:
@@ -170,8 +170,8 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
         return None
     block = max(1, round(recording.rate_hz / model.bank_rate_hz))
     tau_s = block / recording.rate_hz
-    place = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
-    size = np.ones(place.size)
+    interval = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
+    size = np.ones(interval.size)
     tau: list[float] = []
     deviations: list[float] = []
     counts: list[int] = []
@@ -179,12 +179,12 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     with np.errstate(over="ignore", invalid="ignore"):
         total = values[sound]
         while True:
-            first = np.flatnonzero(np.diff(place, prepend=place[0] - 1))
-            place, total, size = place[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
+            first = np.flatnonzero(np.diff(interval, prepend=interval[0] - 1))
+            interval, total, size = interval[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
             whole = size > 0.5 * size.max()
             mean = total[whole] / size[whole]
             level = level if tau else float(np.median(mean))
-            step = np.diff(mean)[np.diff(place[whole]) == 1]
+            step = np.diff(mean)[np.diff(interval[whole]) == 1]
             step[np.abs(step) < SAME * np.abs(mean).max()] = 0.0
             if step.size < (FEWEST_OF_DRIFT if tau else FEWEST):
                 break
@@ -195,7 +195,7 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             tau.append(tau_s)
             counts.append(step.size)
             tau_s *= 2.0
-            place = place // 2
+            interval = interval // 2
     if not tau or not 0.0 < deviations[0] < math.inf:
         return None
     return Seen(level, np.array(tau), np.array(deviations), np.array(counts))
@@ -281,52 +281,52 @@ def moved_along(
         bank.push(samples, own.missing_before)
         return bank.report(0)
 
-    first = found = report(priors)
+    first = result = report(priors)
     moved, gaining = priors, priors != model.group_of(name).priors  # only the model's own have to be outdone
     for _ in range(LEANS_MOST):
-        further = {key: _moved(key, moved[key], end, least) for key, end in leaning(found, moved).items()}
+        further = {key: _moved(key, moved[key], end, least) for key, end in leaning(result, moved).items()}
         further = {key: prior for key, prior in further.items() if prior != moved[key]}
         if not further:
             break
         moved = {**moved, **further}
-        found = report(moved)
-        gaining = gaining or _gains(first, found, [key for key, prior in moved.items() if prior != priors[key]])
+        result = report(moved)
+        gaining = gaining or _gains(first, result, [key for key, prior in moved.items() if prior != priors[key]])
     return moved if gaining else priors
 
 
-def leaning(found: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
+def leaning(result: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
     """The parameters whose posterior under a law leans on an end of its prior: -1 the lower, 1 the upper one."""
     ends: dict[str, int] = {}
-    for estimates in found.parameters.values():
-        for key, one in estimates.items():
+    for estimates in result.parameters.values():
+        for key, estimate in estimates.items():
             prior = priors[key]
-            if key in RATIOS or not prior.law.endswith("uniform") or not one.q05 > 0.0:
+            if key in RATIOS or not prior.law.endswith("uniform") or not estimate.q05 > 0.0:
                 continue
             for end, near, far in (
-                (-1, one.q05 / prior.min, one.q95 / prior.min),
-                (1, prior.max / one.q95, prior.max / one.q05),
+                (-1, estimate.q05 / prior.min, estimate.q95 / prior.min),
+                (1, prior.max / estimate.q95, prior.max / estimate.q05),
             ):
-                middle = one.median / prior.min if end < 0 else prior.max / one.median
+                middle = estimate.median / prior.min if end < 0 else prior.max / estimate.median
                 left = math.log(max(near, 1.0))
                 if left < LEANS_LEFT * (math.log(middle) - left) and math.log(far) < LEANS_WITHIN:
                     ends[key] = end
     return ends
 
 
-def _gains(first: AxisResult, found: AxisResult, moved: Collection[str]) -> bool:
+def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> bool:
     """Whether limits `moved` are the record's own: a law that counts gains by them. Of a law whose alpha moved the sum
     of all laws must gain: as alpha falls it becomes a walk, which may be one of them."""
-    gain = {law: found.log_evidence[law] - before for law, before in first.log_evidence.items()}
-    whole = [float(np.logaddexp.reduce(list(one.log_evidence.values()))) for one in (first, found)]
+    gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
+    whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
     return whole[1] > whole[0] + LEANS_GAIN or any(
-        gain[law] > LEANS_GAIN and found.probability[law] > LEANS_LAW
-        for law, estimates in found.parameters.items()
+        gain[law] > LEANS_GAIN and second.probability[law] > LEANS_LAW
+        for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )
 
 
 def _unseen(seen: Seen, length_s: float) -> dict[str, float]:
-    """Of each parameter of a drift what the record cannot tell from nothing."""
+    """Smallest visible value of each parameter of a drift."""
     size = UNSEEN * seen.N / math.sqrt(length_s)
     return {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
 
@@ -340,8 +340,8 @@ def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float
 
 
 def _moved(key: str, prior: Prior, end: int, least: Mapping[str, float]) -> Prior:
-    """A prior of the same width, moved towards an end, but to no size that the record cannot tell, and to no drift that
-    is white noise to the bank."""
+    """A prior of the same width, moved towards an end, but to no invisible size, and to no drift the bank takes for
+    white noise."""
     if key == "alpha" and end > 0:
         return prior
     width = prior.max / prior.min

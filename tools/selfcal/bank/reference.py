@@ -34,7 +34,7 @@ _FEWEST = 24
 #: Changes allowed when every second node is left out: of ln evidence, and of mean and sd in posterior sd. A probability
 #: moves by a quarter of the first at most, 1e-4, and the full lattice is many times better than the halved one.
 _LN_EVIDENCE, _MOMENT = 4e-4, 5e-3
-#: Nodes of one hypothesis beyond which a posterior counts as out of this engine's reach.
+#: Most nodes of a hypothesis: a larger posterior is out of this engine's reach.
 _MOST = 1_000_000
 #: Scan for modes: points in each drift parameter, by the number of those.
 _SCAN = {0: (), 1: (25,), 2: (11, 9)}
@@ -71,12 +71,12 @@ def identify_axis(
     block: int = 1,
     ahead_s: float = 0.0,
 ) -> AxisResult:
-    """Posterior of one axis under the continuous priors of its group.
+    """Posterior of an axis under the continuous priors of its group.
 
     `y` float64[n] in the group's unit every `dt` s, NaN where a sample is missing; `r` float64[n] is the factor on the
     white noise variance of each (None: 1). `hypotheses`: prior probability by name. `z` float64[n, p] are the columns
     of the regressors in use, less their references, with the prior `coefficient_sd` of each. `y` are means of `block`
-    samples. The bias is the one `ahead_s` after the last of them. Raises UserError without a sample, and when a
+    samples. The bias is at `ahead_s` after the last of them. Raises UserError without a sample, and when a
     posterior would take more than `_MOST` nodes.
     Source: Stepanov & Motorin (2017), equations (11) to (14).
     """
@@ -87,23 +87,28 @@ def identify_axis(
     centred = np.ascontiguousarray(y - offset, np.float64)
     factors = None if r is None else np.ascontiguousarray(r, np.float64)
     columns = None if z is None else (np.ascontiguousarray(z, np.float64), np.array(coefficient_sd, np.float64))
-    found = {
+    posteriors = {
         name: _posterior(centred, dt, offset, group, name, factors, columns, block, ahead_s) for name in hypotheses
     }
-    ln_weight = {name: math.log(hypotheses[name]) + found[name].ln_evidence for name in found if hypotheses[name] > 0.0}
+    ln_weight = {
+        name: math.log(hypotheses[name]) + posteriors[name].ln_evidence for name in posteriors if hypotheses[name] > 0.0
+    }
     top = max(ln_weight.values())
     total = sum(math.exp(value - top) for value in ln_weight.values())
-    probability = {name: math.exp(ln_weight[name] - top) / total if name in ln_weight else 0.0 for name in found}
-    bias_mean = sum(probability[name] * p.mean[0] for name, p in found.items())
-    spread = sum(probability[name] * (p.var[0] + (p.mean[0] - bias_mean) ** 2) for name, p in found.items())
+    probability = {name: math.exp(ln_weight[name] - top) / total if name in ln_weight else 0.0 for name in posteriors}
+    bias_mean = sum(probability[name] * p.mean[0] for name, p in posteriors.items())
+    spread = sum(probability[name] * (p.var[0] + (p.mean[0] - bias_mean) ** 2) for name, p in posteriors.items())
     return AxisResult(
         n,
-        {name: p.ln_evidence for name, p in found.items()},
+        {name: p.ln_evidence for name, p in posteriors.items()},
         probability,
-        {name: p.parameters for name, p in found.items()},
+        {name: p.parameters for name, p in posteriors.items()},
         float(bias_mean + offset),
         math.sqrt(spread),
-        {name: tuple(zip(p.mean[1:].tolist(), np.sqrt(p.var[1:]).tolist(), strict=True)) for name, p in found.items()},
+        {
+            name: tuple(zip(p.mean[1:].tolist(), np.sqrt(p.var[1:]).tolist(), strict=True))
+            for name, p in posteriors.items()
+        },
     )
 
 
@@ -231,10 +236,10 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
         ln_n = np.linspace(left, right, count, axis=1)
         x = np.concatenate([ln_n[:, :, None], np.repeat(rest[:, None, :], count, axis=1)], axis=2)
         values = value(x.reshape(-1, len(low))).reshape(len(rest), count)
-        at = values.argmax(axis=1)
+        top = values.argmax(axis=1)
         rows = np.arange(len(rest))
-        best, profile = ln_n[rows, at], values[rows, at]
-        left, right = ln_n[rows, np.maximum(at - 1, 0)], ln_n[rows, np.minimum(at + 1, count - 1)]
+        best, profile = ln_n[rows, top], values[rows, top]
+        left, right = ln_n[rows, np.maximum(top - 1, 0)], ln_n[rows, np.minimum(top + 1, count - 1)]
     grid = np.pad(profile.reshape(points), 1, constant_values=-np.inf)
     inner = tuple(slice(1, -1) for _ in points)
     peak = np.ones(points, bool)
@@ -248,14 +253,14 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
     for start in starts:
         simplex = np.clip(np.vstack([start, start + np.diag(step)]), low, high)
         simplex[1:] -= 2.0 * np.diag(step) * (np.diag(simplex[1:]) == start)  # at the upper limit: inwards
-        found = minimize(
+        optimum = minimize(
             lambda x: -float(value(x[None, :])[0]),
             start,
             method="Nelder-Mead",
             bounds=list(zip(low, high, strict=True)),
             options={"initial_simplex": simplex, "xatol": math.inf, "fatol": 0.05},
         )
-        polished.append((-float(found.fun), np.asarray(found.x, np.float64)))
+        polished.append((-float(optimum.fun), np.asarray(optimum.x, np.float64)))
     polished.sort(key=lambda mode: -mode[0])
     return np.array([x for height, x in polished if height > polished[0][0] - _DEPTH])
 

@@ -1,4 +1,4 @@
-"""What an engine says of one axis; every number in the units of the axis, continuous time (units.py)."""
+"""The answer of an engine on an axis; every number in the units of the axis, continuous time (units.py)."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def of_mixture(
     weight: NDArray[np.float64], mean: NDArray[np.float64], sd: NDArray[np.float64]
 ) -> tuple[float, float, float, float, float]:
     """Mean, sd, and quantiles 0.05, 0.5 and 0.95 of a sum of normals [m], `weight` of each not normalized."""
-    from scipy.special import ndtr  # a tenth of a second to import: for who has such a posterior alone
+    from scipy.special import ndtr  # a tenth of a second to import, for a mixture only
 
     held = weight > 1e-6 * weight.max()
     weight, mean, sd = weight[held] / weight[held].sum(), mean[held], sd[held]
@@ -30,8 +30,8 @@ def of_mixture(
     def quantile(p: float) -> float:
         low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
         for _ in range(40):
-            at = 0.5 * (low + high)
-            low, high = (at, high) if float(weight @ ndtr((at - mean) / sd)) < p else (low, at)
+            middle = 0.5 * (low + high)
+            low, high = (middle, high) if float(weight @ ndtr((middle - mean) / sd)) < p else (low, middle)
         return 0.5 * (low + high)
 
     return middle, spread, quantile(0.05), quantile(0.5), quantile(0.95)
@@ -39,7 +39,7 @@ def of_mixture(
 
 @dataclass(frozen=True)
 class Estimate:
-    """Posterior of one parameter under one hypothesis. `off_grid`: the grid of nodes does not bear it (selfcal.h)."""
+    """Posterior of a parameter under a hypothesis. `off_grid`: the grid of nodes is too coarse (selfcal.h)."""
 
     mean: float
     median: float
@@ -69,7 +69,7 @@ class Estimate:
 
 @dataclass(frozen=True)
 class AxisResult:
-    """Posterior of one axis. Keys are hypothesis names, then parameter names (N, K, sigma_m, alpha).
+    """Posterior of an axis. Keys are hypothesis names, then parameter names (N, K, sigma_m, alpha).
 
     `n` bank samples; `log_evidence` in nats; `bias` is x0 + drift at the last bank sample, with regressors in use x0 +
     drift + c z there. `coefficients`: mean and sd by hypothesis, in the order of the columns in use.

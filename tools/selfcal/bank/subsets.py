@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from selfcal.bank.result import HALF_90, AxisResult, of_mixture
 from selfcal.model.regressors import Choice, coefficient_unit, ln_prior
 
-#: A law of this probability among those of a subset may be the true one: the widest of these states the coefficient. A
-#: record that does not tell a walk from a Gauss-Markov drift leaves a ramp twice to four times as open beside the walk:
-#: an average over the laws would hold 77 to 85 % of truths beside a walk (tests/noise_coverage.py).
+#: Least probability of a law of a subset that may be true: the widest of these laws states the coefficient. If a record
+#: does not separate a walk from a Gauss-Markov drift, a ramp is 2 to 4 times as uncertain under it. An average over
+#: the laws would cover 77 to 85 % of truths with a walk (tests/noise_coverage.py).
 LIKELY = 0.05
 
 
 @dataclass(frozen=True)
 class Coefficient:
-    """Posterior of one column's coefficient if it is in use, over all subsets with it; of each subset under the law
+    """Posterior of a column's coefficient if it is in use, over all subsets with it; of each subset under the law
     that leaves it most open (LIKELY)."""
 
     column: str
@@ -45,7 +45,7 @@ class Scored:
     """All subsets of the regressors weighed together.
 
     `result`: probabilities, evidence and bias over all subsets; parameters of each law are those of its most probable
-    subset. `probability` [subsets] of each choice; `best` is the most probable one.
+    subset. `probability` [subsets] of each choice; `best` is the most probable.
     """
 
     result: AxisResult
@@ -79,19 +79,21 @@ def combine(
         math.sqrt(float(of_choice @ (sd**2 + (mean - bias) ** 2))),
     )
     inclusion = {}
-    for one in choices[-1]:
-        having = [i for i, choice in enumerate(choices) if one in choice]
+    for regressor in choices[-1]:
+        having = [i for i, choice in enumerate(choices) if regressor in choice]
         coefficients = []
-        for place, column in enumerate(one.columns):
+        for k, column in enumerate(regressor.columns):
             parts = []
             for i in having:
-                at = place + sum(len(other.columns) for other in choices[i][: choices[i].index(one)])
+                index = k + sum(len(other.columns) for other in choices[i][: choices[i].index(regressor)])
                 likely = [law for k, law in enumerate(hypotheses) if weight[i, k] >= LIKELY * of_choice[i] > 0.0]
                 if likely:
-                    widest = max((results[i].coefficients[law][at] for law in likely), key=lambda found: found[1])
+                    widest = max(
+                        (results[i].coefficients[law][index] for law in likely), key=lambda mean_sd: mean_sd[1]
+                    )
                     parts.append((of_choice[i], *widest))
-            coefficients.append(_coefficient(column, coefficient_unit(unit, one.unit), np.array(parts)))
-        inclusion[one.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
+            coefficients.append(_coefficient(column, coefficient_unit(unit, regressor.unit), np.array(parts)))
+        inclusion[regressor.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
     return Scored(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
 
 
@@ -102,5 +104,5 @@ def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coeffi
 
 def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
     """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
-    found = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
-    return Coefficient(column, unit, *found)
+    mixture = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
+    return Coefficient(column, unit, *mixture)

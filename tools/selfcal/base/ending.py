@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-#: How long results may still be worked out after a signal, s.
+#: Time for results after a signal, s.
 GRACE_S = 0.6
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 

@@ -20,7 +20,7 @@ class UserError(Exception):
 
 
 class OutsidePriors(UserError):
-    """No law of the model has any evidence on an axis. `rest.py` says of all such axes in one line why."""
+    """No law of the model has any evidence on an axis. `rest.py` gives the reason, a line for all these axes."""
 
     def __init__(self) -> None:
         super().__init__("the record lies outside the model's priors")
@@ -43,8 +43,8 @@ def remark(text: str) -> str:
     return f"{apart} " if apart.endswith("\\") else apart
 
 
-#: Where a spreadsheet would begin a formula: the first sign of a cell, or of one that a semicolon begins. Some programs
-#: pass by blanks, and take the wide forms of the signs.
+#: Place where a spreadsheet begins a formula: the first sign of a cell, or the first after a semicolon. Some programs
+#: skip blanks, and take the wide forms of the signs.
 _FORMULA = re.compile(r"(^\s*|;)(?=[=+\-@\uff1d\uff0b\uff0d\uff20])")
 
 
@@ -89,12 +89,12 @@ def first_line(error: BaseException) -> str:
 
 
 def note(text: str) -> None:
-    """Tell the user, on stderr, something that is no error."""
+    """Print a note for the user on stderr."""
     print(f"selfcal: {printable(text)}", file=sys.stderr)
 
 
 @cache
 def say_once(text: str) -> None:
-    """Tell the user, unless this process has told it."""
+    """Print a note once a process."""
     if text:
         note(text)

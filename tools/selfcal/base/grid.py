@@ -17,7 +17,7 @@ MEDIAN_SD = 0.6745
 
 def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:
     """First row and the row after the last of every run of true values of a mask [n]. Runs with a gap of at most
-    `apart` rows are one."""
+    `apart` rows join."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
     near = 2 * np.flatnonzero(edges[2::2] - edges[1:-1:2] <= apart) + 1
     edges = np.delete(edges, np.concatenate([near, near + 1]))
@@ -39,7 +39,7 @@ def counts_of_pieces(code: Rows, many: int, least: int, most: int) -> tuple[Rows
 
 
 def block_means(values: Array, size: int) -> Array:
-    """Means of whole blocks of `size` values [n], [n // size]; NaN where one is."""
+    """Means of whole blocks of `size` values [n], [n // size]; NaN where a value is NaN."""
     return np.asarray(values[: values.size // size * size].reshape(-1, size).mean(axis=1))
 
 

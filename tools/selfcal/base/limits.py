@@ -1,4 +1,4 @@
-"""Files from strangers: the largest sizes that are read, and one line for whatever a library raises over one."""
+"""Files from strangers: the largest sizes that are read, and a line for whatever a library raises over them."""
 
 from __future__ import annotations
 
@@ -17,18 +17,19 @@ from selfcal.base.errors import UserError, first_line
 MOST_NUMBERS = 400_000_000
 #: Columns of a recording, and characters of a heading.
 MOST_COLUMNS, LONGEST_HEADING = 1000, 256
-#: A text recording is read by as many bytes; no line is longer.
+#: Bytes of a block of a text recording, and of its longest line.
 BLOCK_BYTES = 1 << 22
-#: What a packed recording may unpack to, times its size: readings of a sensor pack to a twentieth at best. Of a text
-#: less: a number of eight bytes has two there.
+#: Largest growth of a packed recording when unpacked, in times its size: readings pack to a twentieth at best. Text
+#: grows less: a number of eight bytes has two characters there.
 MOST_GROWTH, MOST_TEXT_GROWTH = 200, 25
 #: Lines before the header of a text recording.
 MOST_LEADING_LINES = 1000
-#: Cells of these lines that are looked at for a known heading.
+#: Cells of these lines that are searched for a known heading.
 MOST_HEADINGS = 30_000
-#: What a MATLAB or R file may unpack to, and what any of them may however small it is. Each number is held three times.
+#: Bytes that a MATLAB or R file may unpack to, and the bytes allowed to the smallest file. Memory holds each number
+#: three times.
 MOST_UNPACKED_BYTES, MOST_UNPACKED_SMALL = 1 << 30, 1 << 26
-#: Objects in an R file: each value of a text column is one.
+#: Objects in an R file, each value of a text column included.
 MOST_R_OBJECTS = 200_000
 #: Names of streams that are open already, be it on a regular file.
 STREAMS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
@@ -36,12 +37,12 @@ STREAMS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
 MOST_META_BYTES, MOST_MODEL_BYTES = 1 << 20, 1 << 18
 #: Values in a model file, each alias counted as if it were written out.
 MOST_MODEL_VALUES = 10_000
-#: Sampling rates, Hz.
+#: Lowest and highest sampling rate, Hz.
 LEAST_RATE_HZ, MOST_RATE_HZ = 1e-6, 1e6
-#: Sampling rates in one recording.
+#: Sampling rates in a recording.
 MOST_CLOCKS = 8
-#: What a recording spans: seconds, and samples, those missing included. A law beside the model takes 20 000 intervals,
-#: each of at most 10^6 s and 2^32 samples (lib/bank.c).
+#: Longest span of a recording: seconds, and samples, missing ones included. A law takes 20 000 intervals, each of at
+#: most 10^6 s and 2^32 samples (lib/bank.c).
 LONGEST_S, LONGEST = 1e10, 2**46
 
 
@@ -75,11 +76,11 @@ def reading(path: Path | str, otherwise: str) -> Iterator[None]:
 
 def named_pipe(path: Path) -> bool:
     """Whether a path is a pipe of the file system, which may hold its reader or writer for ever. Raises OSError."""
-    return path.is_fifo() and not any(str(one).startswith(STREAMS) for one in (path, path.resolve()))
+    return path.is_fifo() and not any(str(name).startswith(STREAMS) for name in (path, path.resolve()))
 
 
 def read_text(path: Path, most: int, otherwise: str) -> str:
-    """The text of a file of at most `most` bytes, UTF-8. Raises UserError; FileNotFoundError where there is none."""
+    """The text of a file of at most `most` bytes, UTF-8. Raises UserError; FileNotFoundError without a file."""
     if named_pipe(path):
         raise UserError(f"{path}: is a named pipe: write it into a file first")
     with path.open("rb") as stream, reading(path, otherwise):

@@ -50,12 +50,12 @@ def argument(help: str, metavar: str, *, kind: Any = None, **more: Any) -> Optio
 
 def parse_pairs(option: str, pairs: Sequence[str]) -> dict[str, str]:
     """`NAME=VALUE` texts of a repeated command line option as a dict. Raises UserError naming the option."""
-    found: dict[str, str] = {}
+    options: dict[str, str] = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not (name and equals and value):
             raise UserError(f"{option} takes NAME=VALUE, not '{pair}'")
-        if name in found:
+        if name in options:
             raise UserError(f"{option}: '{name}' is given twice")
-        found[name] = value
-    return found
+        options[name] = value
+    return options

@@ -1,4 +1,4 @@
-"""Output files are whole or absent: each is written under another name beside its place, then renamed."""
+"""Output files are whole or absent: each is written under another name in its folder, then renamed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import shutil
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +23,7 @@ from selfcal.base.limits import STREAMS, named_pipe
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.table import Table
 
 
 def check_place(path: Path | str) -> None:
@@ -53,32 +54,32 @@ def whole(path: Path | str) -> Iterator[Path]:
 def together(path: Path | str, *others: Path | str) -> Iterator[tuple[Path, ...]]:
     """The same for files that belong together: all are on the disk before the first takes its place.
 
-    An older one of the `others` goes just before: none stands beside a `path` that it is not of. One whose temporary
-    file the block removes goes without a new one.
+    Older files of `others` are removed first, so that none is left of another `path`. If the block removes a temporary
+    file, its target is removed too.
     """
-    at = Path(path)
+    target = Path(path)
     pending: list[_Pending] = []
     try:
         try:
-            for at in map(Path, (path, *others)):
-                pending.append(_Pending.of(at))
-            at = Path(path)
-            yield tuple(one.temporary for one in pending)
-            written = [one for one in pending if one.temporary != one.place]
-            written = [one for one in written if one is pending[0] or one.temporary.exists()]
-            for one in written:
-                one.settle()
-            for one in pending[1:]:
-                if one.temporary != one.place:
-                    one.place.unlink(missing_ok=True)
-            for one in written:
-                one.temporary.replace(one.place)
+            for target in map(Path, (path, *others)):
+                pending.append(_Pending.of(target))
+            target = Path(path)
+            yield tuple(file.temporary for file in pending)
+            written = [file for file in pending if file.temporary != file.place]
+            written = [file for file in written if file is pending[0] or file.temporary.exists()]
+            for file in written:
+                file.settle()
+            for file in pending[1:]:
+                if file.temporary != file.place:
+                    file.place.unlink(missing_ok=True)
+            for file in written:
+                file.temporary.replace(file.place)
         finally:
-            for one in pending:
-                if one.temporary != one.place:
-                    one.temporary.unlink(missing_ok=True)
+            for file in pending:
+                if file.temporary != file.place:
+                    file.temporary.unlink(missing_ok=True)
     except OSError as error:
-        raise UserError(f"{at}: cannot be written: {error.strerror or error}") from error
+        raise UserError(f"{target}: cannot be written: {error.strerror or error}") from error
 
 
 @dataclass(frozen=True)
@@ -130,8 +131,8 @@ def write_text(path: Path | str, text: str) -> None:
 
 def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None] = ()) -> None:
     """Raise UserError now, before the work, for a file that could not be written after it, that is one of the `inputs`,
-    or that is there twice. None and '-' are none."""
-    taken = {Path(one).resolve() for one in inputs if one is not None}
+    or that is there twice. None and '-' are skipped."""
+    taken = {Path(path).resolve() for path in inputs if path is not None}
     for file in files:
         if file is not None and str(file) != "-":
             check_place(file)
@@ -158,15 +159,15 @@ def finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-#: Columns of a table at most, and of what is no terminal.
+#: Columns of a table at most, and of an output that is not a terminal.
 TABLE_WIDTH = 140
 _NO_WIDTH = 1000
-#: What a picture's name may end in.
+#: Suffixes of pictures.
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
 
 def check_picture(path: Path | str) -> None:
-    """Raise UserError for a file name that is no picture's."""
+    """Raise UserError for a file name without the suffix of a picture."""
     if Path(path).suffix not in PICTURES:
         raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 
@@ -182,6 +183,17 @@ def console_of(*, to_stderr: bool = False, fits: bool = False) -> Console:
     elif not fits:
         console.width = max(console.width, TABLE_WIDTH)
     return console
+
+
+def table_of(headings: Iterable[str], title: str | None = None, *, wraps: bool = False, **look: Any) -> Table:
+    """A table for a terminal, with these headings; its cells wrap, or have a line each. `look`: more of Table's."""
+    from rich import box
+    from rich.table import Table
+
+    table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left", caption_justify="left", **look)
+    for heading in headings:
+        table.add_column(heading, no_wrap=not wraps, overflow="fold" if wraps else "ellipsis")
+    return table
 
 
 def plotter() -> Any:

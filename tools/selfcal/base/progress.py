@@ -1,16 +1,15 @@
-"""What a long verb does just now: a bar in a terminal, a plain line on stderr now and then where there is none."""
+"""Progress of a long verb: a bar in a terminal, otherwise a line on stderr now and then."""
 
 from __future__ import annotations
 
 import time
-from types import TracebackType
 
 from rich.console import Console
 from rich.progress import Progress
 
 from selfcal.base.errors import note
 
-#: Between two lines without a terminal, s; and before the first one.
+#: Interval of lines without a terminal, and time before the first line, s.
 EVERY_S = 10.0
 
 
@@ -41,7 +40,5 @@ class Doing:
         self.progress.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.progress.stop()

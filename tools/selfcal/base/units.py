@@ -22,7 +22,7 @@ from selfcal.base.errors import UserError, short
 
 #: m/s^2 per g (3rd CGPM, 1901: exact by definition).
 STANDARD_GRAVITY = 9.80665
-#: A two-sided density is this many times the one-sided one.
+#: Two-sided density over the one-sided density.
 ONE_SIDED_TO_TWO_SIDED = 1.0 / math.sqrt(2.0)
 #: Allan deviation of flicker noise over its coefficient, the bias instability: sqrt(2 ln 2 / pi).
 FLICKER_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
@@ -73,13 +73,13 @@ _ATOMS: dict[str, tuple[_Dimension, float]] = {
     "Pa": (_dimension(pressure=1), 1.0),
     "bar": (_dimension(pressure=1), 1e5),
 }
-#: Parts and multiples, and what no prefix makes: of these atoms, and a mass.
+#: Prefixes, the atoms that take one, and a mass.
 _PREFIXES = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1, "h": 1e2, "k": 1e3}
 _WHOLE, _MASS = ("1", "dph", "ft", "in", "min", "h", "day"), "kg"
 #: Zero of a temperature scale in K; counts only where the temperature itself is meant, not in `deg/s/degC`.
 _ZERO = {"degC": 273.15, "mdegC": 273.15, "degF": 273.15 - 160.0 / 9.0}
 
-#: What a recording's header may say, for error messages.
+#: Units that a recording's header may have, for error messages.
 RECORDING_UNITS = (
     "deg/s", "dps", "mdps", "rad/s", "mrad/s", "deg/h", "rad/h", "rpm", "m/s^2", "mm/s^2", "ft/s^2", "g", "mg", "ug",
     LSB, "degC", "degF", "K", "V", "mV", "h", "min", "s", "ms", "us", "ns",
@@ -99,7 +99,7 @@ class Unit:
 _FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d(?:\.\d{1,2})?))?)\Z", re.ASCII)
 #: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
 _LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
-#: Signs that a data sheet has, as this module writes them.
+#: Signs of data sheets, and their spelling here.
 _SIGNS = str.maketrans(
     {"°": "deg", "º": "deg", "℃": "degC", "℉": "degF", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1",
      "·": " ", "⋅": " "}
@@ -163,16 +163,16 @@ def plain(name: str) -> str:
         return spelled
     return next(
         (
-            one
-            for one in RECORDING_UNITS
-            if one != LSB and (same := parse(one)).dimension == meant.dimension and same.size == meant.size
+            unit
+            for unit in RECORDING_UNITS
+            if unit != LSB and (same := parse(unit)).dimension == meant.dimension and same.size == meant.size
         ),
         product,
     )
 
 
 def _word(word: str) -> str:
-    """A word of a unit in this module's spelling, with its prefix; itself if it is none."""
+    """A word of a unit in this module's spelling, with its prefix; any other word unchanged."""
     small = word.lower()
     if small in _WORDS:
         return _WORDS[small]
@@ -181,7 +181,7 @@ def _word(word: str) -> str:
 
 
 def _atom(name: str) -> tuple[_Dimension, float] | None:
-    """Dimension and size of an atom, or of one with a prefix; None for other names."""
+    """Dimension and size of an atom with or without a prefix; None for other names."""
     base = name[1:]
     if name in _ATOMS or name[:1] not in _PREFIXES or base not in _ATOMS or base in _WHOLE or name == _MASS:
         return _ATOMS.get(name)
@@ -191,20 +191,20 @@ def _atom(name: str) -> tuple[_Dimension, float] | None:
 
 @cache
 def parse(name: str) -> Unit:
-    """The unit called `name`. Raises UserError if it is not one."""
+    """The unit called `name`. Raises UserError for an unknown unit."""
     dimension, size = _NONE, 1.0
     unknown = UserError(f"unknown unit '{short(name)}' (known: {', '.join(RECORDING_UNITS)})")
     if len(name) > _LONGEST:
         raise unknown
     for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
         match = _FACTOR.match(part)
-        found = None if match is None else _atom(match["root"] or match["atom"])
-        if match is None or found is None:
+        atom = None if match is None else _atom(match["root"] or match["atom"])
+        if match is None or atom is None:
             raise unknown
         power = Fraction(1, 2) if match["root"] else Fraction(match["power"] or 1)
         if sign == "/":
             power = -power
-        kind, scale = found
+        kind, scale = atom
         dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
         size *= scale ** float(power)
         if not _LEAST < size < _MOST:
@@ -220,9 +220,9 @@ def known(name: str) -> bool:
         return False
 
 
-def same_kind(one: str, other: str) -> bool:
-    """Whether one unit converts into the other."""
-    return parse(one).dimension == parse(other).dimension
+def same_kind(unit: str, other: str) -> bool:
+    """Whether the two units convert into each other."""
+    return parse(unit).dimension == parse(other).dimension
 
 
 def factor(unit: str, to: str) -> float:
@@ -238,7 +238,7 @@ def convert(value: float, unit: str, to: str) -> float: ...
 @overload
 def convert(value: NDArray[np.float64], unit: str, to: str) -> NDArray[np.float64]: ...
 def convert(value: float | NDArray[np.float64], unit: str, to: str) -> float | NDArray[np.float64]:
-    """`value` (any shape) of `unit` in `to`, itself if they are one; temperatures as points on their scales. Raises
+    """`value` (any shape) of `unit` in `to`, unchanged if alike; temperatures as points on their scales. Raises
     UserError as `factor`."""
     scale = factor(unit, to)
     shift = parse(unit).zero - parse(to).zero

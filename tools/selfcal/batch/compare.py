@@ -8,15 +8,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from rich import box
-from rich.table import Table
-
 from selfcal.bank.result import HALF_90
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 
 SCHEMA = "selfcal.compare/1"
-#: A difference counts from so many standard deviations on: once in 1600 quantities by chance.
+#: Least difference that counts, in standard deviations: 1 in 1600 quantities exceeds it by chance.
 LIMIT = 3.4
 #: Estimates that are sizes of a cause; places in time belong to one recording alone.
 SIZES = ("coefficient", "slope", "amplitude", "frequency_hz", "B", "lag1", "ratio", "lsb", "limit")
@@ -42,19 +39,19 @@ def changes_of(axis: Sequence[dict[str, Any]] | Mapping[str, Any]) -> Sequence[d
 
 def incomparable(verdicts: Mapping[str, Mapping[str, Any] | None]) -> str | None:
     """Why an axis cannot be compared between two recordings; None where it can be, or neither has it."""
-    there = {log: one for log, one in verdicts.items() if one is not None}
+    there = {log: verdict for log, verdict in verdicts.items() if verdict is not None}
     absent = [log for log in verdicts if log not in there]
     if absent and there:
         return f"{absent[0]} does not have it"
-    for log, one in there.items():
-        if "error" in one:
-            return f"{log}: {one['error']}"
-    used = list(dict.fromkeys(str(one["unit"]) for one in there.values()))
+    for log, axis in there.items():
+        if "error" in axis:
+            return f"{log}: {axis['error']}"
+    used = list(dict.fromkeys(str(axis["unit"]) for axis in there.values()))
     return f"the recordings have it in {' and '.join(used)}" if len(used) > 1 else None
 
 
 def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Any]:
-    """Verdict and causes of an axis of one recording, or why one of the two has no result."""
+    """Verdict and causes of an axis of a recording, or why one of the two has no result."""
     error = diagnosed.get("error", identified.get("error"))
     if error is not None:
         return {"error": error}
@@ -65,15 +62,15 @@ def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict
 def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
     """What can change: parameters of the likeliest law, the bias, the coefficients of the model file's regressors, and
     the size of each cause found. A cause is `small` where it changes no number by as much as matters."""
-    found: dict[str, Mapping[str, Any]] = {}
+    sizes: dict[str, Mapping[str, Any]] = {}
     if "hypotheses" in identified:
         law = max(identified["hypotheses"], key=lambda name: identified["hypotheses"][name])
         for name, estimate in identified["parameters"][law].items():
             if estimate["identified"]:
-                found[f"{name} ({law})" if name != "N" else "N"] = estimate
+                sizes[f"{name} ({law})" if name != "N" else "N"] = estimate
         bias = identified["bias_now"]
         half = HALF_90 * bias["sd"]
-        found["bias"] = {
+        sizes["bias"] = {
             "median": bias["mean"],
             "q05": bias["mean"] - half,
             "q95": bias["mean"] + half,
@@ -82,22 +79,22 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
         for regressor in identified.get("regressors", {}).values():
             for column, estimate in regressor["coefficients"].items():
                 if math.isfinite(estimate["median"]):
-                    found[f"{column}.coefficient"] = estimate
+                    sizes[f"{column}.coefficient"] = estimate
     counted: dict[str, int] = {}
     matter = (*diagnosed.get("material", ()), "unexplained")
     own = [finding["cause"] for finding in diagnosed.get("findings", [])]
     for cause in diagnosed.get("causes", ()):
         if cause not in own:  # of several axes
-            found[cause] = {"present": True, "small": cause not in matter}
+            sizes[cause] = {"present": True, "small": cause not in matter}
     for finding in diagnosed.get("findings", []):
         cause = str(finding["cause"])
         counted[cause] = counted.get(cause, 0) + 1
         label = cause if counted[cause] == 1 else f"{cause} {counted[cause]}"
         for key, estimate in finding["estimate"].items():
             if key in SIZES and isinstance(estimate, Mapping):
-                found[f"{label}.{key}"] = estimate
-        found.setdefault(label, {"present": True, "small": cause not in matter})
-    return found
+                sizes[f"{label}.{key}"] = estimate
+        sizes.setdefault(label, {"present": True, "small": cause not in matter})
+    return sizes
 
 
 def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
@@ -106,13 +103,13 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
     for key in sorted(before.keys() | after.keys()):
         a, b = before.get(key), after.get(key)
         if a is None or b is None:
-            one = a or b
-            if one is not None and "present" in one and not one["small"]:
+            only = a or b
+            if only is not None and "present" in only and not only["small"]:
                 rows.append({"quantity": key, "what": "appeared" if a is None else "gone"})
             continue
         if "present" in a:
             continue
-        sd = math.hypot(*((one["q95"] - one["q05"]) / (2.0 * HALF_90) for one in (a, b)))
+        sd = math.hypot(*((estimate["q95"] - estimate["q05"]) / (2.0 * HALF_90) for estimate in (a, b)))
         distance = (b["median"] - a["median"]) / sd if sd > 0.0 else 0.0
         if abs(distance) >= LIMIT:
             rows.append(
@@ -131,9 +128,8 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """One line a change."""
     console = console_of(to_stderr=to_stderr)
-    table = Table(box=box.SIMPLE_HEAD, title="changes beyond what the recordings leave open", title_justify="left")
-    for heading in ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings"):
-        table.add_column(heading, no_wrap=True)
+    headings = ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings")
+    table = table_of(headings, "changes beyond what the recordings leave open")
     for name, axis in document["axes"].items():
         for row in changes_of(axis):
             changed = row["what"] == "changed"

@@ -1,11 +1,11 @@
-"""The drift of a unit from recording to recording: the slope of each quantity over the dates, and whether it is one.
+"""The drift of a unit from recording to recording: the slope of each quantity over the dates, if it is significant.
 
 A unit's quantity y (ln N, ln K, ... or the bias itself) at the day d, measured with the error s of its posterior:
 
     y = a + b d + e,    e ~ N(0, s^2 + r^2)
 
-r is how far a quantity comes out differently at each new start. All units that have three dates or more have one r:
-the one whose weighted squares of the residuals are as many as their degrees of freedom. So b over its standard
+r is how far a quantity comes out differently at each new start. All units with three dates or more share an r:
+the weighted squares of their residuals are as many as their degrees of freedom. So b over its standard
 deviation is Student's t of as many. A unit that scatters more than the others has an r of its own.
 """
 
@@ -40,7 +40,7 @@ class Series:
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom beside a line."""
+        """Degrees of freedom left by a line."""
         return self.y.size - 2
 
     def line(self, square: float) -> tuple[float, float, float]:
@@ -55,7 +55,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Drift:
-    """The slope of a device's quantity, of its logarithm or of itself, a day; `log_p` of so steep a one by chance."""
+    """The slope of a device's quantity, of its logarithm or of itself, a day; `log_p` of so steep a slope by chance."""
 
     at: int
     quantity: str
@@ -75,40 +75,51 @@ class Drift:
 
 
 def drifts_of(series: Iterable[Series]) -> list[Drift]:
-    """The slope of each. FALSE_ALARM, that a unit without drift has one, is shared among its quantities."""
+    """The slope of each. Its quantities share FALSE_ALARM, the probability of a drift of a unit without drift."""
     quantities: dict[str, list[Series]] = {}
     of_unit: dict[int, int] = {}
-    for one in series:
-        quantities.setdefault(one.quantity, []).append(one)
-        of_unit[one.at] = of_unit.get(one.at, 0) + 1
-    found = []
+    for history in series:
+        quantities.setdefault(history.quantity, []).append(history)
+        of_unit[history.at] = of_unit.get(history.at, 0) + 1
+    drifts = []
     for of in quantities.values():
-        alike = _alike([one for one in of if one.freedom > 0])
-        common, freedom = _square(alike), sum(one.freedom for one in alike)
-        for one in of:
-            own = one.freedom > 0 and not any(one is other for other in alike)
-            square, degrees = (_square([one]), one.freedom) if own else (common, freedom)
+        alike = _alike([history for history in of if history.freedom > 0])
+        common, freedom = _square(alike), sum(history.freedom for history in alike)
+        for history in of:
+            own = history.freedom > 0 and not any(history is other for other in alike)
+            square, degrees = (_square([history]), history.freedom) if own else (common, freedom)
             if degrees == 0:
                 continue  # two dates alone: what a new start changes is unknown
-            slope, sd, _ = one.line(square)
+            slope, sd, _ = history.line(square)
             log_p = math.log(2.0) + math.log(max(float(stdtr(degrees, -abs(slope) / sd)), 1e-300))
-            significant = log_p <= math.log(FALSE_ALARM / of_unit[one.at])
-            days = float(np.ptp(one.days))
-            found.append(
-                Drift(one.at, one.quantity, one.unit, one.logarithm, slope, sd, log_p, one.y.size, days, significant)
+            significant = log_p <= math.log(FALSE_ALARM / of_unit[history.at])
+            days = float(np.ptp(history.days))
+            drifts.append(
+                Drift(
+                    history.at,
+                    history.quantity,
+                    history.unit,
+                    history.logarithm,
+                    slope,
+                    sd,
+                    log_p,
+                    history.y.size,
+                    days,
+                    significant,
+                )
             )
-    return found
+    return drifts
 
 
 def _square(series: Sequence[Series]) -> float:
     """r^2 of them all: 0 where their errors are scatter enough."""
-    freedom = sum(one.freedom for one in series)
-    low, high = 0.0, max((float(np.var(one.y)) * one.y.size for one in series), default=0.0)
-    if not freedom or sum(one.line(0.0)[2] for one in series) <= freedom:
+    freedom = sum(history.freedom for history in series)
+    low, high = 0.0, max((float(np.var(history.y)) * history.y.size for history in series), default=0.0)
+    if not freedom or sum(history.line(0.0)[2] for history in series) <= freedom:
         return 0.0
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if sum(one.line(middle)[2] for one in series) > freedom else (low, middle)
+        low, high = (middle, high) if sum(history.line(middle)[2] for history in series) > freedom else (low, middle)
     return high
 
 
@@ -117,7 +128,7 @@ def _alike(series: Sequence[Series]) -> list[Series]:
     kept = list(series)
     while len(kept) > 1:
         square, limit = _square(kept), FALSE_ALARM / len(kept)
-        alike = [one for one in kept if chdtrc(one.freedom, one.line(square)[2]) > limit]
+        alike = [history for history in kept if chdtrc(history.freedom, history.line(square)[2]) > limit]
         if len(alike) == len(kept) or not alike:
             break
         kept = alike

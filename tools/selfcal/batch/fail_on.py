@@ -10,21 +10,21 @@ from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, note
 from selfcal.batch.verdicts import PASS, Verdict, code_of
 
-#: What is not explained, or moves a number as much as matters; the latter alone; and, of two recordings, any change.
+#: Words for any finding that is unexplained or material, for a material one, and for a change between two recordings.
 INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Exit code: 0 every axis was judged and passed, 1 it applies to one, 2 one could not be judged. `lines`: why, by
-    axis, of those that could not."""
+    """Exit code: 0 every axis was judged and passed, 1 it applies to an axis, 2 an axis could not be judged. `lines`:
+    the reasons, by axis."""
 
     code: int
     lines: list[str] = field(default_factory=list)
 
 
 def check(wanted: str | None, more: Collection[str] = ()) -> None:
-    """Raise UserError for what is no cause. `more`: what the verb takes besides."""
+    """Raise UserError for an unknown cause. `more`: further words of the verb."""
     if wanted is None:
         return
     from selfcal.diagnosis import hidden  # a second of imports
@@ -37,9 +37,9 @@ def check(wanted: str | None, more: Collection[str] = ()) -> None:
 
 def outcome(document: Mapping[str, Any], wanted: str) -> Outcome:
     """Of the document of `identify`, `diagnose` or `compare`."""
-    told = list(_judged(document, wanted))
-    lines = [line for applies, line in told if not applies and line]
-    return Outcome(1 if any(applies for applies, _ in told) else 2 if lines else 0, lines)
+    judged = list(_judged(document, wanted))
+    lines = [line for applies, line in judged if not applies and line]
+    return Outcome(1 if any(applies for applies, _ in judged) else 2 if lines else 0, lines)
 
 
 def _judged(document: Mapping[str, Any], wanted: str) -> Iterator[tuple[bool, str]]:
@@ -68,9 +68,9 @@ def _axis(axis: Mapping[str, Any], wanted: str) -> tuple[bool, str]:
     shown = {INADEQUATE: axis["verdict"] != "adequate", MATERIAL: bool(axis["material"])}
     if shown[wanted] if wanted in shown else wanted in axis["causes"]:
         return True, ""
-    for one in axis["not_judged"]:
-        if one["cause"] == wanted:
-            return False, f"{wanted} cannot be judged: {one['reason']}"
+    for reason in axis["not_judged"]:
+        if reason["cause"] == wanted:
+            return False, f"{wanted} cannot be judged: {reason['reason']}"
     if axis.get("unfinished"):
         return False, f"{wanted} cannot be judged: {axis['unfinished']}"
     return False, ""
@@ -90,15 +90,15 @@ def exit_code(document: Mapping[str, Any], wanted: str | None) -> int:
     Held().check()
     codes = [0]
     if wanted is not None:
-        found = outcome(document, wanted)
-        for line in found.lines:
+        asked = outcome(document, wanted)
+        for line in asked.lines:
             note(line)
-        codes.append(found.code)
+        codes.append(asked.code)
     if "limits" in document:
         known = ("recording", "device")
-        verdicts = [Verdict.of({k: v for k, v in one.items() if k not in known}) for one in document["limits"]]
-        for one, entry in zip(verdicts, document["limits"], strict=True):
-            if one.verdict != PASS:
-                note(f"{entry['recording']}: {one.words}" if "recording" in entry else one.words)
+        verdicts = [Verdict.of({k: v for k, v in entry.items() if k not in known}) for entry in document["limits"]]
+        for verdict, entry in zip(verdicts, document["limits"], strict=True):
+            if verdict.verdict != PASS:
+                note(f"{entry['recording']}: {verdict.words}" if "recording" in entry else verdict.words)
         codes.append(code_of(verdicts))
     return 1 if 1 in codes else 2 if 2 in codes else 0

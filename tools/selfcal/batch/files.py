@@ -17,16 +17,16 @@ from selfcal.base.errors import UserError, note, short
 from selfcal.base.limits import read_text
 from selfcal.logs.recording import meta_place
 
-#: A table of units: 10 000 lines of 100 letters are 1 MB.
+#: Bytes of a table of units: 10 000 lines of 100 letters are 1 MB.
 MOST_TABLE_BYTES = 1 << 26
 #: Columns of a table of units; the first two must be there.
 TABLE_COLUMNS = ("file", "device", "station", "lot", "date")
-#: Where a serial number comes from.
+#: Sources of a serial number.
 FROM_NAME, FROM_FIELD = "name", "field"
 #: A date of ISO 8601 in its extended form, with or without a time of day.
 _DATE = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d.*)?", re.ASCII)
 DATE_FORM = "2026-03-01 or 2026-03-01T14:30:00Z (ISO 8601)"
-#: Rows of a table of units that are named at most.
+#: Most rows of a table of units in a message.
 MOST_ROWS_NAMED = 5
 
 
@@ -51,32 +51,32 @@ class Source:
 
 
 def matching(patterns: Sequence[str], own: Sequence[Path]) -> list[str]:
-    """The files that the patterns name, each once, in the order of their names. A folder is one of ROS 2.
+    """The files that the patterns name, each once, in the order of their names. A folder is a recording of ROS 2.
 
     `own`: outputs of this command, files or folders, which a pattern may match as well. They are no recordings.
     A line names each link to nothing, pipe and device. It names a folder only where `patterns` names it, as a shell's
     pattern does.
     Raises UserError for a pattern that matches none.
     """
-    found: dict[str, None] = {}
+    recordings: dict[str, None] = {}
     skipped: dict[str, str] = {}
     for pattern in patterns:
-        place = Path(pattern)
-        named = place.exists() or place.is_symlink()
+        folder = Path(pattern)
+        named = folder.exists() or folder.is_symlink()
         names = [pattern] if named else glob(pattern, recursive=True)  # noqa: PTH207
         others = [name for name in names if not _within_any(Path(name), own)]
         kept = [name for name in others if _is_recording(Path(name))]
         if not kept and not named:
             raise _unmatched(pattern)
         skipped |= {name: kind for name in others if (kind := _no_file(Path(name)))}
-        if named and place.is_dir() and others and not kept:
+        if named and folder.is_dir() and others and not kept:
             skipped[pattern] = "a folder that is no recording of ROS 2"
-        found.update(dict.fromkeys(kept))
-    if not found:
+        recordings.update(dict.fromkeys(kept))
+    if not recordings:
         raise _unmatched(*patterns)
     for name, kind in skipped.items():
         note(f"{name}: is {kind}: skipped")
-    return sorted(found)
+    return sorted(recordings)
 
 
 def _unmatched(*patterns: str) -> UserError:
@@ -87,8 +87,8 @@ def _unmatched(*patterns: str) -> UserError:
 
 
 def _within_any(path: Path, own: Sequence[Path]) -> bool:
-    place = path.absolute()
-    return any(place == one.absolute() or one.absolute() in place.parents for one in own)
+    whole = path.absolute()
+    return any(whole == output.absolute() or output.absolute() in whole.parents for output in own)
 
 
 def _no_file(path: Path) -> str:
@@ -107,7 +107,7 @@ def _is_recording(path: Path) -> bool:
 def digest(path: Path) -> str:
     """sha256 of a file; of a folder that of its files' names and hashes. Raises OSError."""
     if path.is_dir():
-        named = [f"{one.name} {digest(one)}\n" for one in sorted(path.iterdir()) if one.is_file()]
+        named = [f"{file.name} {digest(file)}\n" for file in sorted(path.iterdir()) if file.is_file()]
         return hashlib.sha256("".join(named).encode("utf-8", "surrogateescape")).hexdigest()
     with path.open("rb") as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
@@ -115,12 +115,12 @@ def digest(path: Path) -> str:
 
 def hashed(path: str) -> Source:
     """A recording with its hashes. One that cannot be read has none; its reading says why."""
-    place = Path(path)
+    log = Path(path)
     try:
-        of_file = digest(place)
-        beside = meta_place(place)
+        of_file = digest(log)
+        beside = meta_place(log)
         content = of_file if not beside.is_file() else hashlib.sha256((of_file + digest(beside)).encode()).hexdigest()
-        size = sum(one.stat().st_size for one in (place.iterdir() if place.is_dir() else [place]))
+        size = sum(file.stat().st_size for file in (log.iterdir() if log.is_dir() else [log]))
     except OSError:
         return Source(path, content=f"unread {path}")
     return Source(path, of_file, content, size)
@@ -140,9 +140,9 @@ def sources_of(
     """The recordings of the patterns but the outputs `own`, with device, station, lot and date by the table of units.
     A file that the table does not name has its device by `serial_from`.
 
-    A recording under two names of one device is one source. Under the names of two devices the second is a source
+    A recording under two names of the same device is one source. Under the names of two devices the second is a source
     with `copy_of`: that device has no recording of its own.
-    Raises UserError for a pattern without files, and for a table or a `serial_from` that is none.
+    Raises UserError for a pattern without files, and for an invalid table or `serial_from`.
     """
     named = _serials(matching(patterns, own), serial_from)
     units = {} if table is None else _table(Path(table), list(named))
@@ -151,14 +151,14 @@ def sources_of(
     copies: dict[str, str] = {}
     for path, device in named.items():
         known: dict[str, Any] = {"device": device, **units.get(path, {})}
-        one = replace(hashed(path), **known)
-        other = first.setdefault(one.content, one)
-        if other is one:
-            sources.append(one)
-        elif other.device == one.device or path not in units:
+        source = replace(hashed(path), **known)
+        other = first.setdefault(source.content, source)
+        if other is source:
+            sources.append(source)
+        elif other.device == source.device or path not in units:
             copies[path] = other.path
         else:
-            sources.append(replace(one, copy_of=f"{other.path} of device {other.device}"))
+            sources.append(replace(source, copy_of=f"{other.path} of device {other.device}"))
     return Named(sources, copies)
 
 
@@ -167,10 +167,10 @@ def moment(text: str) -> datetime | None:
     if not _DATE.fullmatch(text):
         return None
     try:
-        found = datetime.fromisoformat(text)
+        date = datetime.fromisoformat(text)
     except ValueError:
         return None
-    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+    return date if date.tzinfo is not None else date.replace(tzinfo=UTC)
 
 
 def stem(path: str) -> str:
@@ -188,10 +188,10 @@ def _serials(paths: Sequence[str], serial_from: str | None) -> dict[str, str]:
         return {path: _within(pattern, path) if pattern else stem(path) for path in paths}
     if kind:
         raise UserError(f"--serial-from takes name, name:PATTERN or field, not '{short(serial_from or '')}'")
-    return _told_apart({path: stem(path) for path in paths})
+    return _with_folders({path: stem(path) for path in paths})
 
 
-def _told_apart(named: Mapping[str, str]) -> dict[str, str]:
+def _with_folders(named: Mapping[str, str]) -> dict[str, str]:
     """Names that several files have become their paths."""
     counted: dict[str, int] = {}
     for name in named.values():
@@ -201,71 +201,71 @@ def _told_apart(named: Mapping[str, str]) -> dict[str, str]:
 
 def _within(pattern: str, path: str) -> str:
     try:
-        found = re.search(pattern, path)
+        match = re.search(pattern, path)
     except re.error as error:
         raise UserError(f"--serial-from name:{short(pattern)}: is no regular expression ({error})") from error
-    if found is None:
+    if match is None:
         return stem(path)
-    return found[1] if found.re.groups and found[1] else found[0]
+    return match[1] if match.re.groups and match[1] else match[0]
 
 
-def _table(place: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
+def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
     """Device, station, lot and date by path. A file is named as the pattern names it, from the table's folder on, or by
     its bare name."""
     try:
-        text = read_text(place, MOST_TABLE_BYTES, "not a table of units")
+        text = read_text(table, MOST_TABLE_BYTES, "not a table of units")
     except FileNotFoundError as error:
-        raise UserError(f"{place}: there is no such file") from error
+        raise UserError(f"{table}: there is no such file") from error
     try:
         rows = list(csv.reader(io.StringIO(text.removeprefix("\ufeff")), strict=True))
     except csv.Error as error:
-        raise UserError(f"{place}: not a table of units: {error}") from error
+        raise UserError(f"{table}: not a table of units: {error}") from error
     header = [cell.strip().lower() for cell in rows[0]] if rows else []
     if not set(TABLE_COLUMNS[:2]) <= set(header) or len(set(header)) < len(header):
         raise UserError(
-            f"{place}: its first line must name each of {', '.join(TABLE_COLUMNS)} once; the last three may be left out"
+            f"{table}: its first line must name each of {', '.join(TABLE_COLUMNS)} once; the last three may be left out"
         )
     unknown = [cell.strip() for cell, name in zip(rows[0], header, strict=True) if name not in TABLE_COLUMNS]
     if unknown:
-        note(f"{place}: does not read {_few(unknown, 'columns')} (known: {', '.join(TABLE_COLUMNS)})")
+        note(f"{table}: does not read {_few(unknown, 'columns')} (known: {', '.join(TABLE_COLUMNS)})")
     by_place: dict[Path, list[str]] = {}
     by_name: dict[str, list[str]] = {}
     for path in paths:
         by_place.setdefault(Path(path).resolve(), []).append(path)
         by_name.setdefault(Path(path).name, []).append(path)
-    found: dict[str, dict[str, str]] = {}
+    units: dict[str, dict[str, str]] = {}
     without: list[str] = []
     for number, cells in enumerate(rows[1:], 2):
         if not any(cell.strip() for cell in cells):
             continue
         if len(cells) != len(header):
-            raise UserError(f"{place}: line {number}: {len(cells)} fields where the first line has {len(header)}")
+            raise UserError(f"{table}: line {number}: {len(cells)} fields where the first line has {len(header)}")
         row = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
         if not row["file"] or not row["device"]:
-            raise UserError(f"{place}: line {number}: file or device is empty")
+            raise UserError(f"{table}: line {number}: file or device is empty")
         file = Path(row["file"])
-        meant = [path for one in (file, place.parent / file) for path in by_place.get(one.resolve(), [])]
+        meant = [path for name in (file, table.parent / file) for path in by_place.get(name.resolve(), [])]
         if not meant and file.name == row["file"]:
             meant = by_name.get(file.name, [])
             if len(meant) > 1:
                 raise UserError(
-                    f"{place}: line {number}: '{short(file.name)}' is {short(meant[0])} and {short(meant[1])}: "
+                    f"{table}: line {number}: '{short(file.name)}' is {short(meant[0])} and {short(meant[1])}: "
                     "give its folder"
                 )
         date = row.get("date", "")
         if date and moment(date) is None:
-            raise UserError(f"{place}: line {number}: date '{short(date)}': write it as {DATE_FORM}")
+            raise UserError(f"{table}: line {number}: date '{short(date)}': write it as {DATE_FORM}")
         without += [] if meant else [f"'{row['file']}' (line {number})"]
         entry = {"device": row["device"], "station": row.get("station", ""), "lot": row.get("lot", "")}
         entry["recorded_at"] = date
         for path in dict.fromkeys(meant):
-            if found.setdefault(path, entry) != entry:
+            if units.setdefault(path, entry) != entry:
                 raise UserError(
-                    f"{place}: line {number}: '{short(row['file'])}' is there twice, with different entries"
+                    f"{table}: line {number}: '{short(row['file'])}' is there twice, with different entries"
                 )
     if without:
-        note(f"{place}: no recording of the batch is {_few(without, 'rows')}")
-    return found
+        note(f"{table}: no recording of the batch is {_few(without, 'rows')}")
+    return units
 
 
 def _few(names: Sequence[str], what: str) -> str:

@@ -8,19 +8,12 @@ from typing import Any
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of
 from selfcal.batch.fail_on import outcome
-from selfcal.batch.table import Unit
+from selfcal.batch.unit_table import Unit
 from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
 
 SCHEMA = "selfcal.fleet/1"
-#: Names that are printed of a kind at most.
+#: Most names of a kind in the output.
 MOST_NAMES = 40
-
-
-def version_of_package() -> str:
-    """The version that a table states."""
-    import selfcal
-
-    return str(selfcal.__version__)
 
 
 def judged_units(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
@@ -53,9 +46,9 @@ def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[J
                 open_.setdefault(unit.device, []).extend(lines)
     broken = {unit.source.path for unit in batch if unit.error is not None}  # listed with their errors
     for device, path, verdicts in judged:
-        for one in verdicts:
-            if one.verdict != PASS and path not in broken:
-                (failed if one.verdict == FAIL else open_).setdefault(device, []).append(one.words)
+        for verdict in verdicts:
+            if verdict.verdict != PASS and path not in broken:
+                (failed if verdict.verdict == FAIL else open_).setdefault(device, []).append(verdict.words)
     devices = dict.fromkeys(unit.device for unit in batch)
     return {
         "schema": SCHEMA,
@@ -64,9 +57,9 @@ def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[J
         "failed": failed,
         "not_judged": {device: list(dict.fromkeys(lines)) for device, lines in open_.items()},
         "limits": [
-            {"device": device, "recording": path, **one.entry()}
+            {"device": device, "recording": path, **verdict.entry()}
             for device, path, verdicts in judged
-            for one in verdicts
+            for verdict in verdicts
         ],
         "code": 1 if failed else 2 if open_ else 0,
     }
@@ -78,9 +71,9 @@ def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
     diagnosis = unit.record.get("diagnosis", {})
     for name, axis in unit.axes.items():
         if "error" not in axis:
-            found = outcome({"axes": {name: diagnosis.get(name, axis)}}, fail_on)
-            shown += [name] if found.code == 1 else []
-            lines += found.lines
+            judged = outcome({"axes": {name: diagnosis.get(name, axis)}}, fail_on)
+            shown += [name] if judged.code == 1 else []
+            lines += judged.lines
     return shown, lines
 
 

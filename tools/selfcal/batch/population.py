@@ -28,25 +28,25 @@ from scipy.special import log_ndtr, ndtri
 from selfcal.bank.result import HALF_90, of_mixture
 
 Array = NDArray[np.float64]
-#: Units that make a population, and that make a group.
+#: Fewest units of a population and of a group.
 FEWEST, FEWEST_OF_GROUP = 5, 3
 #: Points of the grid of spreads, and its reach from the spread of the estimates: of five units the tail weighs.
 _POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
-#: A weight that counts for nothing, and has a logarithm.
+#: Smallest weight: it counts for nothing, and has a logarithm.
 _NO_WEIGHT = 1e-300
-#: Probability that a batch of sound units has one that is called unlike by a quantity.
+#: Probability that a quantity calls any unit of a sound batch unlike.
 FALSE_NAME = 0.03
-#: Probability that a batch without groups is said to have one, and that a unit without drift is said to drift.
+#: Probability of a false group in a batch, and of a false drift of a unit.
 FALSE_ALARM = 1e-3
 #: Standard deviation over the median absolute deviation, and of a median over that of a mean, of a normal.
 _MAD, _MEDIAN = 1.4826, 1.2533
-#: Probability of a unit as far off, below which one that is odd in something else is in no population.
+#: Least probability of a unit's deviation at which it is in the population although it is odd in another quantity.
 _ORDINARY = 0.01
-#: Share of the units that are odd at most, and numbers of odd ones that are tried at most.
+#: Largest share of odd units, and the most numbers of odd units that are tried.
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
 #: Rounds of fit and choice at most.
 _ROUNDS = 20
-#: Nats by which two groups must be better than one: 1 in 1000 normal batches of 8 to 24 units has so many.
+#: Evidence of two groups over one, nats: 1 in 1000 normal batches of 8 to 24 units exceeds it.
 _SPLIT = 8.0
 #: Distance of two groups in standard deviations of a unit: nearer ones, as of a uniform population, share units.
 _BETWEEN = 4.5
@@ -163,9 +163,9 @@ class Apart:
     also: tuple[str, ...] = ()
     against: str | None = None
 
-    def shift(self, at: NDArray[np.intp]) -> Array:
-        """By how much the units at the places `at` [n] are off for it."""
-        inside = np.isin(at, self.members)
+    def shift(self, devices: NDArray[np.intp]) -> Array:
+        """By how much the units at the places `devices` [n] are off for it."""
+        inside = np.isin(devices, self.members)
         return self.offset * (inside.astype(np.float64) - (0.0 if self.against is None else 0.5))
 
 
@@ -221,87 +221,87 @@ def populations(
 
     `odd`: by axis, places of units that are unlike by anything else. FALSE_NAME is shared among all units and
     quantities, FALSE_ALARM among all groups and quantities."""
-    tested = [one for one in measured if one.y.size >= FEWEST]
-    limit = math.log(FALSE_NAME / max(1, sum(one.y.size for one in tested)))
+    tested = [quantity for quantity in measured if quantity.y.size >= FEWEST]
+    limit = math.log(FALSE_NAME / max(1, sum(quantity.y.size for quantity in tested)))
     groups = _groups(groupings)
     group_limit = math.log(FALSE_ALARM / max(1, len(groups) * len(tested)))
-    groups_of = {one.name: _apart(one, groups, limit, group_limit) for one in tested}
-    found: dict[str, Population] = {}
+    groups_of = {quantity.name: _apart(quantity, groups, limit, group_limit) for quantity in tested}
+    by_name: dict[str, Population] = {}
     for _ in range(_ROUNDS):
-        before = {name: {one.at for one in of.unlike} for name, of in found.items()}
-        for one in tested:
-            axis = one.name.split(".")[0]
+        before = {name: {unit.at for unit in of.unlike} for name, of in by_name.items()}
+        for quantity in tested:
+            axis = quantity.name.split(".")[0]
             others = set((odd or {}).get(axis, ()))
             others |= set().union(
-                *(of for name, of in before.items() if name != one.name and name.split(".")[0] == axis)
+                *(of for name, of in before.items() if name != quantity.name and name.split(".")[0] == axis)
             )
-            found[one.name] = _population(one, groups_of[one.name], others, limit)
-        if before == {name: {one.at for one in of.unlike} for name, of in found.items()}:
+            by_name[quantity.name] = _population(quantity, groups_of[quantity.name], others, limit)
+        if before == {name: {unit.at for unit in of.unlike} for name, of in by_name.items()}:
             break
-    return list(found.values())
+    return list(by_name.values())
 
 
 def _is_group(inside: int, units: int) -> bool:
-    """Whether so many of the units are a group beside the others: not the larger part, and neither too few."""
+    """Whether so many of the units are a group among the others: not the larger part, and neither too few."""
     return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
 
 
-#: Groups that a test can tell, by the places of their units: kind, name and the only other name of each.
+#: Groups that a test can separate, by the places of their units: kind, name and the only other name of each.
 Groups = Mapping[tuple[int, ...], Sequence[tuple[str, str, str | None]]]
 
 
 def _groups(groupings: Sequence[Grouping]) -> Groups:
-    found: dict[tuple[int, ...], list[tuple[str, str, str | None]]] = {}
+    groups: dict[tuple[int, ...], list[tuple[str, str, str | None]]] = {}
     for kind, names in groupings:
         members: dict[str, list[int]] = {}
-        for at, name in enumerate(names):
-            members.setdefault(name, []).append(at)
+        for device, name in enumerate(names):
+            members.setdefault(name, []).append(device)
         for name, inside in members.items():
             if name and _is_group(len(inside), len(names)):
                 against = next(other for other in members if other != name) if len(members) == 2 else None
-                found.setdefault(tuple(inside), []).append((kind, name, against))
-    return found
+                groups.setdefault(tuple(inside), []).append((kind, name, against))
+    return groups
 
 
-def _apart(one: Measured, groups: Groups, limit: float, group_limit: float) -> list[Apart]:
-    """The groups of a quantity that differ, the one that differs most first."""
+def _apart(measured: Measured, groups: Groups, limit: float, group_limit: float) -> list[Apart]:
+    """The groups of a quantity that differ, the largest difference first."""
     apart: list[Apart] = []
-    y = one.y.copy()
+    y = measured.y.copy()
     for _ in range(_ROUNDS):
         left = {members: labels for members, labels in groups.items() if members not in {of.members for of in apart}}
-        found = _most_apart(one, y, left, limit, group_limit)
-        if found is None:
+        group = _most_apart(measured, y, left, limit, group_limit)
+        if group is None:
             break
-        apart.append(found)
-        y -= found.shift(one.at)
+        apart.append(group)
+        y -= group.shift(measured.at)
     return apart
 
 
-def _population(one: Measured, apart: Sequence[Apart], others: Set[int], limit: float) -> Population:
+def _population(measured: Measured, apart: Sequence[Apart], others: Set[int], limit: float) -> Population:
     """The population of the units but `others`, the units that are odd elsewhere and not ordinary here."""
     apart = list(apart)
     while True:
-        offset = np.sum([np.zeros(one.y.size), *(group.shift(one.at) for group in apart)], axis=0)
-        centred = one.y - offset
-        own = ~np.isin(one.at, list(others))
+        offset = np.sum([np.zeros(measured.y.size), *(group.shift(measured.at) for group in apart)], axis=0)
+        centred = measured.y - offset
+        own = ~np.isin(measured.at, list(others))
         if own.sum() < FEWEST:
             own[:] = True
-        own |= fit(centred[own], one.s[own]).log_p(centred, one.s) > math.log(_ORDINARY)
+        own |= fit(centred[own], measured.s[own]).log_p(centred, measured.s) > math.log(_ORDINARY)
         kept = own.copy()
-        kept[own] = _kept(centred[own], one.s[own], limit)
-        split = None if apart and apart[-1].kind == TWO_GROUPS else _split(one, centred, kept)
+        kept[own] = _kept(centred[own], measured.s[own], limit)
+        split = None if apart and apart[-1].kind == TWO_GROUPS else _split(measured, centred, kept)
         if split is None:
             break
         apart.append(split)
-    population = fit(centred[kept], one.s[kept])
-    log_p = population.log_p(centred, one.s)
+    population = fit(centred[kept], measured.s[kept])
+    log_p = population.log_p(centred, measured.s)
     off = centred - population.middle.median
     unlike = [
-        Unlike(int(one.at[k]), one.name, float(off[k]), float(log_p[k]))
+        Unlike(int(measured.at[k]), measured.name, float(off[k]), float(log_p[k]))
         for k in np.flatnonzero(~kept & (log_p <= limit)).tolist()
     ]
-    seen_from = _seen_from(centred[kept], one.s[kept], limit)
-    return Population(one, population, offset, kept, seen_from, tuple(apart), tuple(unlike))
+    seen_from = _seen_from(centred[kept], measured.s[kept], limit)
+    return Population(measured, population, offset, kept, seen_from, tuple(apart), tuple(unlike))
 
 
 def _seen_from(y: Array, s: Array, limit: float) -> float:
@@ -316,7 +316,7 @@ def _seen_from(y: Array, s: Array, limit: float) -> float:
 
 
 def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
-    """The units [n] that are not odd: `limit` is the ln probability of one that is."""
+    """The units [n] that are not odd: `limit` is the ln probability of an odd unit."""
     middle, spread = robust(y, s)
     order = np.argsort(-np.abs(y - middle) / np.hypot(spread, s))
     most = min(math.ceil(MOST_ODD * y.size), y.size - FEWEST)
@@ -330,12 +330,12 @@ def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
     return np.ones(y.size, np.bool_)
 
 
-def _split(one: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
-    """The smaller of two groups in which the units lie, if two are better than one by _SPLIT.
+def _split(measured: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
+    """The smaller of two groups in which the units lie, if two are better than a single group by _SPLIT.
 
     Each cut of the sorted units gives two normals of one spread. Their likelihood counts each unit's group as drawn."""
     order = np.flatnonzero(kept)[np.argsort(y[kept])]
-    x, s, n = y[order] - y[kept].mean(), one.s[order], order.size
+    x, s, n = y[order] - y[kept].mean(), measured.s[order], order.size
     if n < 2 * FEWEST_OF_GROUP:
         return None
     spread = float(np.std(x)) * np.geomspace(0.03, 3.0, _POINTS)
@@ -355,30 +355,30 @@ def _split(one: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
     if gain[cut] < _SPLIT or apart < _BETWEEN * unit:
         return None
     smaller, off = (order[low_ones:], apart) if 2 * low_ones > n else (order[:low_ones], -apart)
-    members = tuple(sorted(one.at[smaller].tolist()))
-    return Apart(TWO_GROUPS, "", one.name, off, -float(gain[cut]), members, against="")
+    members = tuple(sorted(measured.at[smaller].tolist()))
+    return Apart(TWO_GROUPS, "", measured.name, off, -float(gain[cut]), members, against="")
 
 
-def _most_apart(one: Measured, y: Array, groups: Groups, limit: float, group_limit: float) -> Apart | None:
+def _most_apart(measured: Measured, y: Array, groups: Groups, limit: float, group_limit: float) -> Apart | None:
     """The group that differs most from the others, None without one beyond ln probability `group_limit`. `y` [n]: the
     units without the groups that are known.
 
     Medians, which a few odd units move little, choose; the exact test of the units without odd ones decides. Medians
     see less: half the logarithm of the probability makes a candidate."""
-    inside_of = {members: np.isin(one.at, members) for members in groups}
+    inside_of = {members: np.isin(measured.at, members) for members in groups}
     log_p = {
-        members: _by_medians(y, one.s, inside)
+        members: _by_medians(y, measured.s, inside)
         for members, inside in inside_of.items()
         if _is_group(int(inside.sum()), inside.size)
     }
     for members in sorted(log_p, key=lambda members: log_p[members]):
         if log_p[members] > 0.5 * group_limit:
             break
-        difference, exact = _difference(y, one.s, inside_of[members], limit)
+        difference, exact = _difference(y, measured.s, inside_of[members], limit)
         if exact <= group_limit:
             (kind, name, against), *others = groups[members]
             also = tuple(f"{kind} {name}" for kind, name, _ in others)
-            return Apart(kind, name, one.name, difference, exact, members, also, against)
+            return Apart(kind, name, measured.name, difference, exact, members, also, against)
     return None
 
 

@@ -1,7 +1,8 @@
 """`fleet --write-model`: the batch as the priors of a module's model file.
 
 A new unit's parameter is drawn from the population: log-normal about its mean. Its sd has the spread between units, how
-well the batch tells this spread and the mean, and what sets lots apart. A station's or a day's own part is no unit's.
+well the batch determines this spread and the mean, and what sets lots apart. The part of a station or a day is left
+out.
 """
 
 from __future__ import annotations
@@ -34,16 +35,16 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
     Raises UserError where the batch has no population.
     """
     tree = read_yaml(model.path, "model file")
-    found: dict[str, dict[str, Prior]] = {}
-    for one in batch.populations:
-        axis, _, parameter = one.measured.name.rpartition(".")
-        if one.measured.logarithm:
-            found.setdefault(axis, {})[parameter] = _prior(one, batch)
-    if not found:
+    priors: dict[str, dict[str, Prior]] = {}
+    for population in batch.populations:
+        axis, _, parameter = population.measured.name.rpartition(".")
+        if population.measured.logarithm:
+            priors.setdefault(axis, {})[parameter] = _prior(population, batch)
+    if not priors:
         raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
     for group in model.groups:
         own = tree["groups"][group.name].get("own_priors") or {}
-        own |= {axis: {**own.get(axis, {}), **_trees(found[axis])} for axis in group.axes if axis in found}
+        own |= {axis: {**own.get(axis, {}), **_trees(priors[axis])} for axis in group.axes if axis in priors}
         if own:
             tree["groups"][group.name]["own_priors"] = own
     for law, odds in _odds(model, batch).items():
@@ -52,7 +53,7 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
     Model.of_tree(tree, Path(path))
     head = f"# Priors of {len(batch.devices)} units, by `selfcal fleet`.\n"
     write_text(path, head + yaml.safe_dump(tree, sort_keys=False, width=120))
-    return found
+    return priors
 
 
 def lines_of(priors: Mapping[str, Mapping[str, Prior]], model: Model) -> Iterator[str]:
@@ -102,6 +103,6 @@ def _odds(model: Model, batch: Batch) -> dict[str, float]:
         share = dict(model.hypotheses)
         if axis in there:
             known = [results[-1]["hypotheses"] for results in sound_of(batch.devices, axis).values()]
-            share = {law: (1.0 + sum(one[law] for one in known)) / (len(known) + len(share)) for law in share}
+            share = {law: (1.0 + sum(prior[law] for prior in known)) / (len(known) + len(share)) for law in share}
         total = {law: total[law] + share[law] for law in total}
     return {law: _rounded(odds / len(model.axes)) for law, odds in total.items()}

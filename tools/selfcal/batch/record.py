@@ -17,22 +17,22 @@ from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.base.errors import UserError, first_line, printable
 from selfcal.base.output import whole
 from selfcal.batch.spread import Job, Row, spread
-from selfcal.batch.table import Unit
+from selfcal.batch.unit_table import Unit
 from selfcal.readings.tests import TESTS
 
-#: What is kept of an axis of `identify`, and of one of `diagnose`.
+#: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
-#: Checks of the readings themselves, and of the innovations; a mark is one so many standard deviations off.
+#: Checks of the readings, and of the innovations; deviation of a mark, in standard deviations.
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
-#: Distinct readings from which on their lattice is known.
+#: Fewest distinct readings with a known lattice.
 LEAST_DISTINCT = 8
-#: Devices that have an own page at most, and letters that a page's name does not have.
+#: Most devices with a page of their own, and the characters that its name lacks.
 MOST_PAGES = 20
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
-#: Why a recording whose workers die has no result.
+#: Error of a recording whose workers die.
 KILLED = "its worker process was killed each time, maybe for want of memory"
 
 
@@ -106,20 +106,20 @@ def own_pages(
 
     A page that is there of the same recording and options is not made anew. Returns where each is from the folder
     above."""
-    place = Path(folder)
-    place.mkdir(exist_ok=True)
+    pages = Path(folder)
+    pages.mkdir(exist_ok=True)
     jobs = {}
     for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_PAGES]:
         source = devices[name][-1].source
         known = keeper.place((source.path, source.content)).stem[:12]
-        jobs[name] = (str(Path(source.path).absolute()), str(place / f"{_UNSAFE.sub('_', name)[:60]}-{known}.html"))
+        jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{known}.html"))
     todo = [job for job in jobs.values() if not Path(job[1]).exists()]
     spread(partial(_paged, verbs, options), todo, settings={}, piece=1, count=count, lost=lambda _: [{}], verb="pages")
-    return {name: f"{place.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
+    return {name: f"{pages.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
 
 
 def _paged(verbs: Verbs, options: Options, job: Job) -> list[Row]:
-    """Write the page of one recording. `job`: its absolute path, the page's place."""
+    """Write the page of a recording. `job`: its absolute path, the page's place."""
     with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(UserError, MemoryError):
         given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
         verbs.diagnose(job[0], report=job[1], **given)
@@ -136,9 +136,9 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     if "error" in axis:
         return {}
     checks = axis["checks"]
-    failed = {name: one for name, one in checks.items() if not one["passed"]}
+    failed = {name: check for name, check in checks.items() if not check["passed"]}
     marks = [name for name in failed if name in READINGS]
-    marks += [name for name, one in failed.items() if name in INNOVATIONS and _far(one)]
+    marks += [name for name, check in failed.items() if name in INNOVATIONS and _far(check)]
     lattice = checks.get("lattice", {})
     known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= LEAST_DISTINCT else {}
     return {"marks": list(dict.fromkeys(marks)), **known}
@@ -170,7 +170,7 @@ class ByContent:
         )
 
     def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
-        """The row of a recording; None if it has none, or a damaged one."""
+        """The row of a recording; None without a row, or with a damaged one."""
         try:
             row = json.loads(self.place(jobs[0]).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -185,6 +185,6 @@ class ByContent:
 
 
 def settings_of(options: Options, model: str, version: str) -> dict[str, Any]:
-    """All that decides a record beside its recording; `model`: its content."""
+    """All that decides a record apart from its recording; `model`: its content."""
     kept = [*IDENTIFIED, *DIAGNOSED]
     return {"schema": "selfcal.fleet/1", "kept": kept, **asdict(options), "model": model, "version": version}

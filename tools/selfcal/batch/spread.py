@@ -35,16 +35,16 @@ from selfcal.base.errors import UserError, first_line, install, note, printable,
 from selfcal.base.output import temporary_folder, whole
 from selfcal.base.progress import EVERY_S
 
-#: Whatever a function makes a record of; it is pickled.
+#: Argument of the function for a record; it is pickled.
 Job = Any
 Row = dict[str, Any]
 #: A piece: its place among the pieces, and its jobs.
 Work = tuple[int, list[Job]]
-#: s until a scheduler has answered.
+#: Timeout of a scheduler, s.
 PATIENCE_S = 10.0
 #: Seeds that the simulator takes.
 SEEDS = 2**64
-#: Workers that die over a piece until the piece is the reason.
+#: Dead workers of a piece after which the piece is the reason.
 DEATHS = 4
 _KILLED = "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"
 
@@ -67,7 +67,7 @@ def record_seeds(records: int, seed: int) -> list[int]:
 
 
 def checked_seed(seed: int) -> int:
-    """The seed. Raises UserError for one that the simulator does not take."""
+    """The seed. Raises UserError for a seed that the simulator does not take."""
     if not 0 <= seed < SEEDS:
         raise UserError(f"--seed must be a whole number from 0 to 2^64 - 1, not {shown(seed)}")
     return seed
@@ -90,7 +90,7 @@ def spread(
 
     `settings`: everything that decides the rows beside the jobs; a folder of other settings is refused. `piece`: jobs
     that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this package.
-    `results`: the folder, or what keeps the pieces. `count`: workers here, by default one for each processor. `lost`:
+    `results`: the folder, or what keeps the pieces. `count`: workers here, by default as many as processors. `lost`:
     the rows of a job whose workers die; without it such a job ends the work. `weights` [jobs]: the work of each, for
     the remaining time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.
     Raises UserError for a package that is absent and a scheduler that does not answer.
@@ -98,21 +98,21 @@ def spread(
     if count is not None and count < 1:
         raise UserError("--workers must be at least 1")
     store: Keeper | None = Store(Path(results), settings) if isinstance(results, Path | str) else results
-    pieces = [list(jobs[at : at + piece]) for at in range(0, len(jobs), piece)]
+    pieces = [list(jobs[start : start + piece]) for start in range(0, len(jobs), piece)]
     each = [1.0] * len(jobs) if weights is None else list(weights)
-    found: dict[int, list[Row]] = {}
+    finished: dict[int, list[Row]] = {}
     if store is not None:
-        found = {k: rows for k, work in enumerate(pieces) if (rows := store.read(k, work)) is not None}
-    waiting = [(k, work) for k, work in enumerate(pieces) if k not in found]
+        finished = {k: rows for k, work in enumerate(pieces) if (rows := store.read(k, work)) is not None}
+    waiting = [(k, work) for k, work in enumerate(pieces) if k not in finished]
     with _Remaining(verb, [sum(each[k * piece : (k + 1) * piece]) for k in range(len(pieces))], pieces) as remaining:
-        remaining.done(found)
+        remaining.done(finished)
         done = _cluster(function, waiting, scheduler, lost) if scheduler else _here(function, waiting, count, lost)
         for k, rows in done:
-            found[k] = rows
+            finished[k] = rows
             if store is not None:
                 store.write(k, pieces[k], rows)
             remaining.advance(k)
-    return [row for k in range(len(pieces)) for row in found[k]]
+    return [row for k in range(len(pieces)) for row in finished[k]]
 
 
 class _Remaining:
@@ -185,7 +185,7 @@ def _end_with_the_command() -> None:
 
 @contextmanager
 def workers(count: int | None = None) -> Iterator[ProcessPoolExecutor]:
-    """Processes that work for this one; `count`: one for each processor by default.
+    """Processes that work for this process; `count`: as many as processors by default.
 
     A worker that is killed ends the work that waits for it with BrokenProcessPool. Leaving the block by an exception
     ends the workers at once.
@@ -282,7 +282,7 @@ def _cluster(
 
 @contextmanager
 def _silent() -> Iterator[None]:
-    """A library's log is none for the user: its failure is one line."""
+    """A library's log is not for the user: its failure is a line."""
     before = logging.root.manager.disable
     logging.disable(logging.CRITICAL)
     try:
@@ -314,16 +314,16 @@ class Store:
         """The rows of piece `k`, None if it is absent or was of fewer jobs. Raises UserError for other settings."""
         from pyarrow import ArrowException, parquet
 
-        place = self.place(k)
-        if not place.exists():
+        path = self.place(k)
+        if not path.exists():
             return None
         try:
-            table = parquet.read_table(place)
+            table = parquet.read_table(path)
         except (ArrowException, OSError) as error:
-            raise UserError(f"{place}: cannot be read ({first_line(error)}): delete it to have it made anew") from error
+            raise UserError(f"{path}: cannot be read ({first_line(error)}): delete it to have it made anew") from error
         made = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
         if made.get("selfcal.settings") != self.key:
-            raise UserError(f"{place}: is of other settings: give --results another folder")
+            raise UserError(f"{path}: is of other settings: give --results another folder")
         if made.get("selfcal.jobs") != str(len(jobs)) or "selfcal.keys" not in made:
             return None
         keys = json.loads(made["selfcal.keys"])

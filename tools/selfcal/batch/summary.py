@@ -28,25 +28,25 @@ from selfcal.batch.population import (
     populations,
     sd_of,
 )
-from selfcal.batch.table import Unit, best, bias_of
+from selfcal.batch.unit_table import Unit, best, bias_of
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
 
-#: Rounds in which the shares of the laws are found.
+#: Rounds of the search for the shares of the laws.
 SHARE_ROUNDS = 100
-#: Nats by which a unit's law must be better than the batch's, at most one in e^12 times by chance.
+#: Evidence of a unit's law over the batch's law, nats: at most 1 in e^12 by chance.
 OTHER_LAW = 12.0
-#: Relative difference of two lattices.
+#: Largest relative difference of equal lattices.
 LATTICE = 0.05
-#: Of a recording beside a normal prior, of a quantity or of its logarithm: with less it says nothing of the quantity.
+#: Least weight of a recording over that of a normal prior, of a quantity or its logarithm, that says anything.
 LEAST_WEIGHT = 0.1
-#: What groups units, by the attribute of a source.
+#: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Devices of a line at most.
+#: Most devices of a line.
 MOST_NAMED = 20
 SECONDS_A_DAY = 86400.0
-#: Times the batch's median from which on parts do not differ: a batch that sees no less names no unit by it.
+#: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0
 
 
@@ -100,16 +100,16 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     odd: dict[str, set[int]] = {}
     for axis, name, _ in marked:
         odd.setdefault(axis, set()).add(names.index(name))
-    found = populations(list(_measured(known, names, laws, unidentified)), groupings, odd)
+    fitted = populations(list(_measured(known, names, laws, unidentified)), groupings, odd)
     unlike: dict[str, list[str]] = {}
-    for population in found:
-        for one in population.unlike:
-            unlike.setdefault(names[one.at], []).append(_off(population, one.off, one.log_p))
+    for population in fitted:
+        for odd_unit in population.unlike:
+            unlike.setdefault(names[odd_unit.at], []).append(_off(population, odd_unit.off, odd_unit.log_p))
     for _, name, words in marked:
         unlike.setdefault(name, []).append(words)
-    others = {key: list(one) for key, one in left_out.items()}
+    others = {key: list(left) for key, left in left_out.items()}
     drifts = drifts_of(_series(known, names))
-    return Batch(devices, found, dict(sorted(unlike.items())), drifts, shared, others, unidentified)
+    return Batch(devices, fitted, dict(sorted(unlike.items())), drifts, shared, others, unidentified)
 
 
 def _in_group_units(unit: Unit, model: Model) -> Unit:
@@ -131,13 +131,13 @@ def _converted(axis: Mapping[str, Any], to: str, regressors: Sequence[Regressor]
         law: {name: _estimate_in(estimate, name, to) for name, estimate in of.items()}
         for law, of in axis["parameters"].items()
     }
-    found = {**axis, "bias_now": {"mean": mean, "sd": bias["sd"] * factor, "unit": to}, "parameters": parameters}
-    unit_of = {one.name: coefficient_unit(to, one.unit) for one in regressors}
-    found["regressors"] = {
-        name: {"coefficients": {of: _scaled(e, factor, unit_of[name]) for of, e in one["coefficients"].items()}}
-        for name, one in axis.get("regressors", {}).items()
+    converted = {**axis, "bias_now": {"mean": mean, "sd": bias["sd"] * factor, "unit": to}, "parameters": parameters}
+    unit_of = {regressor.name: coefficient_unit(to, regressor.unit) for regressor in regressors}
+    converted["regressors"] = {
+        name: {"coefficients": {of: _scaled(e, factor, unit_of[name]) for of, e in entry["coefficients"].items()}}
+        for name, entry in axis.get("regressors", {}).items()
     }
-    return found | ({"lattice": axis["lattice"] * factor} if "lattice" in axis else {})
+    return converted | ({"lattice": axis["lattice"] * factor} if "lattice" in axis else {})
 
 
 def _estimate_in(estimate: Mapping[str, Any], name: str, to: str) -> Mapping[str, Any]:
@@ -159,12 +159,12 @@ def group_of(kind: str, unit: Unit) -> str:
 
 
 def sound_of(devices: Mapping[str, Sequence[Unit]], axis: str) -> dict[str, list[Mapping[str, Any]]]:
-    """The results of an axis by device, of the devices that have one."""
-    found = {
+    """The results of an axis, by device."""
+    results = {
         name: [unit.axes[axis] for unit in units if axis in unit.axes and "error" not in unit.axes[axis]]
         for name, units in devices.items()
     }
-    return {name: axes for name, axes in found.items() if axes}
+    return {name: axes for name, axes in results.items() if axes}
 
 
 def axes_of(devices: Mapping[str, Sequence[Unit]]) -> list[str]:
@@ -173,26 +173,26 @@ def axes_of(devices: Mapping[str, Sequence[Unit]]) -> list[str]:
 
 
 def _behind(axis: Mapping[str, Any]) -> dict[str, float]:
-    """How many nats each law is behind the best one."""
+    """Evidence of each law below the best law, nats."""
     evidence = {law: value for law, value in axis["log_evidence"].items() if value is not None}
     best = max(evidence.values())
     return {law: best - value if math.isfinite(value) else math.inf for law, value in evidence.items()}
 
 
 def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
-    """The law that the batch has, by axis: most units are of it where each is of one law, by the greatest likelihood.
+    """The law that the batch has, by axis: the law of most units, by the greatest likelihood of their shares.
 
-    An odd unit counts as one, however many nats it has. Expectation and maximization in turn find the shares."""
-    found: dict[str, str] = {}
+    An odd unit weighs no more than another, however many nats it has. Expectation and maximization find the shares."""
+    laws_of: dict[str, str] = {}
     for axis in axes_of(devices):
-        behind = [_behind(one) for axes in sound_of(devices, axis).values() for one in axes]
-        laws = list(dict.fromkeys(law for one in behind for law in one))
-        likelihood = np.exp([[-one.get(law, math.inf) for law in laws] for one in behind])
+        behind = [_behind(result) for axes in sound_of(devices, axis).values() for result in axes]
+        laws = list(dict.fromkeys(law for nats in behind for law in nats))
+        likelihood = np.exp([[-nats.get(law, math.inf) for law in laws] for nats in behind])
         share = np.ones(len(laws))
         for _ in range(SHARE_ROUNDS if behind else 0):
             share = likelihood.T @ (1.0 / (likelihood @ share)) * share / len(behind)
-        found |= {axis: laws[int(np.argmax(share))]} if behind else {}
-    return found
+        laws_of |= {axis: laws[int(np.argmax(share))]} if behind else {}
+    return laws_of
 
 
 @dataclass(frozen=True)
@@ -211,7 +211,7 @@ OfAxis = dict[str, list[tuple[float | None, dict[str, Known]]]]
 
 
 def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model: Model) -> dict[str, OfAxis]:
-    found: dict[str, OfAxis] = {}
+    known_of: dict[str, OfAxis] = {}
     for axis, law in laws.items():
         group, regressors = model.group_of(axis), offered(model, axis)
         for device, units in devices.items():
@@ -219,98 +219,105 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
                 if "error" not in unit.axes.get(axis, {"error": ""}):
                     day = None if unit.moment is None else unit.moment.timestamp() / SECONDS_A_DAY
                     known = _of_recording(unit.axes[axis], law, group, regressors)
-                    found.setdefault(axis, {}).setdefault(device, []).append((day, known))
-    return found
+                    known_of.setdefault(axis, {}).setdefault(device, []).append((day, known))
+    return known_of
 
 
 def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: Sequence[Regressor]) -> dict[str, Known]:
-    """What one recording says of each parameter of a law, each coefficient of a regressor, and the bias.
+    """Parameters of a law, coefficients of regressors, and the bias, by a recording.
 
     A unit whose own law has N where the batch's has no number is compared by its own."""
     parameters: Mapping[str, Mapping[str, Any]] = axis["parameters"][law]
-    found = {name: _parameter(one, group.priors.get(name)) for name, one in parameters.items()}
-    if found.get("N") is None:
-        found["N"] = _parameter(axis["parameters"][best(axis)]["N"], group.priors.get("N"))
-    for one in regressors:
-        for column, estimate in axis.get("regressors", {}).get(one.name, {"coefficients": {}})["coefficients"].items():
-            found[column] = _coefficient(estimate, one.sd[group.name])
+    quantities = {name: _parameter(estimate, group.priors.get(name)) for name, estimate in parameters.items()}
+    if quantities.get("N") is None:
+        quantities["N"] = _parameter(axis["parameters"][best(axis)]["N"], group.priors.get("N"))
+    for regressor in regressors:
+        for column, estimate in (
+            axis.get("regressors", {}).get(regressor.name, {"coefficients": {}})["coefficients"].items()
+        ):
+            quantities[column] = _coefficient(estimate, regressor.sd[group.name])
     bias = bias_of(axis)
     s = (bias["q95"] - bias["q05"]) / (2.0 * HALF_90)
-    found["bias"] = Known(bias["median"], s, identified=True, unit=group.unit, logarithm=False)
-    return {name: one for name, one in found.items() if one is not None}
+    quantities["bias"] = Known(bias["median"], s, identified=True, unit=group.unit, logarithm=False)
+    return {name: known for name, known in quantities.items() if known is not None}
 
 
-def _parameter(one: Mapping[str, Any], prior: Prior | None) -> Known | None:
+def _parameter(estimate: Mapping[str, Any], prior: Prior | None) -> Known | None:
     """ln of a parameter. A uniform `prior` leans upwards by s^2 in the logarithm. None: the recording says nothing.
 
     An estimate off the grid counts: it is rough, and far from the batch's if it is odd."""
-    median, q05, q95 = (one[key] for key in ("median", "q05", "q95"))
+    median, q05, q95 = (estimate[key] for key in ("median", "q05", "q95"))
     if None in (median, q05, q95) or not 0.0 < q05 < q95 < math.inf:
         return None
     s = math.log(q95 / q05) / (2.0 * HALF_90)
     y = math.log(median)
     if prior is not None and prior.law == "uniform":
         y -= s**2
-    known = Known(y, s, one["identified"], one["unit"], logarithm=True)
+    known = Known(y, s, estimate["identified"], estimate["unit"], logarithm=True)
     return (
         _without(known, math.log(prior.median), prior.sd) if prior is not None and prior.law == "log_normal" else known
     )
 
 
-def _coefficient(one: Mapping[str, Any], sd: float) -> Known | None:
+def _coefficient(estimate: Mapping[str, Any], sd: float) -> Known | None:
     """A coefficient, whose prior is about 0. It is identified where the recording halves that prior's sd."""
-    mean, s = one["mean"], one["sd"]
+    mean, s = estimate["mean"], estimate["sd"]
     if mean is None or s is None or not 0.0 < s < math.inf:
         return None
-    return _without(Known(mean, s, s <= 0.5 * sd, one["unit"], logarithm=False), 0.0, sd)
+    return _without(Known(mean, s, s <= 0.5 * sd, estimate["unit"], logarithm=False), 0.0, sd)
 
 
-def _without(one: Known, mean: float, sd: float) -> Known | None:
-    """Less a normal prior, which is one more measurement. None: hardly anything is left."""
-    own = one.s**-2 - sd**-2
+def _without(known: Known, mean: float, sd: float) -> Known | None:
+    """A quantity without its normal prior. None: hardly anything is left."""
+    own = known.s**-2 - sd**-2
     if own < LEAST_WEIGHT * sd**-2:
         return None
-    return replace(one, y=(one.y * one.s**-2 - mean * sd**-2) / own, s=own**-0.5)
+    return replace(known, y=(known.y * known.s**-2 - mean * sd**-2) / own, s=own**-0.5)
 
 
 def _measured(
     known: Mapping[str, OfAxis], names: Sequence[str], laws: Mapping[str, str], unidentified: dict[str, tuple[int, int]]
 ) -> Iterator[Measured]:
-    """Each quantity over the devices. Several recordings of one count together; of the bias the last counts.
+    """Each quantity over the devices. Recordings of a device count together; of the bias the last counts.
 
     A quantity that too few units identify goes to `unidentified`."""
-    place = {name: k for k, name in enumerate(names)}
+    index = {name: k for k, name in enumerate(names)}
     for axis, of_axis in known.items():
-        there = dict.fromkeys(name for of in of_axis.values() for _, one in of for name in one if name != "bias")
+        there = dict.fromkeys(
+            name for of in of_axis.values() for _, quantities in of for name in quantities if name != "bias"
+        )
         for name in (*there, "bias"):
-            own = {device: [one[name] for _, one in of if name in one] for device, of in of_axis.items()}
+            own = {
+                device: [quantities[name] for _, quantities in of if name in quantities]
+                for device, of in of_axis.items()
+            }
             own = {device: of if name != "bias" else of[-1:] for device, of in own.items() if of}
-            identified = sum(any(one.identified for one in of) for of in own.values())
+            identified = sum(any(record.identified for record in of) for of in own.values())
             if identified < max(FEWEST, 0.5 * len(of_axis)):
                 unidentified |= {f"{axis}.{name}": (identified, len(of_axis))} if len(of_axis) >= FEWEST else {}
                 continue
             y, s = np.array([_joined(of) for of in own.values()], np.float64).T
-            at = np.array([place[device] for device in own], np.intp)
-            one = next(iter(own.values()))[0]
-            yield Measured(f"{axis}.{name}", one.unit, laws[axis], y, s, at, one.logarithm)
+            devices = np.array([index[device] for device in own], np.intp)
+            first = next(iter(own.values()))[0]
+            yield Measured(f"{axis}.{name}", first.unit, laws[axis], y, s, devices, first.logarithm)
 
 
 def _joined(known: Sequence[Known]) -> tuple[float, float]:
-    weight = np.array([one.s**-2 for one in known])
-    return float(weight @ np.array([one.y for one in known]) / weight.sum()), float(weight.sum() ** -0.5)
+    weight = np.array([record.s**-2 for record in known])
+    return float(weight @ np.array([record.y for record in known]) / weight.sum()), float(weight.sum() ** -0.5)
 
 
 def _series(known: Mapping[str, OfAxis], names: Sequence[str]) -> Iterator[Series]:
     """Each quantity of each device that has recordings of two dates or more."""
     for axis, of_axis in known.items():
-        for at, device in enumerate(names):
-            dated = [(day, one) for day, one in of_axis.get(device, ()) if day is not None]
-            for name in dict.fromkeys(name for _, one in dated for name in one):
-                own = [(day, one[name]) for day, one in dated if name in one]
+        for index, device in enumerate(names):
+            dated = [(day, quantities) for day, quantities in of_axis.get(device, ()) if day is not None]
+            for name in dict.fromkeys(name for _, quantities in dated for name in quantities):
+                own = [(day, quantities[name]) for day, quantities in dated if name in quantities]
                 days = np.array([day for day, _ in own])
                 if np.unique(days).size > 1:
-                    y, s = np.array([(one.y, one.s) for _, one in own], np.float64).T
-                    yield Series(at, f"{axis}.{name}", own[0][1].unit, own[0][1].logarithm, days, y, s)
+                    y, s = np.array([(quantity.y, quantity.s) for _, quantity in own], np.float64).T
+                    yield Series(index, f"{axis}.{name}", own[0][1].unit, own[0][1].logarithm, days, y, s)
 
 
 def _off(population: Population, off: float, log_p: float) -> str:
@@ -327,33 +334,33 @@ def _marked(
     """Axes of devices with what few others have, and its words: another lattice or law than most, a mark, a cause.
 
     A mark or a cause that more than MOST_ODD of the units have is the batch's own."""
-    known = {(one.kind, one.name, one.cause) for one in shared}
+    known = {(cause.kind, cause.name, cause.cause) for cause in shared}
     for axis in axes_of(devices):
         sound = sound_of(devices, axis)
         if len(sound) < FEWEST:
             continue
         lattice = [axes[-1]["lattice"] for axes in sound.values() if "lattice" in axes[-1]]
         step = float(np.median(lattice)) if len(lattice) >= 0.5 * len(sound) else math.nan
-        found: dict[str, list[tuple[str, str]]] = {}
+        marked: dict[str, list[tuple[str, str]]] = {}
         for name, axes in sound.items():
-            for mark in dict.fromkeys(mark for one in axes for mark in one.get("marks", [])):
-                found.setdefault(mark, []).append((name, f"{axis} {mark}"))
+            for mark in dict.fromkeys(mark for result in axes for mark in result.get("marks", [])):
+                marked.setdefault(mark, []).append((name, f"{axis} {mark}"))
             own = axes[-1].get("lattice", math.nan)
             if abs(own / step - 1.0) > LATTICE:
                 unit = axes[-1]["bias_now"]["unit"]
                 yield axis, name, f"{axis} steps of {own:.3g} {unit}, the batch's are {step:.3g}"
             behind = _behind(axes[-1])
             if axis in laws and behind.get(laws[axis], math.inf) > OTHER_LAW + math.log(len(sound)):
-                law = min(behind, key=lambda one: behind[one])
+                law = min(behind, key=lambda law: behind[law])
                 yield axis, name, f"{axis} {law} by {behind[laws[axis]]:.0f} nats, the batch's law is {laws[axis]}"
             for unit_ in devices[name]:
                 for cause in unit_.causes(axis):
                     if not any((kind, group_of(kind, unit_), cause) in known for kind in KINDS):
-                        found.setdefault(f"cause {cause}", []).append((name, f"{axis} {cause}"))
-        for marked in found.values():
-            told = dict(marked)
-            if len(told) <= MOST_ODD * len(sound):
-                yield from ((axis, name, words) for name, words in told.items())
+                        marked.setdefault(f"cause {cause}", []).append((name, f"{axis} {cause}"))
+        for having in marked.values():
+            words_of = dict(having)
+            if len(words_of) <= MOST_ODD * len(sound):
+                yield from ((axis, name, words) for name, words in words_of.items())
 
 
 def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]) -> list[Shared]:
@@ -369,14 +376,14 @@ def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]
         for cause in named
         if group and FEWEST_OF_GROUP <= names.count(group) < len(names)
     ]
-    found = []
+    shared = []
     for kind, group, names, cause in tests:
         inside = [cause in of for of, name in zip(causes, names, strict=True) if name == group]
         outside = [cause in of for of, name in zip(causes, names, strict=True) if name != group]
         log_p = _fisher(sum(inside), len(inside), sum(outside), len(outside))
         if log_p <= math.log(FALSE_ALARM / len(tests)) and sum(inside) > 0.5 * len(inside):
-            found.append(Shared(kind, group, cause, (sum(inside), len(inside)), (sum(outside), len(outside)), log_p))
-    return sorted(found, key=lambda one: one.log_p)
+            shared.append(Shared(kind, group, cause, (sum(inside), len(inside)), (sum(outside), len(outside)), log_p))
+    return sorted(shared, key=lambda cause: cause.log_p)
 
 
 def _fisher(a: int, n: int, b: int, m: int) -> float:
@@ -388,7 +395,7 @@ def _fisher(a: int, n: int, b: int, m: int) -> float:
     total = ln_choose(n + m, a + b)
     terms = [ln_choose(n, k) + ln_choose(m, a + b - k) - total for k in range(a, min(n, a + b) + 1) if a + b - k <= m]
     high = max(terms)
-    return min(0.0, high + math.log(sum(math.exp(one - high) for one in terms)))
+    return min(0.0, high + math.log(sum(math.exp(term - high) for term in terms)))
 
 
 # ---------------------------------------------------------------------------------------------------------- in words
@@ -400,22 +407,22 @@ def document_of(batch: Batch) -> dict[str, Any]:
     units: dict[str, dict[str, Any]] = {}
     for population in batch.populations:
         measured = population.measured
-        for k, at in enumerate(measured.at.tolist()):
+        for k, device in enumerate(measured.at.tolist()):
             own = population.shrunken(k)
-            units.setdefault(names[at], {})[measured.name] = vars(plain(measured, own)) | {"unit": measured.unit}
+            units.setdefault(names[device], {})[measured.name] = vars(plain(measured, own)) | {"unit": measured.unit}
     drift: dict[str, dict[str, Any]] = {}
     drifting: dict[str, list[str]] = {}
-    for one in batch.drifts:
-        drift.setdefault(names[one.at], {})[one.quantity] = one.entry()
-        if one.significant:
-            drifting.setdefault(names[one.at], []).append(_drift_words(one))
+    for slope in batch.drifts:
+        drift.setdefault(names[slope.at], {})[slope.quantity] = slope.entry()
+        if slope.significant:
+            drifting.setdefault(names[slope.at], []).append(_drift_words(slope))
     return {
-        "population": {one.measured.name: _entry(one, names) for one in batch.populations},
+        "population": {population.measured.name: _entry(population, names) for population in batch.populations},
         "unlike": batch.unlike,
         "drifting": drifting,
         "drift": drift,
         "unidentified": {name: {"identified": n, "units": of} for name, (n, of) in batch.unidentified.items()},
-        "shared_causes": [vars(one) for one in batch.shared],
+        "shared_causes": [vars(cause) for cause in batch.shared],
         "units": units,
     }
 
@@ -442,21 +449,23 @@ def _entry(population: Population, names: Sequence[str]) -> dict[str, Any]:
         "middle": vars(plain(measured, population.fit.middle)),
         "spread": vars(population.fit.spread),
         "unlike_from": _seen_from(population),
-        "left_out": [names[at] for at in measured.at[~population.kept].tolist()],
-        "apart": [{**vars(one), "members": [names[at] for at in one.members]} for one in population.apart],
+        "left_out": [names[device] for device in measured.at[~population.kept].tolist()],
+        "apart": [
+            {**vars(group), "members": [names[device] for device in group.members]} for group in population.apart
+        ],
     }
 
 
 def lines_of(batch: Batch) -> Iterator[str]:
-    """A line for each population, each quantity without one, axis left out, group that is apart and shared cause."""
-    for one in batch.populations:
-        measured = one.measured
-        middle, spread = plain(measured, one.fit.middle), one.fit.spread
+    """A line for each population, quantity without population, axis left out, group apart, and shared cause."""
+    for population in batch.populations:
+        measured = population.measured
+        middle, spread = plain(measured, population.fit.middle), population.fit.spread
         kind = "spread of ln" if measured.logarithm else "spread"
         yield (
             f"population: {measured.name} ({measured.y.size} units): {middle.median:.4g} [{middle.q05:.4g}, "
             f"{middle.q95:.4g}] {measured.unit}, {kind} {spread.median:.2g} [{spread.q05:.2g}, {spread.q95:.2g}], "
-            f"unlike from {seen_from_words(one)}"
+            f"unlike from {seen_from_words(population)}"
         )
     yield from unidentified_lines(batch)
     for (axis, reason), names in batch.left_out.items():
@@ -467,9 +476,9 @@ def lines_of(batch: Batch) -> Iterator[str]:
 def group_lines(batch: Batch) -> Iterator[str]:
     """A line for each group that is apart, and for each cause that a group shares."""
     names = list(batch.devices)
-    for one in batch.populations:
-        for apart in one.apart:
-            yield f"{f'{apart.kind} {apart.name}'.strip()}: {apart_words(one.measured, apart, names)}"
+    for population in batch.populations:
+        for apart in population.apart:
+            yield f"{f'{apart.kind} {apart.name}'.strip()}: {apart_words(population.measured, apart, names)}"
     for shared in batch.shared:
         yield f"{shared.kind} {shared.name}: {_shared_words(shared)}"
 
@@ -496,9 +505,10 @@ def seen_from_words(population: Population) -> str:
     return f"{off:.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
 
 
-def _drift_words(one: Drift) -> str:
-    rate = f"{100.0 * math.expm1(one.per_day):+.3g} %" if one.logarithm else f"{one.per_day:+.3g} {one.unit}"
-    return f"{one.quantity} {rate} a day, {one.recordings} recordings in {one.days:.3g} days, {sd_of(one.log_p):.1f} sd"
+def _drift_words(drift: Drift) -> str:
+    rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if drift.logarithm else f"{drift.per_day:+.3g} {drift.unit}"
+    seen = f"{drift.recordings} recordings in {drift.days:.3g} days, {sd_of(drift.log_p):.1f} sd"
+    return f"{drift.quantity} {rate} a day, {seen}"
 
 
 def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:
@@ -508,7 +518,7 @@ def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> 
     if apart.against is None:
         return f"{measured.name} is {how} the other units', {sd_of(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
     if apart.kind == TWO_GROUPS:
-        of = _some([names[at] for at in apart.members])
+        of = _some([names[device] for device in apart.members])
         return f"{measured.name} of {of} is {how} the others': no column of the batch explains it"
     other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
     said = f"the two differ, {sd_of(apart.log_p):.1f} sd: which one is off, two alone do not show"

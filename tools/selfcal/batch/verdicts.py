@@ -6,17 +6,17 @@ A limits file has an entry for each quantity, `AXIS.PARAMETER` or `GROUP.PARAMET
     accel.bias: {min: -50 mg, max: 50 mg}
 
 A unit passes a maximum if the upper 95 % bound of the quantity is within it. It fails if the lower 95 % bound is
-beyond. Between the two the record cannot tell yet. A unit that could not be judged has not passed.
+beyond. Between the two the record is too short for a verdict. A unit that could not be judged has not passed.
 """
 
 from __future__ import annotations
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ParamSpec
+from typing import Any
 
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
@@ -29,11 +29,11 @@ from selfcal.model.laws import PLACES, RATIOS
 
 SCHEMA = "selfcal.limits/1"
 PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
-#: A law of less probability is no law of the axis.
+#: Least probability of a law of the axis.
 LEAST_PROBABILITY = 0.05
-#: Chance that the verdict is there after the rest that is asked for; times the record that are asked for at most.
+#: Probability of a verdict after the rest that is asked for; longest such rest, in times the record.
 CHANCE, MOST_TIMES = 0.8, 1000.0
-#: How the upper bound of a quantity that the record does not identify falls with the record's length: to this power.
+#: Power of the record's length by which the upper bound of an unidentified quantity falls.
 FALLS = {"K": 1.0, "sigma_m": 0.5, "B": 0.5}
 
 
@@ -74,8 +74,8 @@ class Verdict:
 
     def entry(self) -> dict[str, Any]:
         """As JSON has it."""
-        told = asdict(self)
-        return {**told.pop("limit"), **told}
+        entry = asdict(self)
+        return {**entry.pop("limit"), **entry}
 
     @staticmethod
     def of(entry: Mapping[str, Any]) -> Verdict:
@@ -96,17 +96,21 @@ class Limits:
 
     def of(self, axes: Collection[str]) -> list[Limit]:
         """The limits of a batch whose recordings have these axes. An axis' own limit replaces its group's."""
-        own = {(one.axis, one.parameter, one.side) for one in self.stated}
-        group = [one for one in self.of_group if one.axis in axes and (one.axis, one.parameter, one.side) not in own]
-        return sorted([*self.stated, *group], key=lambda one: (one.axis, one.parameter, one.side))
+        own = {(limit.axis, limit.parameter, limit.side) for limit in self.stated}
+        group = [
+            limit
+            for limit in self.of_group
+            if limit.axis in axes and (limit.axis, limit.parameter, limit.side) not in own
+        ]
+        return sorted([*self.stated, *group], key=lambda limit: (limit.axis, limit.parameter, limit.side))
 
     @staticmethod
     def load(path: Path | str, model: Model) -> Limits:
         """Read and check a limits file. Raises UserError naming the file and the entry."""
-        place = Path(path)
-        tree = read_yaml(place, "limits file (a YAML mapping of gx.N: {max: 0.01 deg/s/sqrt(Hz)})")
+        file = Path(path)
+        tree = read_yaml(file, "limits file (a YAML mapping of gx.N: {max: 0.01 deg/s/sqrt(Hz)})")
         if tree.pop("schema", SCHEMA) != SCHEMA:
-            raise UserError(f"{place}: schema: must be {SCHEMA}")
+            raise UserError(f"{file}: schema: must be {SCHEMA}")
         stated: list[Limit] = []
         of_group: list[Limit] = []
         groups = {group.name: group for group in model.groups}
@@ -114,28 +118,28 @@ class Limits:
             name, _, parameter = str(key).partition(".")
             if name not in groups and name not in model.axes:
                 known = ", ".join((*groups, *model.axes))
-                raise UserError(f"{place}: {shown(key)}: begins with no group or axis of the model ({known})")
+                raise UserError(f"{file}: {shown(key)}: begins with no group or axis of the model ({known})")
             group = groups[name] if name in groups else model.group_of(name)
             if parameter not in ("bias", *PLACES):
-                raise UserError(f"{place}: {shown(key)}: ends with none of bias, {', '.join(PLACES)}")
+                raise UserError(f"{file}: {shown(key)}: ends with none of bias, {', '.join(PLACES)}")
             if not isinstance(entry, dict) or not entry or not set(entry) <= {"min", "max"}:
-                raise UserError(f"{place}: {shown(key)}: takes {{max: VALUE UNIT}}, {{min: VALUE UNIT}} or both")
+                raise UserError(f"{file}: {shown(key)}: takes {{max: VALUE UNIT}}, {{min: VALUE UNIT}} or both")
             unit = units.parameter_unit(parameter, group.unit)
             for side, text in entry.items():
-                value, of = _quantity(f"{place}: {key}.{side}", text, unit)
+                value, of = _quantity(f"{file}: {key}.{side}", text, unit)
                 for axis in group.axes if name in groups else (name,):
                     (of_group if name in groups else stated).append(Limit(axis, parameter, side, value, of))
         if not stated and not of_group:
-            raise UserError(f"{place}: no limit is in it: write one as gx.N: {{max: 0.01 deg/s/sqrt(Hz)}}")
-        found = Limits(tuple(stated), tuple(of_group))
-        by_side = {(one.axis, one.parameter, one.side): one for one in found.of(model.axes)}
+            raise UserError(f"{file}: no limit is in it: write one as gx.N: {{max: 0.01 deg/s/sqrt(Hz)}}")
+        limits = Limits(tuple(stated), tuple(of_group))
+        by_side = {(limit.axis, limit.parameter, limit.side): limit for limit in limits.of(model.axes)}
         for (axis, parameter, side), low in by_side.items():
             high = by_side.get((axis, parameter, "max"))
             if side == "min" and high is not None and low.value * units.factor(low.unit, high.unit) > high.value:
                 raise UserError(
-                    f"{place}: {axis}.{parameter}: min {low.value:g} {low.unit} is above max {high.value:g} {high.unit}"
+                    f"{file}: {axis}.{parameter}: min {low.value:g} {low.unit} is above max {high.value:g} {high.unit}"
                 )
-        return found
+        return limits
 
 
 def _quantity(where: str, text: Any, like: str) -> tuple[float, str]:
@@ -171,20 +175,20 @@ def _judged(limit: Limit, axis: Mapping[str, Any] | None, duration_s: float) -> 
     known = axis if "hypotheses" in axis else axis.get("posterior")
     if known is None:
         return Verdict(limit, UNJUDGED, "there is no posterior")
-    found = _estimate(limit.parameter, known)
-    if isinstance(found, str):
-        return Verdict(limit, UNJUDGED, found)
-    factor = 1.0 if limit.parameter in RATIOS else units.factor(found["unit"], limit.unit)
-    median, q05, q95 = (found[key] * factor for key in ("median", "q05", "q95"))
-    if found["off_grid"] or not all(map(math.isfinite, (median, q05, q95))):
+    estimate = _estimate(limit.parameter, known)
+    if isinstance(estimate, str):
+        return Verdict(limit, UNJUDGED, estimate)
+    factor = 1.0 if limit.parameter in RATIOS else units.factor(estimate["unit"], limit.unit)
+    median, q05, q95 = (estimate[key] * factor for key in ("median", "q05", "q95"))
+    if estimate["off_grid"] or not all(map(math.isfinite, (median, q05, q95))):
         return Verdict(limit, UNJUDGED, "the model's grid does not support the estimate: more nodes", median, q05, q95)
     above = limit.side == "max"
     if q95 <= limit.value if above else q05 >= limit.value:
         return Verdict(limit, PASS, "", median, q05, q95)
-    if found["identified"] and (q05 > limit.value if above else q95 < limit.value):
+    if estimate["identified"] and (q05 > limit.value if above else q95 < limit.value):
         reason = f"the {'lower' if above else 'upper'} 95 % bound is {q05 if above else q95:.3g}"
         return Verdict(limit, FAIL, reason, median, q05, q95)
-    more_s = _rest_s(limit, found, (median, q05, q95), duration_s)
+    more_s = _rest_s(limit, estimate, (median, q05, q95), duration_s)
     reason = "a longer rest does not tell" if more_s is None else f"rest {duration_words(more_s)} more"
     return Verdict(limit, OPEN, reason, median, q05, q95, more_s)
 
@@ -211,7 +215,7 @@ def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
 
 
 def _rest_s(
-    limit: Limit, found: Mapping[str, Any], known: tuple[float, float, float], duration_s: float
+    limit: Limit, estimate: Mapping[str, Any], known: tuple[float, float, float], duration_s: float
 ) -> float | None:
     """Rest beyond `duration_s` after which the verdict is there with the probability CHANCE, s; None: none does that.
 
@@ -219,9 +223,9 @@ def _rest_s(
     moves by what the variance loses.
     """
     median, q05, q95 = known
-    if not found["sharpens"]:
+    if not estimate["sharpens"]:
         return None
-    if not found["identified"]:
+    if not estimate["identified"]:
         power = FALLS.get(limit.parameter)
         if power is None or limit.side == "min":
             return None
@@ -244,8 +248,8 @@ def _rest_s(
     if chance(MOST_TIMES) < CHANCE:
         return None
     for _ in range(60):
-        at = 0.5 * (low + high)
-        low, high = (low, at) if at > 0.0 and chance(math.exp(at)) >= CHANCE else (at, high)
+        half = 0.5 * (low + high)
+        low, high = (low, half) if half > 0.0 and chance(math.exp(half)) >= CHANCE else (half, high)
     return duration_s * math.expm1(high)
 
 
@@ -254,8 +258,8 @@ def _normal(x: float) -> float:
 
 
 def code_of(verdicts: Iterable[Verdict]) -> int:
-    """Exit code: 0 all pass, 1 one fails, 2 one cannot be told or judged."""
-    there = {one.verdict for one in verdicts}
+    """Exit code: 0 all pass, 1 a limit fails, 2 a limit is open or not judged."""
+    there = {verdict.verdict for verdict in verdicts}
     return 1 if FAIL in there else 2 if there & {OPEN, UNJUDGED} else 0
 
 
@@ -269,51 +273,45 @@ _COLUMNS = (
 
 def write_verdicts(path: Path | str, judged: Iterable[Judged]) -> None:
     """Write a CSV of a row for each limit of each recording."""
-    from selfcal.batch.table import write_csv
+    from selfcal.batch.unit_table import write_csv
 
-    def rows() -> Iterator[dict[str, Any]]:
-        for device, recording, verdicts in judged:
-            for one in verdicts:
-                yield {"device": device, "recording": recording, **one.entry()}
-
-    write_csv(path, _COLUMNS, rows())
+    rows = (
+        {"device": device, "recording": recording, **verdict.entry()}
+        for device, recording, verdicts in judged
+        for verdict in verdicts
+    )
+    write_csv(path, _COLUMNS, rows)
 
 
 def write_junit(path: Path | str, judged: Sequence[Judged]) -> None:
     """Write JUnit's XML: a suite for each recording, a case for each limit.
 
-    A case without a verdict is an error, not a skipped one: a line must not take it for passed.
+    A case without a verdict is an error, not skipped: a line must not take it for passed.
     """
-    whole_batch = _counts([one for _, _, verdicts in judged for one in verdicts])
+    whole_batch = _counts([verdict for _, _, verdicts in judged for verdict in verdicts])
     del whole_batch["skipped"]  # the schema has it of a suite alone
     suites = ElementTree.Element("testsuites", {"name": "selfcal limits", **whole_batch})
     for device, recording, verdicts in judged:
-        suite = ElementTree.SubElement(suites, "testsuite", {"name": _clean(device), **_counts(verdicts), "time": "0"})
+        suite = ElementTree.SubElement(
+            suites, "testsuite", {"name": printable(device), **_counts(verdicts), "time": "0"}
+        )
         properties = ElementTree.SubElement(suite, "properties")
-        ElementTree.SubElement(properties, "property", {"name": "recording", "value": _clean(recording)})
-        for one in verdicts:
-            head = {"classname": _clean(device), "name": _clean(one.limit.name), "time": "0"}
+        ElementTree.SubElement(properties, "property", {"name": "recording", "value": printable(recording)})
+        for verdict in verdicts:
+            head = {"classname": printable(device), "name": printable(verdict.limit.name), "time": "0"}
             case = ElementTree.SubElement(suite, "testcase", head)
-            if one.verdict != PASS:
-                kind = {"message": _clean(one.words), "type": one.verdict}
-                ElementTree.SubElement(case, "failure" if one.verdict == FAIL else "error", kind)
+            if verdict.verdict != PASS:
+                kind = {"message": printable(verdict.words), "type": verdict.verdict}
+                ElementTree.SubElement(case, "failure" if verdict.verdict == FAIL else "error", kind)
     ElementTree.indent(suites)
     with whole(path) as temporary:
         ElementTree.ElementTree(suites).write(temporary, encoding="utf-8", xml_declaration=True)
 
 
 def _counts(verdicts: Sequence[Verdict]) -> dict[str, str]:
-    failures = sum(one.verdict == FAIL for one in verdicts)
-    errors = sum(one.verdict in (OPEN, UNJUDGED) for one in verdicts)
+    failures = sum(verdict.verdict == FAIL for verdict in verdicts)
+    errors = sum(verdict.verdict in (OPEN, UNJUDGED) for verdict in verdicts)
     return {"tests": str(len(verdicts)), "failures": str(failures), "errors": str(errors), "skipped": "0"}
-
-
-def _clean(text: str) -> str:
-    """A text that XML can have."""
-    return printable(text)
-
-
-P = ParamSpec("P")
 
 
 def write_unjudged(given: Mapping[str, Any], reason: str) -> None:
@@ -337,7 +335,7 @@ def write(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | s
     """Write the files that are asked for. A recording without a device has its file's name."""
     from selfcal.batch.files import stem
 
-    named = [(device or stem(recording), recording, found) for device, recording, found in judged]
+    named = [(device or stem(recording), recording, of_unit) for device, recording, of_unit in judged]
     if junit is not None:
         write_junit(junit, named)
     if verdicts is not None:
@@ -349,6 +347,6 @@ def add_verdicts(
 ) -> None:
     """Judge a document of `identify` or `diagnose`: its key `limits`, and the files that are asked for."""
     axes, recording = document["axes"], document["recording"]
-    found = judge(limits.of(axes), axes, recording["duration_s"])
-    document["limits"] = [one.entry() for one in found]
-    write([(recording.get("serial", ""), recording["path"], found)], junit, verdicts)
+    judged = judge(limits.of(axes), axes, recording["duration_s"])
+    document["limits"] = [verdict.entry() for verdict in judged]
+    write([(recording.get("serial", ""), recording["path"], judged)], junit, verdicts)

@@ -1,4 +1,4 @@
-"""The picture of `identify --plot`: each axis's Allan deviation beside the model's, and where they part."""
+"""The picture of `identify --plot`: each axis's Allan deviation with the model's, and where they differ."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, printable
 from selfcal.base.output import plotter, save_picture
 
-#: The model's colour, and that of what does not fit.
+#: Colours of the model and of points outside it.
 MODEL, OUTSIDE = "tab:blue", "tab:red"
 
 
@@ -65,7 +65,7 @@ def figure_of(document: Mapping[str, Any], *, datasheet: bool = False) -> Any:
         Patch(color=MODEL, alpha=0.15, label="where the recording may lie"),
         Line2D([], [], color=OUTSIDE, marker="o", markersize=9, fillstyle="none", linestyle="", label="outside"),
     ]
-    # Four in a row are wider than the picture of one axis.
+    # Four in a row are wider than the picture of an axis.
     figure.legend(handles=handles, loc="outside lower center", ncols=4 if columns > 1 else 2, frameon=False)
     return figure
 
@@ -109,13 +109,15 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
         for check, outcome in axis["checks"].items()
         if check.startswith("allan_") and not outcome["passed"]
     }
-    at = [int(np.argmin(np.abs(np.log(tau / tau_s)))) for tau_s in failed]
+    nearest = [int(np.argmin(np.abs(np.log(tau / tau_s)))) for tau_s in failed]
     recorded = scaled(allan, "recording")
-    panel.plot(tau[at], recorded[at], color=OUTSIDE, marker="o", markersize=10, fillstyle="none", linestyle="")
+    panel.plot(
+        tau[nearest], recorded[nearest], color=OUTSIDE, marker="o", markersize=10, fillstyle="none", linestyle=""
+    )
     panel.set_title(f"{name}: {'adequate' if axis['adequate'] else 'NOT ADEQUATE'}", loc="left", fontweight="bold",
                     color="black" if axis["adequate"] else OUTSIDE)  # fmt: skip
     likely = sorted(axis["hypotheses"].items(), key=lambda entry: -entry[1])
-    lines = [(f"{law}  P {probability:.3f}", MODEL if place == 0 else "0.4") for place, (law, probability) in
+    lines = [(f"{law}  P {probability:.3f}", MODEL if rank == 0 else "0.4") for rank, (law, probability) in
              enumerate(likely[:4])]  # fmt: skip
     if failed:
         lines.append(("model over recording:", OUTSIDE))
@@ -123,9 +125,9 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
         lines += [(",  ".join(named[k : k + 3]), OUTSIDE) for k in range(0, len(named), 3)]
     others = [check for check, outcome in axis["checks"].items() if not outcome["passed"] and "allan" not in check]
     lines += [(check, OUTSIDE) for check in others]
-    for place, (text, color) in enumerate(lines):
-        panel.text(0.97, 0.97 - 0.055 * place, text, color=color, ha="right", va="top", fontsize="x-small",
-                   fontweight="bold" if place == 0 else "normal", transform=panel.transAxes)  # fmt: skip
+    for row, (text, color) in enumerate(lines):
+        panel.text(0.97, 0.97 - 0.055 * row, text, color=color, ha="right", va="top", fontsize="x-small",
+                   fontweight="bold" if row == 0 else "normal", transform=panel.transAxes)  # fmt: skip
     panel.set_xlabel("averaging time τ, s")
     panel.set_ylabel(f"Allan deviation, {units.typeset(unit)}")
     panel.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))

@@ -1,28 +1,31 @@
-"""Line charts as inline SVG, and the table behind each. Colours and fonts are the page's style sheet's."""
+"""Line charts as inline SVG, and the table behind each. Colours and fonts are the page's style sheet's.
+
+Templates lay the figures out; here are their numbers: scales, ticks, paths and rows."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from html import escape
 from typing import Literal
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
 from selfcal.likelihood.statemodel import Array
+from selfcal.show.template import number, render
 
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
 WIDTH, HEIGHT = 340, 220
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Size of a picture of strips, room for their names, and the height of each.
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
-#: Share of the points of a strip that may lie beyond its lower edge, and beyond its upper one.
+#: Share of a strip's points that may lie beyond each of its edges.
 USUAL = 0.02
 #: Rows of a table behind a picture at most.
 ROWS = 25
-#: Ticks on an axis, about.
+#: Approximate number of ticks of an axis.
 TICKS = 5
 
 Kind = Literal["measured", "fitted", "dots"]
@@ -67,7 +70,49 @@ class Panel:
 
     @property
     def drawn(self) -> list[Curve | Band]:
+        """What the key and the tables name."""
         return [*self.curves, *self.bands]
+
+    @property
+    def alternative(self) -> str:
+        """The picture in a sentence: what, over what, and how much of the measured curve the simulated band holds."""
+        text = f"{self.title}: {self.y_label} over {self.x_label}."
+        for curve in self.curves:
+            good = curve.y[np.isfinite(curve.y)]
+            if good.size:
+                text += f" {curve.label} from {number(float(good.min()), 3)} to {number(float(good.max()), 3)}."
+        for band in self.bands:
+            same = next(
+                (curve for curve in self.curves if curve.kind != "fitted" and curve.x.size == band.x.size), None
+            )
+            if same is not None and band.kind == "simulated":
+                outside, total = outside_of(same, band)
+                text += f" {outside} of {total} points lie outside the simulated band."
+        return text
+
+    @property
+    def tables(self) -> Iterator[tuple[str, list[str], Iterator[list[str]]]]:
+        """Caption, headings and rows of a table for all curves and bands on the same x, thinned evenly."""
+        groups: list[tuple[Array, list[tuple[str, Array]]]] = []
+        for item in self.drawn:
+            if isinstance(item, Curve):
+                columns = [(item.label, item.y)]
+            else:
+                columns = [(f"{item.label}, lowest", item.low), (f"{item.label}, highest", item.high)]
+            same = next((group for group in groups if np.array_equal(group[0], item.x)), None)
+            if same is None:
+                groups.append((item.x, columns))
+            else:
+                same[1].extend(columns)
+        for x, columns in groups:
+            every = max(1, math.ceil(x.size / ROWS))
+            thinned = "" if every == 1 else f" One point in {every} of {x.size}."
+            heads = [self.x_label, *(label for label, _ in columns)]
+            rows = (
+                [number(float(abscissa), 5), *(number(float(y)) for y in row)]
+                for abscissa, *row in zip(x[::every], *(y[::every] for _, y in columns), strict=True)
+            )
+            yield f"{self.title}: {self.y_label} over {self.x_label}.{thinned}", heads, rows
 
 
 @dataclass(frozen=True)
@@ -78,16 +123,16 @@ class Figure:
     caption: str
     panels: Sequence[Panel]
 
-
-def number(value: float, digits: int = 4) -> str:
-    """Short and without a needless zero."""
-    if not math.isfinite(value):
-        return "–" if math.isnan(value) else ("∞" if value > 0 else "−∞")
-    text = f"{value:.{digits}g}"
-    if "e" in text:
-        mantissa, exponent = text.split("e")
-        text = f"{mantissa}e{int(exponent)}"
-    return text.replace("-", "−")
+    @property
+    def key(self) -> dict[str, str]:
+        """The look of each label."""
+        looks: dict[str, str] = {}
+        for panel in self.panels:
+            for item in panel.drawn:
+                looks.setdefault(item.label, item.kind)
+            if panel.marks:
+                looks.setdefault(panel.marked, "mark")
+        return looks
 
 
 def envelope(x: Array, y: Array, points: int) -> tuple[Array, Array, Array, Array]:
@@ -120,6 +165,9 @@ class _Scale:
         part = np.clip((v - a) / (b - a), 0.0, 1.0)
         return self.start + part * self.length
 
+    def place(self, value: float) -> float:
+        return float(self.at(np.array([value]))[0])
+
     def ticks(self) -> list[float]:
         if self.log:
             return _log_ticks(self.low, self.high)
@@ -135,14 +183,14 @@ def _log_ticks(low: float, high: float) -> list[float]:
     a, b = math.log10(low), math.log10(high)
     factors = (1.0,) if b - a > 2.0 else (1.0, 2.0, 5.0)
     every = max(1, math.ceil((b - a) / (TICKS + 1)))
-    found = [
+    ticks = [
         factor * 10.0**k
         for k in range(math.floor(a), math.ceil(b) + 1)
         if k % every == 0
         for factor in factors
         if low * 0.999 <= factor * 10.0**k <= high * 1.001
     ]
-    return found if len(found) > 1 else [low, high]
+    return ticks if len(ticks) > 1 else [low, high]
 
 
 def _limits(values: Sequence[Array], log: bool, pad: float) -> tuple[float, float]:
@@ -160,7 +208,7 @@ def _limits(values: Sequence[Array], log: bool, pad: float) -> tuple[float, floa
 
 def _x_limits(figure: Figure) -> tuple[float, float]:
     first = figure.panels[0]
-    xs = [one.x for panel in figure.panels for one in panel.drawn]
+    xs = [item.x for panel in figure.panels for item in panel.drawn]
     if first.stairs:  # to the outer edges of the bins, and to the marks beyond them
         low, high = _limits(xs, first.log_x, 0.5 / max(1, xs[0].size - 1))
         marks = [mark for panel in figure.panels for mark in panel.marks]
@@ -171,113 +219,60 @@ def _x_limits(figure: Figure) -> tuple[float, float]:
 
 
 def _y_limits(figure: Figure) -> tuple[float, float]:
-    values = [one.y for panel in figure.panels for one in panel.curves]
-    values += [edge for panel in figure.panels for one in panel.bands for edge in (one.low, one.high)]
+    values = [curve.y for panel in figure.panels for curve in panel.curves]
+    values += [edge for panel in figure.panels for band in panel.bands for edge in (band.low, band.high)]
     return _limits(values, figure.panels[0].log_y, 0.06)
 
 
-def draw(figure: Figure) -> str:
+def draw(figure: Figure) -> Markup:
     """The figure in HTML: its panels on one scale, caption, key, and a table behind them."""
     first = figure.panels[0]
-    x = _Scale(*_x_limits(figure), first.log_x, LEFT, WIDTH - LEFT - RIGHT)
-    y = _Scale(*_y_limits(figure), first.log_y, HEIGHT - BOTTOM, -(HEIGHT - TOP - BOTTOM))
-    pictures = "".join(_panel(panel, x, y) for panel in figure.panels)
-    return (
-        f"<figure><div class=panels>{pictures}</div>"
-        f"<figcaption>{escape(figure.caption)} {_key(figure)}</figcaption>{_tables(figure)}</figure>"
+    right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
+    return render(
+        "panels.html",
+        figure=figure,
+        x=_Scale(*_x_limits(figure), first.log_x, LEFT, right - LEFT),
+        y=_Scale(*_y_limits(figure), first.log_y, bottom, TOP - bottom),
+        paths=_paths,
+        **{"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": right, "top": TOP, "bottom": bottom},
     )
 
 
-def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> str:
+def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
     """The figure in HTML with its panels one below the other over one x, each on its own scale; `marks`: places with
     the text that stands above them."""
-    x = _Scale(*_x_limits(figure), False, STRIP_LEFT, STRIP_WIDTH - STRIP_LEFT - RIGHT)
     right, bottom = STRIP_WIDTH - RIGHT, TOP + STRIP * len(figure.panels)
-    told = f"{figure.name}: {', '.join(panel.title for panel in figure.panels)}; marks at " + (
-        ", ".join(f"{number(at)} s ({text})" for at, text in marks) or "no time"
-    )
-    out = [f'<svg viewBox="0 0 {STRIP_WIDTH} {bottom + 34}" role=img aria-label="{escape(told)}">']
-    for row, given in enumerate(figure.panels):
-        top = TOP + STRIP * row
-        y = _Scale(*_usual(given), False, top + STRIP - 4, -(STRIP - 8))
-        panel = replace(
-            given,
-            curves=[replace(one, y=np.clip(one.y, y.low, y.high)) for one in given.curves],
-            bands=[
-                replace(one, low=np.clip(one.low, y.low, y.high), high=np.clip(one.high, y.low, y.high))
-                for one in given.bands
-            ],
-        )
-        out.append(f"<path class=grid d='M{STRIP_LEFT} {top + STRIP}H{right}'/>")
-        out.append(f"<text class=name x=4 y={top + STRIP // 2}>{escape(panel.title)}</text>")
-        span = number(y.high - y.low, 2)
-        out.append(f"<text class=tick x=4 y={top + STRIP // 2 + 15}>{span} {escape(panel.y_label)}</text>")
-        out += [_band(band, x, y, False) for band in panel.bands]
-        out += [_curve(curve, x, y, False) for curve in panel.curves]
-    above: dict[float, list[str]] = {}
-    for at, text in sorted(marks):
-        place = float(x.at(np.array([at]))[0])
-        out.append(f"<path class=mark d='M{place:.1f} {TOP}V{bottom}'/>")
-        near = next((one for one in above if place - one < 14.0), place)
-        above.setdefault(near, []).append(text)
-    for place, texts in above.items():
-        text = escape(" ".join(dict.fromkeys(texts)))
-        out.append(f"<text class=name x={place:.1f} y={TOP - 6} text-anchor=middle>{text}</text>")
-    for value in x.ticks():
-        at = float(x.at(np.array([value]))[0])
-        out.append(f"<text class=tick x={at:.1f} y={bottom + 15} text-anchor=middle>{number(value)}</text>")
-    out.append(f"<text class=tick x={right} y={bottom + 30} text-anchor=end>{escape(figure.panels[0].x_label)}</text>")
-    return (
-        f"<figure><div class='scroll strips' tabindex=0 role=group aria-label='{escape(figure.name)}'>{''.join(out)}"
-        f"</svg></div><figcaption>{escape(figure.caption)} {_key(figure)}</figcaption>{_tables(figure)}</figure>"
+    x = _Scale(*_x_limits(figure), False, STRIP_LEFT, right - STRIP_LEFT)
+    rows = []
+    for row, panel in enumerate(figure.panels):
+        y = _Scale(*_usual(panel), False, TOP + STRIP * (row + 1) - 4, 8 - STRIP)
+        curves = [replace(curve, y=np.clip(curve.y, y.low, y.high)) for curve in panel.curves]
+        bands = [
+            replace(band, low=np.clip(band.low, y.low, y.high), high=np.clip(band.high, y.low, y.high))
+            for band in panel.bands
+        ]
+        rows.append((replace(panel, curves=curves, bands=bands), y))
+    above: dict[float, list[str]] = {}  # a text that has no room of its own goes to its left neighbour
+    for value, text in sorted(marks):
+        place = x.place(value)
+        above.setdefault(next((other for other in above if place - other < 14.0), place), []).append(text)
+    return render(
+        "strips.html",
+        figure=figure,
+        marks=marks,
+        rows=rows,
+        above=above,
+        x=x,
+        paths=_paths,
+        **{"width": STRIP_WIDTH, "strip": STRIP, "left": STRIP_LEFT, "right": right, "top": TOP, "bottom": bottom},
     )
 
 
 def _usual(panel: Panel) -> tuple[float, float]:
     """Limits that all but a few points of a panel keep: a shock must not hide a step."""
-    values = [one.y for one in panel.curves] + [edge for one in panel.bands for edge in (one.low, one.high)]
-    usual = [np.nanquantile(one, (USUAL, 1.0 - USUAL)) for one in values if np.isfinite(one).any()]
+    values = [curve.y for curve in panel.curves] + [edge for band in panel.bands for edge in (band.low, band.high)]
+    usual = [np.nanquantile(ys, (USUAL, 1.0 - USUAL)) for ys in values if np.isfinite(ys).any()]
     return _limits(usual, False, 0.06)
-
-
-def _panel(panel: Panel, x: _Scale, y: _Scale) -> str:
-    right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
-    out = [
-        f'<svg viewBox="0 0 {WIDTH} {HEIGHT}" role=img aria-label="{escape(_alternative(panel))}">',
-        f"<text class=name x={LEFT} y=14>{escape(panel.title)}</text>",
-    ]
-    for value in y.ticks():
-        at = float(y.at(np.array([value]))[0])
-        out.append(f"<path class=grid d='M{LEFT} {at:.1f}H{right}'/>")
-        out.append(f"<text class=tick x={LEFT - 5} y={at + 4:.1f} text-anchor=end>{number(value)}</text>")
-    for value in x.ticks():
-        at = float(x.at(np.array([value]))[0])
-        anchor = "end" if at > right - 12 else "middle"
-        out.append(f"<path class=grid d='M{at:.1f} {TOP}V{bottom}'/>")
-        out.append(f"<text class=tick x={at:.1f} y={bottom + 15} text-anchor={anchor}>{number(value)}</text>")
-    out += [_band(band, x, y, panel.stairs) for band in panel.bands]
-    for mark in panel.marks:
-        at = float(x.at(np.array([mark]))[0])
-        out.append(f"<path class=mark d='M{at:.1f} {TOP}V{bottom}'/>")
-    out += [_curve(curve, x, y, panel.stairs) for curve in panel.curves]
-    out.append(f"<text class=tick x={right} y={HEIGHT - 8} text-anchor=end>{escape(panel.x_label)}</text>")
-    out.append(f"<text class=tick x={right} y=14 text-anchor=end>{escape(panel.y_label)}</text></svg>")
-    return "".join(out)
-
-
-def _alternative(panel: Panel) -> str:
-    """The picture in a sentence: what, over what, and how much of the measured curve the simulated band holds."""
-    text = f"{panel.title}: {panel.y_label} over {panel.x_label}."
-    for curve in panel.curves:
-        good = curve.y[np.isfinite(curve.y)]
-        if good.size:
-            text += f" {curve.label} from {number(float(good.min()), 3)} to {number(float(good.max()), 3)}."
-    for band in panel.bands:
-        same = next((one for one in panel.curves if one.kind != "fitted" and one.x.size == band.x.size), None)
-        if same is not None and band.kind == "simulated":
-            outside, total = outside_of(same, band)
-            text += f" {outside} of {total} points lie outside the simulated band."
-    return text
 
 
 def outside_of(curve: Curve, band: Band) -> tuple[int, int]:
@@ -287,24 +282,31 @@ def outside_of(curve: Curve, band: Band) -> tuple[int, int]:
     return int((out & good).sum()), int(good.sum())
 
 
-def _band(band: Band, x: _Scale, y: _Scale, stairs: bool) -> str:
+def _paths(drawn: Sequence[Curve | Band], x: _Scale, y: _Scale, stairs: bool) -> Markup:
+    """An SVG path for each curve or band that has a finite point."""
+    shapes = [
+        (item.kind, _line(item, x, y, stairs) if isinstance(item, Curve) else _area(item, x, y, stairs))
+        for item in drawn
+    ]
+    return Markup("\n").join(Markup("<path class={} d='{}'/>").format(kind, d) for kind, d in shapes if d)
+
+
+def _area(band: Band, x: _Scale, y: _Scale, stairs: bool) -> str:
     low, high = y.at(band.low), y.at(band.high)
     px = x.at(band.x)
     out = ""
     for piece in _pieces(np.isfinite(band.low) & np.isfinite(band.high)):
         upper, lower = (_stairs(px[piece], edge[piece], stairs) for edge in (high, low))
         out += _path(np.concatenate([upper[0], lower[0][::-1]]), np.concatenate([upper[1], lower[1][::-1]])) + "z"
-    return f"<path class={band.kind} d='{out}'/>" if out else ""
+    return out
 
 
-def _curve(curve: Curve, x: _Scale, y: _Scale, stairs: bool) -> str:
+def _line(curve: Curve, x: _Scale, y: _Scale, stairs: bool) -> str:
     px, py = x.at(curve.x), y.at(curve.y)
     good = np.isfinite(py) & np.isfinite(px)
     if curve.kind == "dots":
-        dots = "".join(f"M{px[k] - 3:.1f} {py[k]:.1f}l3-3 3 3-3 3z" for k in np.flatnonzero(good))
-        return f"<path class=dots d='{dots}'/>" if dots else ""
-    lines = "".join(_path(*_stairs(px[piece], py[piece], stairs)) for piece in _pieces(good))
-    return f"<path class={curve.kind} d='{lines}'/>" if lines else ""
+        return "".join(f"M{px[k] - 3:.1f} {py[k]:.1f}l3-3 3 3-3 3z" for k in np.flatnonzero(good))
+    return "".join(_path(*_stairs(px[piece], py[piece], stairs)) for piece in _pieces(good))
 
 
 def _stairs(px: Array, py: Array, stairs: bool) -> tuple[Array, Array]:
@@ -317,10 +319,12 @@ def _stairs(px: Array, py: Array, stairs: bool) -> tuple[Array, Array]:
 
 def _path(px: Array, py: Array) -> str:
     """Path data in steps of a tenth, relative: a third shorter than absolute ones."""
-    at = np.rint(10.0 * np.column_stack([px, py])).astype(int)
-    steps = np.diff(at, axis=0)
+    corners = np.rint(10.0 * np.column_stack([px, py])).astype(int)
+    steps = np.diff(corners, axis=0)
     text = "".join(_tenth(int(dx), "") + _tenth(int(dy), " ") + " " for dx, dy in steps if dx or dy)
-    return f"M{_tenth(int(at[0, 0]), '')}{_tenth(int(at[0, 1]), ' ')}" + (f"l{text.rstrip()}" if text else "h0")
+    return f"M{_tenth(int(corners[0, 0]), '')}{_tenth(int(corners[0, 1]), ' ')}" + (
+        f"l{text.rstrip()}" if text else "h0"
+    )
 
 
 def _tenth(value: int, before: str) -> str:
@@ -333,72 +337,3 @@ def _pieces(good: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
     """Runs of indices that are good."""
     where = np.flatnonzero(good)
     return [run for run in np.split(where, np.flatnonzero(np.diff(where) > 1) + 1) if run.size]
-
-
-_SWATCH = {
-    "measured": "<path class=measured d='M1 8H27'/>",
-    "fitted": "<path class=fitted d='M1 8H27'/>",
-    "dots": "<path class=dots d='M10 8l4 -4 4 4 -4 4z'/>",
-    "simulated": "<path class=simulated d='M1 2H27V14H1Z'/>",
-    "spread": "<path class=spread d='M1 2H27V14H1Z'/>",
-    "mark": "<path class=mark d='M14 1V15'/>",
-}
-
-
-def _key(figure: Figure) -> str:
-    entries: dict[str, str] = {}
-    for panel in figure.panels:
-        for one in panel.drawn:
-            entries.setdefault(one.label, one.kind)
-        if panel.marks:
-            entries.setdefault(panel.marked, "mark")
-    return "".join(
-        f"<span class=key><svg viewBox='0 0 28 16' aria-hidden=true>{_SWATCH[kind]}</svg>{escape(label)}</span> "
-        for label, kind in entries.items()
-    )
-
-
-def _tables(figure: Figure) -> str:
-    tables = "".join(_table(panel, figure.name) for panel in figure.panels)
-    return f"<details><summary>Table: {escape(figure.name)}</summary>{tables}</details>"
-
-
-def _table(panel: Panel, name: str) -> str:
-    """One table for all curves and bands on the same x, thinned evenly."""
-    groups: list[tuple[Array, list[tuple[str, Array]]]] = []
-    for one in panel.drawn:
-        columns = (
-            [(one.label, one.y)]
-            if isinstance(one, Curve)
-            else [(f"{one.label}, lowest", one.low), (f"{one.label}, highest", one.high)]
-        )
-        same = next((group for group in groups if np.array_equal(group[0], one.x)), None)
-        if same is None:
-            groups.append((one.x, columns))
-        else:
-            same[1].extend(columns)
-    return "".join(_rows(panel, name, x, columns) for x, columns in groups)
-
-
-def _rows(panel: Panel, name: str, x: Array, columns: list[tuple[str, Array]]) -> str:
-    every = max(1, math.ceil(x.size / ROWS))
-    thinned = "" if every == 1 else f" One point in {every} of {x.size}."
-    head = "".join(f"<th scope=col>{escape(label)}</th>" for label, _ in columns)
-    body = "".join(
-        f"<tr><th scope=row>{number(float(x[k]), 5)}</th>"
-        + "".join(f"<td>{number(float(values[k]))}</td>" for _, values in columns)
-        + "</tr>"
-        for k in range(0, x.size, every)
-    )
-    caption = f"{panel.title}: {panel.y_label} over {panel.x_label}.{thinned}"
-    table = f"<thead><tr><th scope=col>{escape(panel.x_label)}</th>{head}</tr></thead><tbody>{body}</tbody>"
-    return scrolled(f"{name}, {panel.title}", caption, table)
-
-
-def scrolled(name: str, caption: str, rows: str, look: str = "") -> str:
-    """A table that scrolls by itself on a narrow screen, with the keyboard too. `rows`: its head and body, HTML;
-    `look`: more classes of its style."""
-    return (
-        f'<div class="{f"scroll {look}".strip()}" tabindex=0 role=group aria-label="{escape(name)}">'
-        f"<table><caption><span>{escape(caption)}</span></caption>{rows}</table></div>"
-    )

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -15,11 +14,11 @@ from selfcal.adequacy.document import since
 from selfcal.adequacy.summary import noisier
 from selfcal.base import units
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
 
-#: Characters of a line where no terminal shows it.
+#: Characters of a line without a terminal.
 WIDTH = 114
 
 
@@ -67,8 +66,8 @@ def show(
 
 def verdict(axis: Mapping[str, Any]) -> str:
     """The verdict on an axis, why it is not finished, and what the model file states already."""
-    told = words.verdict(axis) + (f": {axis['unfinished']}" if axis.get("unfinished") else "")
-    return told + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
+    text = words.verdict(axis) + (f": {axis['unfinished']}" if axis.get("unfinished") else "")
+    return text + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
 
 
 def noisier_of(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -79,9 +78,7 @@ def noisier_of(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _events(findings: Sequence[Mapping[str, Any]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("", "from", "what", "changes", "do"):
-        table.add_column(heading, overflow="fold")
+    table = table_of(("", "from", "what", "changes", "do"), wraps=True, pad_edge=False)
     for number, finding in enumerate(findings, 1):
         what = "; ".join(filter(None, (words.what(finding), words.how_much(finding))))
         row = (what, words.effects(finding), words.action(finding))
@@ -92,9 +89,8 @@ def _events(findings: Sequence[Mapping[str, Any]]) -> Table:
 
 def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> Table:
     """N, K and B of each axis without its findings and with them."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False)
-    for heading in ("axis", "verdict", "N, per √Hz", "K, per s and √Hz", "B"):
-        table.add_column(heading, overflow="fold")
+    headings = ("axis", "verdict", "N, per √Hz", "K, per s and √Hz", "B")
+    table = table_of(headings, wraps=True, pad_edge=False)
     for name, axis in axes.items():
         cells = [escape(before_after(axis["numbers"][key])) for key in ("N", "K", "B")]
         table.add_row(f"{name}, {units.typeset(axis['unit'])}", escape(verdict(axis)), *cells)
@@ -104,13 +100,13 @@ def _numbers(axes: Mapping[str, Mapping[str, Any]]) -> Table:
 def before_after(number: Mapping[str, Any]) -> str:
     """One number of an axis."""
     after = number["after"]
-    told = "–" if not after["identified"] else f"{after['median']:.3g}"
+    text = "–" if not after["identified"] else f"{after['median']:.3g}"
     if "q05" in after:
         half = 0.5 * (after["q95"] - after["q05"])
         known = f"{words.rounded(after['median'], 10.0 * half)} ± {half:.1g}"
-        told = known if after["identified"] else f"< {after['q95']:.2g}"
+        text = known if after["identified"] else f"< {after['q95']:.2g}"
     before = f"{number['before']:.3g}" if number["before"] > 0.0 and math.isfinite(number["before"]) else "–"
-    return f"{before} -> {told}"
+    return f"{before} -> {text}"
 
 
 def _lines(finding: Mapping[str, Any]) -> list[str]:

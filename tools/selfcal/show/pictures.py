@@ -21,7 +21,7 @@ from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.show.chart import Band, Curve, Figure, Panel, envelope
 
-#: Simulated records a band is the range of.
+#: Simulated records of a band.
 RECORDS = 20
 #: Points of a curve at most.
 POINTS = 400
@@ -59,38 +59,41 @@ class Compared:
 
 @dataclass
 class _Pair:
-    """Curve and band of one state."""
+    """Curve and band of a state."""
 
     measured: Array
     low: Array
     high: Array
 
 
-def figures(one: Diagnosed, record: Record, factor: float, unit: str) -> tuple[list[Figure], list[list[Figure]]]:
-    """Overview figures of an axis, and those of each of its findings in the order of `one.findings`.
+def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> tuple[list[Figure], list[list[Figure]]]:
+    """Overview figures of an axis, and those of each of its findings in the order of its findings.
 
     `factor` turns the axis' inner unit into `unit`."""
-    overview = [_allan(one.first, one.state, factor, unit), _spectrum(one.first, one.state, factor, unit)]
-    plans = [_plan(finding, finding.record or record, factor, unit) for finding in one.findings]
+    overview = [
+        _allan(diagnosed.first, diagnosed.state, factor, unit),
+        _spectrum(diagnosed.first, diagnosed.state, factor, unit),
+    ]
+    plans = [_plan(finding, finding.record or record, factor, unit) for finding in diagnosed.findings]
     compared = [*overview, *(item for plan in plans for item in plan if isinstance(item, Compared))]
     pairs = _ensembles(compared)
 
     def figure(item: Compared | Figure) -> Figure:
         return item if isinstance(item, Figure) else _figure(item, pairs)
 
-    sides = _sides(one, record, factor, unit)
+    sides = _sides(diagnosed, record, factor, unit)
     return [sides, *(figure(item) for item in overview)], [[figure(item) for item in plan] for plan in plans]
 
 
 def _ensembles(items: Sequence[Compared]) -> dict[tuple[int, int], _Pair]:
-    """Every band. Each state is simulated once for all the pictures that need it: one record in memory at a time."""
+    """Every band. Each state is simulated once for all the pictures that need it: with a record in memory at a time."""
     jobs: dict[int, list[tuple[int, int, Compared]]] = {}
     states: dict[int, State] = {}
     for number, item in enumerate(items):
         for side, state in enumerate(item.states):
             jobs.setdefault(id(state), []).append((number, side, item))
             states[id(state)] = state
-    found: dict[tuple[int, int], _Pair] = {}
+    pairs: dict[tuple[int, int], _Pair] = {}
     for key, wanted in jobs.items():
         state = states[key]
         random = np.random.default_rng(20)
@@ -104,8 +107,8 @@ def _ensembles(items: Sequence[Compared]) -> dict[tuple[int, int], _Pair]:
         for number, side, item in wanted:
             sample = np.array(drawn[number, side])
             measured = item.summaries[side](state.y, state.whitened)
-            found[id(item), side] = _Pair(measured, sample.min(axis=0), sample.max(axis=0))
-    return found
+            pairs[id(item), side] = _Pair(measured, sample.min(axis=0), sample.max(axis=0))
+    return pairs
 
 
 def _figure(item: Compared, pairs: Mapping[tuple[int, int], _Pair]) -> Figure:
@@ -218,8 +221,8 @@ def _line(finding: Finding, factor: float, unit: str) -> Compared:
     state = finding.before
     f = float(finding.look.estimate["frequency_hz"]["median"])
     frequency = rfftfreq(state.y.size, state.dt)
-    at = int(np.argmin(np.abs(frequency - f)))
-    low, high = max(1, at - BESIDE), min(frequency.size, at + BESIDE + 1)
+    nearest = int(np.argmin(np.abs(frequency - f)))
+    low, high = max(1, nearest - BESIDE), min(frequency.size, nearest + BESIDE + 1)
 
     def removed(state: State) -> Summary:
         effect = _effect(finding) if state is finding.after else np.zeros(state.y.size)
@@ -301,8 +304,8 @@ def _largest(finding: Finding, record: Record) -> Compared:
     edges, middle = _pieces(record, POINTS // 2)
 
     def summary(y: Array, w: Array) -> Array:
-        found = np.maximum.reduceat(np.where(np.isfinite(w), np.abs(w), -1.0), edges[:-1])
-        return np.asarray(np.where(found < 0.0, np.nan, found))
+        largest = np.maximum.reduceat(np.where(np.isfinite(w), np.abs(w), -1.0), edges[:-1])
+        return np.asarray(np.where(largest < 0.0, np.nan, largest))
 
     return Compared(
         "Largest residual innovations",
@@ -397,13 +400,13 @@ def _histogram_of_readings(
 
 def _together(finding: Finding) -> Iterator[Figure]:
     """How the noise of two axes goes together, by frequency."""
-    one, two = finding.before, finding.partner
+    state, two = finding.before, finding.partner
     if two is None:
         return
-    hz, r, sd = shared.by_frequency(shared.pair_of(one.whitened, two.whitened, one.dt))
+    hz, r, sd = shared.by_frequency(shared.pair_of(state.whitened, two.whitened, state.dt))
     yield Figure(
         "Correlation of two axes",
-        f"Correlation in phase of the residual innovations of {one.axis} and {two.axis}, by third of an octave.",
+        f"Correlation in phase of the residual innovations of {state.axis} and {two.axis}, by third of an octave.",
         [
             Panel(
                 "Measured",
@@ -435,7 +438,7 @@ def _missing(finding: Finding, record: Record) -> Figure:
 
 def _effect(finding: Finding) -> Array:
     """What the finding's columns add to a reading [n], in the inner unit."""
-    known = {one.name for one in finding.before.regressors}
+    known = {column.name for column in finding.before.regressors}
     effect = np.zeros(finding.after.y.size)
     for k, column in enumerate(finding.after.regressors):
         if column.name not in known:
@@ -443,11 +446,11 @@ def _effect(finding: Finding) -> Array:
     return effect
 
 
-def _sides(one: Diagnosed, record: Record, factor: float, unit: str) -> Figure:
-    """The record beside one simulated record of the final model."""
-    y = simulated(one.state, np.random.default_rng(20))
+def _sides(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> Figure:
+    """The record and a simulated record of the final model."""
+    y = simulated(diagnosed.state, np.random.default_rng(20))
     panels = []
-    for title, values in (("Measured", one.first.y), ("Simulated", y)):
+    for title, values in (("Measured", diagnosed.first.y), ("Simulated", y)):
         x, mean, low, high = envelope(record.time_s, values, POINTS)
         panels.append(
             Panel(
@@ -459,7 +462,9 @@ def _sides(one: Diagnosed, record: Record, factor: float, unit: str) -> Figure:
             )
         )
     return Figure(
-        "Readings", f"{_about(one.first, factor, unit)} Simulated: one record of the model with all findings.", panels
+        "Readings",
+        f"{_about(diagnosed.first, factor, unit)} Simulated: one record of the model with all findings.",
+        panels,
     )
 
 

@@ -16,13 +16,13 @@ from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import AxisReport, axis_unit
 
-#: Of the hypotheses, in the model's order.
+#: Colours of the hypotheses, in the model's order.
 COLORS = ("tab:green", "tab:blue", "tab:red", "tab:purple", "tab:orange", "tab:olive", "tab:brown", "tab:cyan")
-#: A law whose last probability is below this is drawn faint, and its values are not written.
+#: Least probability of a law that is drawn in full, with its values.
 FAINT = 0.01
-#: A true value beyond this is none: an integer may have any number of digits.
+#: Largest true value that is drawn: an integer may have any number of digits.
 LARGEST = 1e30
-#: Share of the reports, from the first on, whose intervals do not count for the scales: they are the prior's.
+#: Share of first reports that set no scale: their intervals are the prior's.
 SETTLING = 0.2
 
 
@@ -38,7 +38,7 @@ def plot_run(
     """Save the picture of complete reports by axis; the suffix of `path` chooses the format. `names`: of hypotheses and
     parameters; each parameter has a panel.
 
-    Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales that axes of one unit share; alpha
+    Lines are posterior medians, bands the 5 to 95 % intervals, on logarithmic scales, alike for axes of a unit; alpha
     as 1/alpha in s. Above each panel stands the last report's verdict, or the median and interval of its likeliest law.
     `units` of the axes' readings; default: telemetry's. `sent_in`: what the reports of axes of other names are in.
     `truth`, of a simulated recording: per axis its `hypothesis` and parameters, drawn dashed. Raises UserError if it
@@ -69,7 +69,7 @@ def plot_run(
         reports = history[axis]
         time = np.array([report.time_s for report in reports])
         late = int(SETTLING * len(time))
-        told = (truth or {}).get(axis)
+        axis_truth = (truth or {}).get(axis)
         newest = reports[-1].values
         last = {k: newest[f"h{k}_probability"] for k in range(count) if f"h{k}_probability" in newest}
         shown = {k: 1.0 if probability >= FAINT else 0.2 for k, probability in last.items()}
@@ -77,7 +77,7 @@ def plot_run(
             row[0].plot(time, _values(reports, f"h{k}_probability"), color=COLORS[k], alpha=shown[k])
         row[0].set_ylim(-0.03, 1.03)
         row[0].set_ylabel(axis, rotation=0, fontweight="bold", labelpad=15)
-        _write(row[0], *_verdict(last, told, hypotheses))
+        _write(row[0], *_verdict(last, axis_truth, hypotheses))
         for panel, (parameter, candidates) in zip(row[1:], panels.items(), strict=True):
             scale = factor(own[axis], unit[axis]) if _scales(parameter) else 1.0
             spans[axis, parameter] = []
@@ -96,7 +96,7 @@ def plot_run(
                         _write(panel, f"{middle[-1]:.3g} [{low[-1]:.3g}, {high[-1]:.3g}]", COLORS[k])
                 elif len(candidates) == 1:  # nothing else in this panel
                     spans[axis, parameter] += middle[late:].tolist()
-            value = _true(told, parameter, unit[axis])
+            value = _true(axis_truth, parameter, unit[axis])
             if value is not None:
                 spans[axis, parameter].append(value)
                 panel.axhline(value, color="black", linestyle="--", linewidth=1.0)
@@ -139,28 +139,28 @@ def _values(reports: Sequence[AxisReport], signal: str) -> NDArray[np.float64]:
     return np.array([report.value(signal) for report in reports])
 
 
-def _verdict(last: Mapping[int, float], told: Any, hypotheses: Sequence[str]) -> tuple[str, str]:
-    """The most probable hypothesis with its probability and the true one, if there is one; and its colour."""
+def _verdict(last: Mapping[int, float], truth: Any, hypotheses: Sequence[str]) -> tuple[str, str]:
+    """The most probable hypothesis with its probability, the true one if known; and its colour."""
     finite = {k: probability for k, probability in last.items() if math.isfinite(probability)}
     if not finite:
         return "outside the priors", "black"
     best = max(finite, key=lambda k: finite[k])
     said = f"{hypotheses[best].replace('_', ' ')} {finite[best]:.3f}"
-    if isinstance(told, Mapping) and told.get("hypothesis") in tuple(hypotheses):
-        said += f" (truth: {told['hypothesis'].replace('_', ' ')})"
+    if isinstance(truth, Mapping) and truth.get("hypothesis") in tuple(hypotheses):
+        said += f" (truth: {truth['hypothesis'].replace('_', ' ')})"
     return said, COLORS[best]
 
 
-def _true(told: Any, parameter: str, unit: str) -> float | None:
-    """A parameter's true value in the picture's unit, if the recording states one that can be drawn."""
-    if not isinstance(told, Mapping):
+def _true(truth: Any, parameter: str, unit: str) -> float | None:
+    """A parameter's true value in the picture's unit; None if the recording states none that can be drawn."""
+    if not isinstance(truth, Mapping):
         return None
-    value = told.get("N_with_lattice", told.get("N")) if parameter == "N" else told.get(parameter)
+    value = truth.get("N_with_lattice", truth.get("N")) if parameter == "N" else truth.get(parameter)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < LARGEST:
         return None
     if parameter == "alpha":
         return 1.0 / value
-    stated = told.get("unit", unit)
+    stated = truth.get("unit", unit)
     if not _scales(parameter):
         return float(value)
     if not isinstance(stated, str) or not known(stated) or not same_kind(stated, unit):

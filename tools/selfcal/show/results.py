@@ -46,7 +46,9 @@ def _hints(of: type[Object]) -> dict[str, Any]:
 def _typed(value: Any, hint: Any) -> Any:
     """`value` with the classes of `hint`; as it is where that does not fit it."""
     if isinstance(hint, UnionType):
-        hint = next((one for one in get_args(hint) if isinstance(value, get_origin(one) or _shape(one))), Any)
+        hint = next(
+            (choice for choice in get_args(hint) if isinstance(value, get_origin(choice) or _shape(choice))), Any
+        )
     arguments = get_args(hint)
     if get_origin(hint) is dict and isinstance(value, Mapping):
         return {key: _typed(entry, arguments[1]) for key, entry in value.items()}
@@ -57,9 +59,11 @@ def _typed(value: Any, hint: Any) -> Any:
     return value
 
 
-def _shape(one: Any) -> type:
-    """What a value must be to be taken for `one`."""
-    return Mapping if isinstance(one, type) and issubclass(one, Object) else one if isinstance(one, type) else object
+def _shape(hint: Any) -> type:
+    """What a value must be to be taken for `hint`."""
+    return (
+        Mapping if isinstance(hint, type) and issubclass(hint, Object) else hint if isinstance(hint, type) else object
+    )
 
 
 class Damaged(Object):
@@ -87,7 +91,7 @@ class Recording(Object):
 
 
 class Posterior(Object):
-    """Of one parameter under one law, in `unit`; q05 and q95 bound the 90 % interval. `identified`: the record says
+    """A parameter under a law, in `unit`; q05 and q95 bound the 90 % interval. `identified`: the record says
     more than the prior. `off_grid`: the truth may lie beyond what the model's grid of nodes can show."""
 
     mean: float
@@ -204,7 +208,7 @@ class Identification(Document):
     axes: dict[str, IdentifiedAxis]
 
     def _print(self, console: Any) -> None:
-        from selfcal.show.table import show
+        from selfcal.show.identification import show
 
         show(self, console=console)
 
@@ -214,17 +218,17 @@ class Identification(Document):
             if "error" in axis:
                 yield {"axis": name, "error": axis["error"]}
             for law, parameters in axis.get("parameters", {}).items():
-                for parameter, one in parameters.items():
+                for parameter, estimate in parameters.items():
                     yield {
                         "axis": name,
                         "law": law,
                         "probability": axis["hypotheses"][law],
                         "parameter": parameter,
-                        **one,
+                        **estimate,
                     }
 
     def plot(self, path: Path | str | None = None, *, datasheet: bool = False) -> Picture | None:
-        """The Allan deviation of each axis beside the model's, as `identify --plot` has it: a picture, which a notebook
+        """The Allan deviation of each axis with the model's, as `identify --plot` has it: a picture, which a notebook
         shows, or the file `path`. `datasheet`: in the units of data sheets. Raises UserError."""
         from selfcal.base.output import check_picture, png_of
         from selfcal.show.allan_plot import figure_of, plot_allan
@@ -341,9 +345,9 @@ class Diagnosis(Document):
             head = {"axis": name, **{key: axis[key] for key in ("verdict", "error") if key in axis}}
             if not axis.get("findings"):
                 yield head
-            for found in axis.get("findings", ()):
-                of = {**head, "cause": found["cause"], "evidence_gain_nats": found["evidence_gain_nats"]}
-                for key, value in found["estimate"].items():
+            for finding in axis.get("findings", ()):
+                of = {**head, "cause": finding["cause"], "evidence_gain_nats": finding["evidence_gain_nats"]}
+                for key, value in finding["estimate"].items():
                     yield {**of, "key": key, **(value if isinstance(value, Mapping) else {"median": value})}
 
 

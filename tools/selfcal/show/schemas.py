@@ -27,11 +27,9 @@ COUNT: Json = {"type": "integer", "minimum": 0}
 _OF = {str: "string", bool: "boolean", int: "integer", float: "number"}
 
 
-def _map(values: Json, names: Sequence[str] | None = None, **more: Any) -> Json:
-    """A mapping of these `values`; of these names alone, if there are any."""
-    return {"type": "object", "additionalProperties": values, **more} | (
-        {"propertyNames": {"enum": list(names)}} if names else {}
-    )
+def _map(values: Json, **more: Any) -> Json:
+    """A mapping of these `values`."""
+    return {"type": "object", "additionalProperties": values, **more}
 
 
 def _only(entries: Mapping[str, Json], needed: Sequence[str] = ()) -> Json:
@@ -43,18 +41,11 @@ def _list(items: Json, **more: Any) -> Json:
     return {"type": "array", "items": items, **more}
 
 
-def model() -> Json:
-    """Of a model file."""
-    limits: dict[str, Json] = {"law": {"enum": ["log_uniform", "uniform"]}, "min": NUMBER, "max": NUMBER}
-    prior = {
-        "oneOf": [
-            _only(limits, list(limits)),
-            _only({"law": {"const": "log_normal"}, "median": NUMBER, "sd": NUMBER}, ["law", "median", "sd"]),
-        ]
-    }
+def _group() -> Json:
+    """Of a group of axes."""
     bias = _only({"law": {"const": "normal"}, "sd": NUMBER}, ["law", "sd"])
     priors = {"bias": bias, **dict.fromkeys(PLACES, PRIOR)}
-    group = _only(
+    return _only(
         {
             "axes": _list({"type": "string"}, minItems=1, maxItems=MOST_AXES),
             "unit": TEXT,
@@ -66,6 +57,17 @@ def model() -> Json:
         },
         ["axes", "unit", "priors"],
     )
+
+
+def model() -> Json:
+    """Of a model file."""
+    limits: dict[str, Json] = {"law": {"enum": ["log_uniform", "uniform"]}, "min": NUMBER, "max": NUMBER}
+    prior = {
+        "oneOf": [
+            _only(limits, list(limits)),
+            _only({"law": {"const": "log_normal"}, "median": NUMBER, "sd": NUMBER}, ["law", "median", "sd"]),
+        ]
+    }
     kinds = [
         _only({"kind": {"const": kind}, "deviation": TEXT, **dict.fromkeys(keys, NUMBER)}, ["kind"])
         for kind, keys in KEYS_OF_TERM.items()
@@ -92,7 +94,7 @@ def model() -> Json:
         "sensor": _only(
             {"name": TEXT, "rate_hz": NUMBER, "filter_taps": COUNT | {"minimum": 1, "maximum": MOST_TAPS}}, ["rate_hz"]
         ),
-        "groups": _map(group, minProperties=1),
+        "groups": _map(_group(), minProperties=1),
         "hypotheses": {
             "type": "object",
             "properties": dict.fromkeys(NAMED, NUMBER),
@@ -141,7 +143,7 @@ def result(of: type[Object]) -> Json:
 def _hint(hint: Any, places: dict[str, Json]) -> Json:
     """Of an annotation; classes go to `places`."""
     if isinstance(hint, UnionType):
-        return {"anyOf": [_hint(one, places) for one in get_args(hint)]}
+        return {"anyOf": [_hint(choice, places) for choice in get_args(hint)]}
     if hint is NoneType:
         return {"type": "null"}
     arguments = get_args(hint)
@@ -153,8 +155,8 @@ def _hint(hint: Any, places: dict[str, Json]) -> Json:
         if hint.__name__ not in places:
             places[hint.__name__] = {}
             hints = get_type_hints(hint)
-            needed = [key for key, one in hints.items() if NoneType not in get_args(one)]
-            entries = {key: _hint(one, places) for key, one in hints.items()}
+            needed = [key for key, value in hints.items() if NoneType not in get_args(value)]
+            entries = {key: _hint(value, places) for key, value in hints.items()}
             failed = {"anyOf": [{"required": ["error"]}, {"required": needed}]}
             places[hint.__name__] = {"type": "object", "properties": entries} | (
                 failed if "error" in hints else {"required": needed}
@@ -167,7 +169,7 @@ def _hint(hint: Any, places: dict[str, Json]) -> Json:
 def schemas() -> dict[str, Json]:
     """By the name of the file."""
     of = {"identify": Identification, "diagnose": Diagnosis, "compare": Comparison}
-    return {"model": model(), **{name: result(one) for name, one in of.items()}}
+    return {"model": model(), **{name: result(results) for name, results in of.items()}}
 
 
 if __name__ == "__main__":

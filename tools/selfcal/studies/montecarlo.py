@@ -12,19 +12,17 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
 from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.tables import bank_block, make_tables
 
 SCHEMA = "selfcal.montecarlo/1"
-#: Bank samples; fewer say nothing.
+#: Fewest bank samples.
 MIN_SAMPLES = 10
-#: Of a record: 80 MB.
+#: Most samples of a record: 80 MB.
 MOST_SAMPLES = 10_000_000
 
 
@@ -33,7 +31,7 @@ MOST_SAMPLES = 10_000_000
 BLOCK = 10
 
 
-#: What of each estimate of the true law a row has.
+#: Keys of each estimate of the true law in a row.
 ESTIMATE = ("mean", "sd", "q05", "median", "q95")
 
 
@@ -45,8 +43,8 @@ def rows_of(model: Model, axis: str, duration_s: float, job: tuple[str, int]) ->
     block = min(BLOCK, bank_block(model.sensor_rate_hz, model.bank_rate_hz))
     rate_hz = block * model.bank_rate_hz
     tables = make_tables(model, rate_hz, (axis,))
-    place = list(model.hypotheses).index(law)
-    rng = np.random.default_rng([seed, place])
+    index = list(model.hypotheses).index(law)
+    rng = np.random.default_rng([seed, index])
     truth = draw(model.group_of(axis), law, rng)
     drawn = 1
     while not has_nodes(model.laws[law], truth, tables):
@@ -122,13 +120,9 @@ def _chosen(row: Row) -> str:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The table of calculated against actual."""
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=f"{document['records_per_law']} records per law, {document['duration_s']:g} s, axis {document['axis']}",
-        title_justify="left",
-    )
-    for heading in ("law", "parameter", "truth in 90 %", "rms actual (16)", "rms calculated (17)", "ratio"):
-        table.add_column(heading, no_wrap=True)
+    title = f"{document['records_per_law']} records per law, {document['duration_s']:g} s, axis {document['axis']}"
+    headings = ("law", "parameter", "truth in 90 %", "rms actual (16)", "rms calculated (17)", "ratio")
+    table = table_of(headings, title)
     for law, entry in document["laws"].items():
         for name, p in entry["parameters"].items():
             table.add_row(

@@ -29,15 +29,15 @@ from scipy.spatial.transform import Rotation
 from selfcal.base.units import STANDARD_GRAVITY, convert
 from selfcal.model.parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
 
-#: s of rest, and of the flight: with GPS, and after its outage.
+#: Lengths of the rest, and of the flight with GPS and after its outage, s.
 REST_S, GPS_S, OUTAGE_S = 1800, 300, 60
 #: Readings per s in flight.
 RATE_HZ = 10
-#: s by which a position is late, and the sd of its error by part; a position's own sd by axis, m.
+#: Latency of a position, and the sd of its error by part, s; a position's own sd by axis, m.
 LATENCY_S, LATENCY_SD_S, GPS_SD_M = 1, 0.1, 3.0
-#: sd of the start's errors: the tilt of the floor and the heading, deg; the position by axis, m.
+#: Sd of the start's errors: the tilt of the floor and the heading, deg; the position by axis, m.
 TILT_SD, HEADING_SD, START_SD_M = 0.1, 2.0, 3.0
-#: m/s of speed and its swing; deg/s of turn at most; s of the take-off and of the swings.
+#: Speed and its swing, m/s; largest turn, deg/s; take-off and periods of the swings, s.
 SPEED, SPEED_SWING, TURN, TAKE_OFF_S, SPEED_PERIOD_S, TURN_PERIOD_S = 20.0, 4.0, 10.0, 20.0, 47.0, 60.0
 #: Units of the filter, by AXES, and the size of each axis' unit in them.
 SI = {"deg/s": "rad/s", "m/s^2": "m/s^2"}
@@ -132,8 +132,8 @@ class Part:
     @classmethod
     def of(cls, law: str, seeds: Sequence[int], *, noise: float = 1.0) -> Part:
         """Parts of a law; `noise` scales every error there is."""
-        found = [_part(law, seed, noise) for seed in seeds]
-        return cls(**{name: np.stack([one[name] for one in found]) for name in found[0]})
+        parts = [_part(law, seed, noise) for seed in seeds]
+        return cls(**{name: np.stack([part[name] for part in parts]) for name in parts[0]})
 
 
 def _part(law: str, seed: int, noise: float) -> dict[str, Any]:
@@ -217,7 +217,7 @@ class Filters:
         self.update(measure, gps - expected, np.full((1, 3), GPS_SD_M**2))
 
     def move(self, readings: Floats) -> None:
-        """Strapdown by the readings [filters or 1, 6] of one interval."""
+        """Strapdown by the readings [filters or 1, 6] of an interval."""
         dt = 1.0 / RATE_HZ
         corrected = readings - self.constant - self.drift
         rate, force = corrected[:, :3], corrected[:, 3:]
@@ -242,7 +242,7 @@ class Filters:
         self.predict(move, kept, variance, noise)
 
     def predict(self, move: Floats, kept: Floats, variance: Floats, noise: Floats | float = 0.0) -> None:
-        """The drift and the covariance over one interval."""
+        """The drift and the covariance over an interval."""
         self.drift = self.drift * kept
         self.covariance = move @ self.covariance @ move.transpose(0, 2, 1) + noise
         np.einsum("...ii->...i", self.covariance)[:, _DRIFT] += variance
@@ -283,8 +283,8 @@ def cross(v: Floats) -> Floats:
 
 def nees(errors: Floats, covariance: Floats) -> Floats:
     """Normalised estimation error squared, [filters]: of a filter that is consistent, chi-squared of JUDGED degrees."""
-    found: Floats = np.einsum("bi,bi->b", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
-    return found
+    squares: Floats = np.einsum("bi,bi->b", errors, np.linalg.solve(covariance, errors[:, :, None])[:, :, 0])
+    return squares
 
 
 def true_noise(law: str) -> list[Mapping[str, float]]:

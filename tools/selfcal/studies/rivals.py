@@ -18,7 +18,6 @@ from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -28,7 +27,7 @@ from selfcal.adequacy.identify import chosen_axes
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
-from selfcal.base.output import check_writable, console_of, write_json
+from selfcal.base.output import check_writable, console_of, table_of, write_json
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
 from selfcal.logs.recording import Recording, as_float, load
@@ -41,14 +40,14 @@ from selfcal.studies.methods.problem import Answer, Problem
 
 SCHEMA = "selfcal.rivals/1"
 ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
-#: The model of the ensemble, and the numbers of samples that it has unless told otherwise.
+#: The model of the ensemble, and its default numbers of samples.
 ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
 SAMPLES = (150, 600)
 #: Samples of a record of the ensemble at most: the slowest method takes eight minutes then.
 MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
-#: An interval from a value to so many times it says nothing: wider than any prior here.
+#: Ratio of an interval's ends that says nothing: wider than any prior here.
 LOOSE = 1e4
 #: Columns of a terminal that the table takes with the intervals, and without.
 WHOLE_WIDTH, BRIEF_WIDTH = 190, 110
@@ -78,7 +77,7 @@ def of_recording(
     recording = load(log, sensors=loaded.sensors, **reading)
     names = chosen_axes(recording, loaded, axes)
     loaded = for_record(loaded, recording, names)
-    found: dict[str, Any] = {}
+    answers: dict[str, Any] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("rivals", total=len(names) * len(chosen))
@@ -89,13 +88,13 @@ def of_recording(
                 progress.update(task, description=f"{name}: {rival.title}")
                 entries[rival.name] = measured(rival, problem, recording.columns[name].unit)
                 progress.advance(task)
-            found[name] = {
+            answers[name] = {
                 "samples": int(problem.y.size),
                 "samples_left_out": left_out,
                 "interval_s": problem.dt_s,
                 "rivals": entries,
             }
-    document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": found}
+    document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": answers}
     if json is not None:
         write_json(document, json)
     return document
@@ -196,8 +195,8 @@ def problem_of(recording: Recording, name: str, model: Model, decimate: float | 
             f"{recording.path}: {name}: {y.size} averages of {tables.dt_s:g} s without a gap are too few, "
             f"{FEWEST} are needed: record longer, or give --decimate HZ"
         )
-    one = replace(group, axes=(name,))
-    return Problem(y, tables.dt_s, one, laws), int(np.isfinite(mean).sum()) - y.size
+    alone = replace(group, axes=(name,))
+    return Problem(y, tables.dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
 
 
 def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -214,10 +213,10 @@ def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
         return {"title": rival.title, "error": rival.missing}
     try:
         with workers(1) as pool:
-            found = pool.submit(_alone, rival, problem, unit).result()
+            answer = pool.submit(_alone, rival, problem, unit).result()
     except BrokenProcessPool:
-        found = {"error": "it ended without an answer"}
-    return {"title": rival.title, **found}
+        answer = {"error": "it ended without an answer"}
+    return {"title": rival.title, **answer}
 
 
 def _alone(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
@@ -274,13 +273,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 
 
 def _table(name: str, axis: Mapping[str, Any], *, brief: bool) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        title=f"{printable(name)}: {axis['samples']} averages of {axis['interval_s']:g} s",
-        title_justify="left",
-    )
-    for heading in ("method", "law", "weight", "N", "K or sigma_m", "1/alpha, s", "time", "memory"):
-        table.add_column(heading, no_wrap=True)
+    title = f"{printable(name)}: {axis['samples']} averages of {axis['interval_s']:g} s"
+    table = table_of(("method", "law", "weight", "N", "K or sigma_m", "1/alpha, s", "time", "memory"), title)
     for entry in axis["rivals"].values():
         if "error" in entry:
             continue
@@ -317,19 +311,9 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
         cells.setdefault((entry["samples"], entry["law"]), []).append(entry)
     for (samples, law), entries in cells.items():
         names = NAMED[law].parameters
-        table = Table(
-            box=box.SIMPLE_HEAD,
-            title=f"{law}, {samples} samples, {entries[0]['records']} records, truth: {document['truth']}",
-            title_justify="left",
-        )
-        for heading in (
-            "method",
-            *(f"error of ln {name} over ML's" for name in names),
-            "90 % intervals hold",
-            "none",
-            "time",
-        ):
-            table.add_column(heading, no_wrap=True)
+        title = f"{law}, {samples} samples, {entries[0]['records']} records, truth: {document['truth']}"
+        errors = (f"error of ln {name} over ML's" for name in names)
+        table = table_of(("method", *errors, "90 % intervals hold", "none", "time"), title)
         for entry in entries:
             p = entry["parameters"]
             table.add_row(
@@ -340,9 +324,8 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
                 _seconds(entry["seconds"]),
             )
         console.print(table)
-    table = Table(box=box.SIMPLE_HEAD, title="choice of the law, mean over the laws", title_justify="left")
-    for heading in ("samples", "method", "by", "right", *document_laws(document), "log score"):
-        table.add_column(heading, no_wrap=True)
+    headings = ("samples", "method", "by", "right", *document_laws(document), "log score")
+    table = table_of(headings, "choice of the law, mean over the laws")
     for entry in document["choice"]:
         table.add_row(
             str(entry["samples"]),

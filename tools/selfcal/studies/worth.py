@@ -9,12 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 from scipy import signal
 
 from selfcal.base.errors import UserError, printable
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
 from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, as_float, load
@@ -23,20 +21,20 @@ from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Fl
 from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"
-#: s of rest, and s after its end at which the bias is wanted.
+#: Lengths of rest, and times after it for the bias, s.
 RESTS_S, HORIZONS_S = (60, 300, 1800), (1, 10, 60, 300, 1000)
-#: s of "the last seconds".
+#: Length of "the last seconds", s.
 LAST_S = 10
 #: Corner of x-io Fusion's bias filter, Hz.
 CORNER_HZ = 0.02
-#: s of dead reckoning, and the seconds after a rest at which the bias is predicted.
+#: Length of dead reckoning, s, and its seconds after a rest.
 RECKONED_S = 60
 SECONDS = (*range(1, RECKONED_S + 1), *(h for h in HORIZONS_S if h > RECKONED_S))
 #: Its errors in the document, and in the table.
 RECKONED = {"heading_deg": "heading, deg", "position_m": "position, m"}
 #: The gyro that turns each horizontal accelerometer out of the level.
 ACROSS = {"ax": "gy", "ay": "gx"}
-#: s of real readings whose mean stands for the bias then.
+#: Length of the real readings whose mean is the bias then, s.
 REFERENCE_S = 30
 #: The methods, in the order of the table.
 TITLES = {
@@ -47,7 +45,7 @@ TITLES = {
     "kalman": "fixed-gain Kalman, data-sheet numbers",
     "none": "no correction",
 }
-#: Beside them, of simulated parts: dead reckoning with the bias known throughout has the white noise alone.
+#: Further method for simulated parts: dead reckoning with a known bias has the white noise alone.
 KNOWN = "known"
 
 
@@ -66,7 +64,7 @@ def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], 
 
     bank = Bank(make_tables(model, 1.0, (axis,), bank_rate_hz=1.0))
     bank.push(y[:, None])
-    told = np.array(bank.raw.predict(0, [float(s) for s in SECONDS]))
+    predicted = np.array(bank.raw.predict(0, [float(s) for s in SECONDS]))
     level: dict[str, Callable[[Group, Floats], float]] = {
         "last": lambda _, seen: float(seen[-LAST_S:].mean()),
         "rest": lambda _, seen: float(seen.mean()),
@@ -75,8 +73,8 @@ def predictions(model: Model, axis: str, y: Floats) -> tuple[dict[str, Floats], 
         "none": lambda _, __: 0.0,
     }
     group = model.group_of(axis)
-    found = {name: np.full(len(SECONDS), method(group, y)) for name, method in level.items()}
-    return {"bank": told[:, 0], **found}, told[:, 1]
+    levels = {name: np.full(len(SECONDS), method(group, y)) for name, method in level.items()}
+    return {"bank": predicted[:, 0], **levels}, predicted[:, 1]
 
 
 def heading_error(rate: Floats) -> float:
@@ -128,8 +126,8 @@ class After:
 
     def errors(self, unit: str) -> dict[str, Floats]:
         """Of the minute's corrected readings, by method."""
-        found = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
-        return {name: convert(error, self.unit, unit) for name, error in found.items()}
+        errors = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
+        return {name: convert(error, self.unit, unit) for name, error in errors.items()}
 
     def row(self, case: str, rest: int, truth: Floats) -> Row:
         """Errors of the bias, `truth` at HORIZONS_S."""
@@ -160,8 +158,8 @@ def simulated(model: Model, job: Job) -> list[Row]:
         y, truth[axis] = simulate(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)
         noise[axis] = (y - truth[axis])[job.rest_s :][:RECKONED_S]
         after[axis] = After.of(model, axis, convert(y, AXES[axis], model.group_of(axis).unit), job.rest_s)
-    at = [job.rest_s - 1 + h for h in HORIZONS_S]
-    row = after["gx"].row(job.law, job.rest_s, convert(truth["gx"][at], AXES["gx"], after["gx"].unit))
+    samples = [job.rest_s - 1 + h for h in HORIZONS_S]
+    row = after["gx"].row(job.law, job.rest_s, convert(truth["gx"][samples], AXES["gx"], after["gx"].unit))
     row |= _heading(after["gx"]) | _position(after["gx"], after["ax"])
     row[f"heading_deg.{KNOWN}"] = heading_error(noise["gx"])
     row[f"position_m.{KNOWN}"] = position_error(noise["gx"], noise["ax"])
@@ -169,7 +167,7 @@ def simulated(model: Model, job: Job) -> list[Row]:
 
 
 def _means(recording: Recording, model: Model, name: str) -> Floats:
-    """Means of 1 s of a recorded axis, NaN where there is none."""
+    """Means of 1 s of a recorded axis, NaN in gaps."""
     from selfcal.bank.blocks import usable_blocks
 
     recording = recording.along(name)
@@ -192,19 +190,19 @@ def recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
     for name, mean in means.items():
         across = means.get(ACROSS.get(name, ""))
         both = mean if across is None else mean + across
-        at = longest_stretch(np.where(np.isfinite(both), np.arange(both.size), np.nan)).astype(int)
+        stretch = longest_stretch(np.where(np.isfinite(both), np.arange(both.size), np.nan)).astype(int)
         gyro = same_kind(model.group_of(name).unit, "rad/s")
         for rest in RESTS_S:
             span = rest + HORIZONS_S[-1] + REFERENCE_S
-            for start in range(0, at.size - span + 1, span):
-                piece = mean[at[start : start + span]]
+            for start in range(0, stretch.size - span + 1, span):
+                piece = mean[stretch[start : start + span]]
                 after = After.of(model, name, piece, rest)
                 truth = np.array([piece[rest + h - 1 : rest + h - 1 + REFERENCE_S].mean() for h in HORIZONS_S])
                 row = after.row(f"recorded {'gyros' if gyro else 'accelerometers'}", rest, truth)
                 if gyro:
                     row |= _heading(after)
                 elif across is not None:
-                    turning = After.of(model, ACROSS[name], across[at[start : start + span]], rest)
+                    turning = After.of(model, ACROSS[name], across[stretch[start : start + span]], rest)
                     row |= _position(turning, after)
                 rows.append(row)
     return rows
@@ -212,7 +210,7 @@ def recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
 
 def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """The document: rms errors by case and length of the rest."""
-    found = []
+    entries = []
     for case, rest in dict.fromkeys((row["case"], row["rest_s"]) for row in rows):
         mine = [row for row in rows if (row["case"], row["rest_s"]) == (case, rest)]
         entry: dict[str, Any] = {"case": case, "unit": mine[0]["unit"], "rest_s": rest, "rests": len(mine)}
@@ -223,8 +221,8 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
             for key in RECKONED
             if (having := [row for row in mine if f"{key}.bank" in row])
         }
-        found.append(entry)
-    return found
+        entries.append(entry)
+    return entries
 
 
 def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -236,12 +234,12 @@ def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
             groups["bias"].append({name: entry["rms_error"][name][horizon] for name in TITLES})
         for key, errors in entry["dead_reckoning"].items():
             groups[key].append({name: errors[name] for name in TITLES})
-    found: dict[str, dict[str, Any]] = {}
+    worst: dict[str, dict[str, Any]] = {}
     for name in TITLES:
         ratios = {key: [one[name] / min(one.values()) for one in group] for key, group in groups.items() if group}
-        told = {key: {"worst": max(all_), "median": float(np.median(all_))} for key, all_ in ratios.items()}
-        found[name] = {**told.pop("bias"), **told}
-    return found
+        spread = {key: {"worst": max(all_), "median": float(np.median(all_))} for key, all_ in ratios.items()}
+        worst[name] = {**spread.pop("bias"), **spread}
+    return worst
 
 
 def _rms(rows: Sequence[Row], key: str) -> float:
@@ -260,9 +258,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         reckoned = entries[0]["dead_reckoning"]
         if reckoned:
             title += f"; of {RECKONED_S} s of dead reckoning"
-        table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-        for heading in ("rest", "method", *(f"after {h} s" for h in HORIZONS_S), *(RECKONED[key] for key in reckoned)):
-            table.add_column(heading, no_wrap=True)
+        after = (f"after {h} s" for h in HORIZONS_S)
+        table = table_of(("rest", "method", *after, *(RECKONED[key] for key in reckoned)), title)
         for entry in entries:
             columns = [{name: errors[str(h)] for name, errors in entry["rms_error"].items()} for h in HORIZONS_S]
             columns += entry["dead_reckoning"].values()
@@ -281,13 +278,14 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             if any(known):
                 table.add_row("", "  the white noise alone", *known, end_section=True)
         console.print(table)
-    table = Table(box=box.SIMPLE_HEAD, title="error over the least of all methods: median, worst", title_justify="left")
     regrets = document["regret"]
     reckoned = [key for key in RECKONED if key in regrets["bank"]]
-    for heading in ("method", "bias", *(RECKONED[key].partition(",")[0] for key in reckoned)):
-        table.add_column(heading, no_wrap=True)
+    headings = ("method", "bias", *(RECKONED[key].partition(",")[0] for key in reckoned))
+    table = table_of(headings, "error over the least of all methods: median, worst")
     for name, ratio in regrets.items():
-        shown = (f"{one['median']:.3g}, {one['worst']:.3g}" for one in (ratio, *(ratio[key] for key in reckoned)))
+        shown = (
+            f"{spread['median']:.3g}, {spread['worst']:.3g}" for spread in (ratio, *(ratio[key] for key in reckoned))
+        )
         table.add_row(TITLES[name], *shown)
     console.print(table)
     if document["recordings"]:

@@ -34,52 +34,38 @@ def command(
     Raises UserError for an order or argument that does not exist, a key that cannot be read, a channel that is not
     named or cannot be opened, or no answer.
     """
-    from selfcal.wire.command import (
-        ANSWER_S,
-        CHALLENGE,
-        CHALLENGE_S,
-        OWN_ORDERS,
-        PAUSE_S,
-        answer_in,
-        argument_of,
-        build_flag,
-        codes,
-        frame,
-        new_key,
-        payload,
-        read_key,
-    )
+    from selfcal.wire import command as wire
     from selfcal.wire.dbc_file import NODES
     from selfcal.wire.frames import open_bus, serial_ports
 
     if order == "new-key":
-        new_key(key_file)
+        wire.new_key(key_file)
         return ""
     if order == "build-flag":
-        return build_flag(read_key(key_file))
-    orders = [name for name in codes("command") if name != CHALLENGE]
+        return wire.build_flag(wire.read_key(key_file))
+    orders = [name for name in wire.codes("command") if name != wire.CHALLENGE]
     if order not in orders:
-        raise UserError(f"no such command: {order} (there are {', '.join((*orders, *OWN_ORDERS))})")
-    argument = argument_of(order, value)
+        raise UserError(f"no such command: {order} (there are {', '.join((*orders, *wire.OWN_ORDERS))})")
+    argument = wire.argument_of(order, value)
     if not 0 <= node < NODES:
         raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     if not channel:
         raise UserError(
             f"to which module? --channel names its serial port ({serial_ports()}), or the --interface's channel"
         )
-    key = read_key(key_file)
+    key = wire.read_key(key_file)
     with open_bus(interface, channel, **({"bitrate": bitrate} if bitrate else {})) as link:
-        for wait in (PAUSE_S, PAUSE_S, 0.0):
-            link.bus.send(frame(payload(CHALLENGE), node))
-            challenge = answer_in(link, "challenge", CHALLENGE_S, codes("command")[CHALLENGE], node)
+        for wait in (wire.PAUSE_S, wire.PAUSE_S, 0.0):
+            link.bus.send(wire.frame(wire.payload(wire.CHALLENGE), node))
+            challenge = wire.answer_in(link, "challenge", wire.CHALLENGE_S, wire.codes("command")[wire.CHALLENGE], node)
             if challenge is not None:
                 break
             time.sleep(wait)
         else:
             raise UserError("the module gives no challenge now: a wrong tag before, or no random numbers; try again")
-        link.bus.send(frame(payload(order, argument, key=key, challenge=challenge), node))
-        result = answer_in(link, "result", ANSWER_S, codes("command")[order], node)
-    return next((name for name, number in codes("result").items() if number == result), str(result))
+        link.bus.send(wire.frame(wire.payload(order, argument, key=key, challenge=challenge), node))
+        result = wire.answer_in(link, "result", wire.ANSWER_S, wire.codes("command")[order], node)
+    return next((name for name, number in wire.codes("result").items() if number == result), str(result))
 
 
 def show(answer: str, given: Mapping[str, Any]) -> int:

@@ -9,19 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError, called
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ, Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    ModelFile,
-    Report,
-    Start,
-    Verdicts,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Recording
@@ -33,8 +21,8 @@ def compare(
         Sequence[Path | str | Recording], argument(f"Recordings of one part: {READ}", "LOG LOG...", kind=list[Path])
     ],
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
     decimate: Annotated[
         float | None, option("Diagnose block means at this rate; default: every sample", metavar="HZ")
     ] = None,
@@ -45,22 +33,22 @@ def compare(
             metavar="changed|inadequate|material|CAUSE",
         ),
     ] = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    start_s: Start = None,
-    end_s: End = None,
-    gate: Gate = False,
-    json: Json = None,
-    report: Report = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    gate: shared.Gate = False,
+    json: shared.Json = None,
+    report: shared.Report = None,
     **reading: Unpack[Reading],
 ) -> Comparison:
-    """Identify and diagnose each of `logs`, and set every one beside the one before it.
+    """Identify and diagnose each of `logs`, and compare each with the one before it.
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
     distance in standard deviations; the `verdicts` by recording and axis; and the `quantities` that were set beside
     each other, by recording, axis and name. An axis that two successive recordings do
-    not both have, judged and in one unit, is {"error": ..., "changes": [...]}.
+    not both have, judged and in the same unit, is {"error": ..., "changes": [...]}.
     `decimate`, `start_s`, `end_s`, `gate`, `reading`: as `diagnose` has them, of each recording. `fail_on`: see
     fail_on.py; it is only checked here. `report`: file for a page with tables and pictures.
     `limits`, `junit`, `verdicts`: as `identify` has them, of each recording.
@@ -83,7 +71,7 @@ def compare(
         raise UserError(f"compare takes two recordings or more of one part: {called()} compare A B")
     check(fail_on, more=(CHANGED,))
     check_options(limits, junit, verdicts)
-    files = [file for one in logs for file in list_of(one)]
+    files = [file for log in logs for file in list_of(log)]
     check_writable(json, report, junit, verdicts, inputs=(*files, model, limits))
     bounds = None if limits is None else Limits.load(limits, Model.load(model))
     seen = []
@@ -93,55 +81,57 @@ def compare(
     part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
     part |= reading
     names = [
-        str(one if isinstance(one, Path | str) else getattr(one, "path", f"arrays {number}"))
-        for number, one in enumerate(logs, 1)
+        str(log if isinstance(log, Path | str) else getattr(log, "path", f"arrays {number}"))
+        for number, log in enumerate(logs, 1)
     ]
-    for log, place in zip(logs, names, strict=True):
+    for log, path in zip(logs, names, strict=True):
         known = identify(log, suspicion=False, **part)
         identified = known["axes"]
         if bounds is not None:
             add_verdicts(known, bounds, None, None)
-            judged.append(("", place, [Verdict.of(one) for one in known["limits"]]))
+            judged.append(("", path, [Verdict.of(entry) for entry in known["limits"]]))
         diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]
         Held().check()
-        by_log[place] = {
+        by_log[path] = {
             name: verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
         }
         for name, axis in identified.items():
             if axis.get("allan"):
-                curves.setdefault(name, {})[place] = axis["allan"]
+                curves.setdefault(name, {})[path] = axis["allan"]
         seen.append({name: quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
-    compared = {name: Compared() for name in sorted({name for one in by_log.values() for name in one})}
+    compared = {name: Compared() for name in sorted(set().union(*by_log.values()))}
     for (first, before), (second, after) in pairwise(zip(names, seen, strict=True)):
-        for name, one in compared.items():
+        for name, axis in compared.items():
             error = incomparable({log: by_log[log].get(name) for log in (first, second)})
             if error is not None:
-                one.errors += [error] if error not in one.errors else []
+                axis.errors += [error] if error not in axis.errors else []
             elif name in before and name in after:
-                one.pairs += 1
+                axis.pairs += 1
                 rows = changes(before[name], after[name])
-                one.changes += [{"from": first, "to": second, **row} for row in rows]
+                axis.changes += [{"from": first, "to": second, **row} for row in rows]
     document = {
         "schema": SCHEMA,
         "recordings": names,
-        "axes": {name: one.entry() for name, one in compared.items()},
+        "axes": {name: axis.entry() for name, axis in compared.items()},
         "verdicts": by_log,
         "quantities": dict(zip(names, seen, strict=True)),
         "limit_sd": LIMIT,
     }
     if bounds is not None:
-        document["limits"] = [{**one.entry(), "recording": log} for _, log, found in judged for one in found]
+        document["limits"] = [
+            {**judgement.entry(), "recording": log} for _, log, of_log in judged for judgement in of_log
+        ]
         write(judged, junit, verdicts)
-    none = not any(one.pairs for one in compared.values())
+    none = not any(axis.pairs for axis in compared.values())
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
     if report is not None and not none:
-        from selfcal.show.compare_page import write_page
+        from selfcal.show.comparison_page import write_page
 
         write_page(report, document, curves)
     if none:
-        told = "; ".join(f"{name}: {', '.join(one.errors)}" for name, one in compared.items())
-        raise UserError(f"no axis can be compared ({told})")
+        reasons = "; ".join(f"{name}: {', '.join(axis.errors)}" for name, axis in compared.items())
+        raise UserError(f"no axis can be compared ({reasons})")
     return Comparison(document)
 
 
@@ -150,5 +140,5 @@ def show(document: Comparison, given: Mapping[str, Any]) -> int:
     from selfcal.batch.compare import show as table
     from selfcal.batch.fail_on import exit_code
 
-    table(document, to_stderr=to_stderr(given))
+    table(document, to_stderr=shared.to_stderr(given))
     return exit_code(document, given.get("fail_on"))

@@ -42,7 +42,7 @@ def convert(
 
 def show(recording: Recording, given: Mapping[str, Any]) -> int:
     """Print what was written."""
-    axes = ", ".join(f"{name}[{one.unit}]" for name, one in recording.columns.items())
+    axes = ", ".join(f"{name}[{column.unit}]" for name, column in recording.columns.items())
     rows = f"{recording.samples:,} rows, {recording.rate_hz:.6g} Hz, {recording.duration_s:.6g} s"
     print(f"{given['output']}: {rows}: {axes}")
     return 0

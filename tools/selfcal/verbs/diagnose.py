@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
@@ -10,56 +10,46 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError, note
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    FailOn,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    Logs,
-    ModelFile,
-    Report,
-    SincePowerOn,
-    Start,
-    Verdicts,
-    on_a_line,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
+    from selfcal.base.ending import Held
+    from selfcal.base.progress import Doing
+    from selfcal.diagnosis.finding import Diagnosed
+    from selfcal.diagnosis.record import Record
+    from selfcal.logs.recording import Recording
+    from selfcal.model.file import Model
     from selfcal.show.results import Diagnosis
 
 
-@on_a_line
+@shared.on_a_line
 def diagnose(
-    log: Logs,
+    log: shared.Logs,
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
     decimate: Annotated[
         float | None, option("Look at means at this rate alone; default: means of 1 s, then every sample", metavar="HZ")
     ] = None,
     full_rate: Annotated[
         bool, option("Look at every sample at once, not at means of 1 s first", "--full-rate")
     ] = False,
-    json: Json = None,
-    report: Report = None,
+    json: shared.Json = None,
+    report: shared.Report = None,
     write_model: Annotated[
         Path | str | None, option("Write the model file with what was found in it", metavar="MODEL.yaml")
     ] = None,
     on: Annotated[
         Path | str | None, option("Measure each finding's gain on a second recording of the part", metavar="LOG")
     ] = None,
-    fail_on: FailOn = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    gate: Gate = False,
+    fail_on: shared.FailOn = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    gate: shared.Gate = False,
     details: Annotated[bool, option("Print every finding of each axis too", "--details")] = False,
     **reading: Unpack[Reading],
 ) -> Diagnosis:
@@ -68,7 +58,7 @@ def diagnose(
     `axes`: those reported on; every other column may explain them. A long recording is looked at twice: first its means
     of 1 s, whose findings go to stderr at once, then every sample. The second result is the final one, unless it shows
     nothing where the first one does. A further finding of the means stays in the axis' `only_in_means`. An axis that
-    the second look did not finish has the first one's result if it has none of its own. `full_rate`: no first look.
+    the second look did not finish without a result of its own has the first look's. `full_rate`: no first look.
     `decimate`: look at block means at this rate alone, Hz.
     `on`: a second recording, read as the first, on which each finding's gain is measured.
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
@@ -89,34 +79,18 @@ def diagnose(
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.diagnosis import hidden
-    from selfcal.diagnosis.diagnose import (
-        FIRST_FROM,
-        FIRST_HZ,
-        LEAST_HZ,
-        add_carried,
-        add_posteriors,
-        below_lattice,
-        by_identify,
-        entry_of,
-        events_of,
-        less_stated,
-        looked_at,
-        options_given,
-        shared_by,
-        show_first,
-        why_not,
-    )
+    from selfcal.diagnosis.diagnose import add_carried, add_posteriors, entry_of, events_of, options_given, shared_by
     from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
     from selfcal.diagnosis.events import add_findings
     from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
-    from selfcal.diagnosis.finding import Diagnosed
-    from selfcal.diagnosis.loop import INTERRUPTED
     from selfcal.diagnosis.record import of_recording
-    from selfcal.diagnosis.verdict import joined
     from selfcal.likelihood import work
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
     from selfcal.show.results import Diagnosis
+
+    if report is not None:
+        from selfcal.show.diagnosis_page import write_page
 
     check(fail_on)
     check_options(limits, junit, verdicts)
@@ -135,77 +109,49 @@ def diagnose(
     second = None
     if on is not None:
         second = load(on, sensors=loaded.sensors, **reading)
-    first: dict[str, Diagnosed] = {}
     with held() as ending, Doing("diagnose") as doing:
-        record = of_recording(recording, loaded, decimate, names)
-        if decimate is None and not full_rate and recording.samples >= FIRST_FROM and recording.rate_hz >= LEAST_HZ:
-            means = None
-            with suppress(UserError):  # a recording that is too short for means is looked at once
-                means = of_recording(recording, loaded, FIRST_HZ, names)
-            if means is not None and record.axes:
-                first = looked_at(means, names, ending, doing)
-                show_first(recording, first, [name for name in names if name in record.axes], ending)
-        seen = looked_at(record, names, ending, doing, first) if not ending.asked else {}
-        looked = {
-            name: first.get(name)
-            if name not in seen and below_lattice(record, name)
-            else joined(seen.get(name), first.get(name), INTERRUPTED)
-            for name in names
-        }
-        found = {name: less_stated(one, loaded) for name, one in looked.items() if one is not None}
-        if not ending.asked:
-            doing.now("checks")
-            by_identify(found, recording, loaded)
-        errors = {
-            name: seen[name].unfinished if name in seen else why_not(recording, loaded, record, name)
-            for name in names
-            if name not in found
-        }
+        record, first, diagnosed, errors = _looked(recording, loaded, names, decimate, full_rate, ending, doing)
         with work.within(work.Work(lambda: ending.overdue)):
-            if not found:
-                reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
+            if not diagnosed:
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
-                        from selfcal.show.page import write_page
-
                         write_page(report, document, record, {})
                     if json is not None:
                         write_json(document, json)
                 ending.check()
+                reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
             doing.now("held-out gain")
             sensor = recording.path.name.partition(".")[0] if model is None else None
-            tree, read_out = extended(loaded, record, found, sensor)
-            out = left_out(loaded, found)
+            tree, read_out = extended(loaded, record, diagnosed, sensor)
+            out = left_out(loaded, diagnosed)
             doing.now("what the axes share")
-            shared = shared_by(found, loaded) if not ending.asked else None
+            shared = shared_by(diagnosed, loaded) if not ending.asked else None
             if shared is not None:
                 hidden.extend(tree, shared)
-            document = to_document(recording, found, errors, tree, first, [finding for _, finding in out])
-            quantity = None if shared is None else entry_of(shared, found, recording)
+            document = to_document(recording, diagnosed, errors, tree, first, [finding for _, finding in out])
+            quantity = None if shared is None else entry_of(shared, diagnosed, recording)
             if shared is not None and quantity is not None and second is not None:
                 on_second = of_recording(second, loaded, 1.0 / shared.dt)
                 quantity["gain_on"] = hidden.carried(shared, on_second.axes, events_of(on_second))
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
-                add_carried(document, loaded, tree, record, found, second)
+                add_carried(document, loaded, tree, record, diagnosed, second)
             doing.now("posterior")
             known = add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
-            add_findings(document, recording, found, known, quantity)
+            add_findings(document, recording, diagnosed, known, quantity)
             if write_model is not None:
                 write_text(write_model, as_text(tree, recording.path, read_out))
                 note(f"{write_model}: {read_out}")
                 if out:
-                    told = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
-                    note(f"{write_model}: a module leaves out {told}: {NO_ROOM}")
+                    causes = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
+                    note(f"{write_model}: a module leaves out {causes}: {NO_ROOM}")
             if report is not None:
-                from selfcal.show.page import write_page
-
                 doing.now("pictures")
                 given = options_given(axes, model, decimate, recording)
-                write_page(report, document, record, found, given)
+                write_page(report, document, record, diagnosed, given)
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
     if json is not None:
@@ -213,10 +159,54 @@ def diagnose(
     return Diagnosis(document)
 
 
+def _looked(
+    recording: Recording,
+    model: Model,
+    names: Sequence[str],
+    decimate: float | None,
+    full_rate: bool,
+    ending: Held,
+    doing: Doing,
+) -> tuple[Record, dict[str, Diagnosed], dict[str, Diagnosed], dict[str, str]]:
+    """The look at means, whose findings go to stderr, then at every sample: the record, what the first look found, what
+    both found together, and why the other axes have no result."""
+    from selfcal.diagnosis import diagnose as looks
+    from selfcal.diagnosis.loop import INTERRUPTED
+    from selfcal.diagnosis.record import of_recording
+    from selfcal.diagnosis.verdict import joined
+
+    first: dict[str, Diagnosed] = {}
+    record = of_recording(recording, model, decimate, names)
+    long = recording.samples >= looks.FIRST_FROM and recording.rate_hz >= looks.LEAST_HZ
+    if decimate is None and not full_rate and long:
+        means = None
+        with suppress(UserError):  # a recording that is too short for means is looked at once
+            means = of_recording(recording, model, looks.FIRST_HZ, names)
+        if means is not None and record.axes:
+            first = looks.looked_at(means, names, ending, doing)
+            looks.show_first(recording, first, [name for name in names if name in record.axes], ending)
+    seen = looks.looked_at(record, names, ending, doing, first) if not ending.asked else {}
+    diagnosed: dict[str, Diagnosed] = {}
+    for name in names:
+        only_means = name not in seen and looks.below_lattice(record, name)
+        axis = first.get(name) if only_means else joined(seen.get(name), first.get(name), INTERRUPTED)
+        if axis is not None:
+            diagnosed[name] = looks.less_stated(axis, model)
+    if not ending.asked:
+        doing.now("checks")
+        looks.by_identify(diagnosed, recording, model)
+    errors = {
+        name: seen[name].unfinished if name in seen else looks.why_not(recording, model, record, name)
+        for name in names
+        if name not in diagnosed
+    }
+    return record, first, diagnosed, errors
+
+
 def show(document: Diagnosis, given: Mapping[str, Any]) -> int:
     """Print each finding in words; the exit code of `--fail-on` and the limits."""
     from selfcal.batch.fail_on import exit_code
     from selfcal.show.findings import show as table
 
-    table(document, to_stderr=to_stderr(given), details=bool(given.get("details")))
+    table(document, to_stderr=shared.to_stderr(given), details=bool(given.get("details")))
     return exit_code(document, given.get("fail_on"))

@@ -4,27 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from selfcal.base.errors import UserError, note, short
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    FailOn,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    ModelFile,
-    Scheduler,
-    SincePowerOn,
-    Start,
-    Verdicts,
-    Workers,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
+
+if TYPE_CHECKING:
+    from selfcal.batch.files import Named
 
 
 def fleet(
@@ -47,26 +35,26 @@ def fleet(
         Path | str | None, option("Columns file, device, and station, lot, date", metavar="UNITS.csv")
     ] = None,
     diagnose: Annotated[bool, option("Look for causes too; slower", "--diagnose")] = False,
-    fail_on: FailOn = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    json: Json = None,
+    fail_on: shared.FailOn = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    json: shared.Json = None,
     report: Annotated[Path | str | None, option("Write a page of the batch", metavar="FILE.html")] = None,
     write_model: Annotated[
         Path | str | None, option("Write the model with the batch as a new unit's priors", metavar="FILE.yaml")
     ] = None,
-    workers: Workers = None,
-    scheduler: Scheduler = None,
+    workers: shared.Workers = None,
+    scheduler: shared.Scheduler = None,
     results: Annotated[
         Path | str | None, option("Folder of finished recordings; default: FILE.parts", metavar="DIR")
     ] = None,
-    axes: Axes = (),
-    model: ModelFile = None,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    gate: Gate = False,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    gate: shared.Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Identify every recording of the batch and write the table `output`, .csv or .parquet.
@@ -86,16 +74,17 @@ def fleet(
     """
     from functools import partial
 
+    import selfcal
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.fail_on import check
-    from selfcal.batch.files import DATE_FORM, sources_of
-    from selfcal.batch.fleet import document_with, judged_units, version_of_package
+    from selfcal.batch.files import DATE_FORM
+    from selfcal.batch.fleet import document_with, judged_units
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
     from selfcal.batch.record import ByContent, Options, Verbs, examined, killed, own_pages, settings_of
     from selfcal.batch.spread import spread
     from selfcal.batch.summary import document_of, lines_of, summed_up
-    from selfcal.batch.table import Unit, check_table, rows_of, write_table
+    from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
     from selfcal.batch.verdicts import Limits, check_options, write
     from selfcal.model.file import Model
     from selfcal.model.file import settings_of as model_settings_of
@@ -114,20 +103,9 @@ def fleet(
         loaded.group_of(name)
     bounds = None if limits is None else Limits.load(limits, loaded)
     folder = Path(f"{output}.parts") if results is None else Path(results)
-    given = {Path(str(one)).resolve() for one in patterns}
-    outputs = [Path(one) for one in (output, junit, verdicts, json, report, write_model) if one is not None]
-    for one in outputs:
-        if one.resolve() in given:
-            raise UserError(f"{one}: is one of the recordings: give it a name of its own")
-    own_files = [
-        *outputs,
-        folder,
-        Path(f"{report}.units"),
-        *(Path(one) for one in (model, limits, units_table) if one is not None),
-    ]
-    named = sources_of([str(one) for one in patterns], units_table, serial_from, own_files)
-    for copy, other in named.copies.items():
-        note(f"{copy}: the same recording as {other}: counted once")
+    outputs = [Path(file) for file in (output, junit, verdicts, json, report, write_model) if file is not None]
+    inputs = [Path(file) for file in (model, limits, units_table) if file is not None]
+    named = _named(patterns, units_table, serial_from, outputs, [*inputs, folder, Path(f"{report}.units")])
     verbs = Verbs(identify, run_diagnose)
     options = Options(
         None if model is None else str(Path(model).absolute()),
@@ -136,31 +114,29 @@ def fleet(
         {**reading, **({} if dbc is None else {"dbc": str(Path(dbc).absolute())})},
         {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
     )
-    version = version_of_package()
+    version = str(selfcal.__version__)
     keeper = ByContent(folder, settings_of(options, model_settings_of(loaded), version))
-    own = [one for one in named.sources if not one.copy_of]
-    found = spread(
+    sources = [source for source in named.sources if not source.copy_of]
+    records = spread(
         partial(examined, verbs, options),
-        [(str(Path(one.path).absolute()), one.content) for one in own],
+        [(str(Path(source.path).absolute()), source.content) for source in sources],
         settings={},
         piece=1,
         scheduler=scheduler,
         results=keeper,
         count=workers,
         lost=killed,
-        weights=[one.size + 1.0 for one in own],
+        weights=[source.size + 1.0 for source in sources],
         verb="fleet",
     )
-    record_of = dict(zip((one.path for one in own), found, strict=True))
+    record_of = dict(zip((source.path for source in sources), records, strict=True))
     batch = [
-        Unit(one, record_of.get(one.path, {"error": f"is the same recording as {one.copy_of}"}))
-        for one in named.sources
+        Unit(source, record_of.get(source.path, {"error": f"is the same recording as {source.copy_of}"}))
+        for source in named.sources
     ]
     for unit in batch:
         if unit.undated:
             note(f"{unit.source.path}: leaves out the date '{short(unit.undated)}': write it as {DATE_FORM}")
-        if "damaged" in (known := unit.record.get("recording", {})):
-            note(f"{unit.source.path}: {known['damaged']['words']}")
         if "damaged" in (known := unit.record.get("recording", {})):
             note(f"{unit.source.path}: {known['damaged']['words']}")
     batch.sort(key=lambda unit: unit.place)
@@ -175,19 +151,39 @@ def fleet(
     if json is not None:
         write_json(document, json)
     if report is not None:
-        from selfcal.batch.page import write_page
+        from selfcal.batch.fleet_page import write_page
 
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
-        pages = (
-            own_pages(f"{report}.units", flagged, summary.devices, verbs, options, keeper, workers) if diagnose else {}
-        )
+        pages: dict[str, str] = {}
+        if diagnose:
+            pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, keeper, workers)
         write_page(report, document, summary, pages)
     return document
+
+
+def _named(
+    patterns: Sequence[Path | str],
+    units_table: Path | str | None,
+    serial_from: str | None,
+    outputs: Sequence[Path],
+    others: Sequence[Path],
+) -> Named:
+    """The recordings with their devices. `outputs`, `others`: the run's own files, which are no recordings."""
+    from selfcal.batch.files import sources_of
+
+    given = {Path(str(pattern)).resolve() for pattern in patterns}
+    for file in outputs:
+        if file.resolve() in given:
+            raise UserError(f"{file}: is one of the recordings: give it a name of its own")
+    named = sources_of([str(pattern) for pattern in patterns], units_table, serial_from, [*outputs, *others])
+    for copy, other in named.copies.items():
+        note(f"{copy}: the same recording as {other}: counted once")
+    return named
 
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     """Print the devices that need a look; the exit code of the batch."""
     from selfcal.batch.fleet import show as table
 
-    table(document, to_stderr=to_stderr(given))
+    table(document, to_stderr=shared.to_stderr(given))
     return int(document["code"])

@@ -4,48 +4,36 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 
 from selfcal.base.errors import UserError, say_once
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    FailOn,
-    Gate,
-    Json,
-    Junit,
-    LimitsFile,
-    Logs,
-    ModelFile,
-    SincePowerOn,
-    Start,
-    Verdicts,
-    on_a_line,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
+    from selfcal.likelihood.state import Look
+    from selfcal.logs.recording import Recording
+    from selfcal.model.file import Model
     from selfcal.show.results import Identification
 
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
 
 
-@on_a_line
+@shared.on_a_line
 def identify(
-    log: Logs,
+    log: shared.Logs,
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
     engine: Annotated[Literal["library", "reference", "fixed"], option("What computes")] = "library",
     decimate: Annotated[
         float | None, option("Rate of the block means instead of the model file's", metavar="HZ")
     ] = None,
-    json: Json = None,
+    json: shared.Json = None,
     plot: Annotated[
         Path | str | None, option("Save the Allan deviations beside the model's (.png .pdf .svg)", metavar="FILE")
     ] = None,
@@ -75,14 +63,14 @@ def identify(
         bool,
         option("No second look at the axes that are not adequate", "--no-suspicion", kind=bool, made=operator.not_),
     ] = True,
-    fail_on: FailOn = None,
-    limits: LimitsFile = None,
-    junit: Junit = None,
-    verdicts: Verdicts = None,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    gate: Gate = False,
+    fail_on: shared.FailOn = None,
+    limits: shared.LimitsFile = None,
+    junit: shared.Junit = None,
+    verdicts: shared.Verdicts = None,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    gate: shared.Gate = False,
     **reading: Unpack[Reading],
 ) -> Identification:
     """Identify the axes of a recording; returns the document `selfcal.identify/1` and writes it to `json`.
@@ -140,7 +128,7 @@ def identify(
     recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     of_file, loaded_model = loaded_model, for_record(loaded_model, recording, names)
-    found: dict[str, Identified | UserError] = {}
+    identified: dict[str, Identified | UserError] = {}
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         subsets = sum(len(choices_of(offered(loaded_model, name))) for name in names)
@@ -148,7 +136,7 @@ def identify(
         for name in names:
             progress.update(task, description=f"{name} ({engine})")
             try:
-                found[name] = identify_axis(
+                identified[name] = identify_axis(
                     recording,
                     name,
                     loaded_model,
@@ -158,27 +146,20 @@ def identify(
                     draw=plot is not None,
                 )
             except UserError as error:
-                found[name] = error
-        with_reasons(found, recording, loaded_model)
-        document = to_document(recording, found, all_failed=json if fail_on is not None else None)
+                identified[name] = error
+        with_reasons(identified, recording, loaded_model)
+        document = to_document(recording, identified, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)
         doubtful = [  # motion is left out already: what is left is judged
             name
-            for name, axis in found.items()
+            for name, axis in identified.items()
             if isinstance(axis, Identified) and against(axis.judged.checks).keys() - {"motion"}
         ]
         if doubtful and suspicion:
-            from selfcal.diagnosis.suspicion import suspicions, weigh_more_laws, with_added_laws
-            from selfcal.readings.tests import TESTS
+            from selfcal.diagnosis.suspicion import weigh_more_laws, with_added_laws
 
             progress.update(task, description="strongest suspicion")
-            suspected = suspicions(recording, loaded_model, doubtful)
-            for name, shown in suspected.items():
-                document["axes"][name]["suspicion"] = shown.cause
-            for name in doubtful:
-                for test in TESTS:  # shown by the readings themselves
-                    if test.name in document["axes"][name]["checks"]:
-                        document["axes"][name]["suspicion"] = test.name
+            suspected = _suspect(document, recording, loaded_model, doubtful)
             if model is None:
                 progress.update(task, description="more laws")
                 again = with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)
@@ -197,10 +178,25 @@ def identify(
     return Identification(document)
 
 
+def _suspect(document: dict[str, Any], recording: Recording, model: Model, names: Sequence[str]) -> dict[str, Look]:
+    """Name the strongest suspicion of each axis in the document: a test of the readings, else the look that explains
+    most. The looks by axis."""
+    from selfcal.diagnosis.suspicion import suspicions
+    from selfcal.readings.tests import TESTS
+
+    suspected = suspicions(recording, model, names)
+    for name in names:
+        axis = document["axes"][name]
+        causes = [suspected[name].cause] if name in suspected else []
+        causes += [test.name for test in TESTS if test.name in axis["checks"]]
+        axis |= {"suspicion": causes[-1]} if causes else {}
+    return suspected
+
+
 def show(document: Identification, given: Mapping[str, Any]) -> int:
     """Print the table; the exit code of `--fail-on` and the limits."""
     from selfcal.batch.fail_on import exit_code
-    from selfcal.show.table import show as table
+    from selfcal.show.identification import show as table
 
-    table(document, to_stderr=to_stderr(given), datasheet=given.get("datasheet", False))
+    table(document, to_stderr=shared.to_stderr(given), datasheet=given.get("datasheet", False))
     return exit_code(document, given.get("fail_on"))

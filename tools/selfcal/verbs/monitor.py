@@ -7,13 +7,15 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
 from selfcal.verbs._shared import Axes, From, Json
 
 if TYPE_CHECKING:
+    from selfcal.logs.framelog import FrameLog
+    from selfcal.wire.frames import Link
     from selfcal.wire.monitor import Outcome
 
 
@@ -66,19 +68,19 @@ def monitor(
     from selfcal.show.plot import plot_run
     from selfcal.wire.dbc_file import NODES
     from selfcal.wire.frame_writer import FrameWriter
-    from selfcal.wire.frames import AXES, REASONS, AxisReport, Link, Streams, axis_unit, open_bus, reasons, serial_ports
+    from selfcal.wire.frames import Streams, axis_unit, open_bus, serial_ports
     from selfcal.wire.known_models import KnownModels
     from selfcal.wire.live import Contact, View, patient
-    from selfcal.wire.monitor import LOOK_S, MODULES, REOPEN_S, Outcome, document, farewell, feed, keep
+    from selfcal.wire.monitor import Outcome, Run
     from selfcal.wire.streams import check as check_stream
-    from selfcal.wire.streams import content, open_streams
+    from selfcal.wire.streams import open_streams
 
     if (channel is None) == (read is None):
         raise UserError(
             f"which module? --channel names its port ({serial_ports()}), or --read a log of its frames: one of the two"
         )
-    for name in axes:
-        axis_unit(name)
+    for axis in axes:
+        axis_unit(axis)
     if node is not None and not 0 <= node < NODES:
         raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
     if speed is not None and (read is None or not 0.0 < speed < math.inf):
@@ -89,123 +91,59 @@ def monitor(
         raise UserError(f"--duration must be above 0 s, not {duration:g}")
     if plot is not None:
         check_picture(plot)
-    for one in stream:
-        check_stream(one)
+    for kind in stream:
+        check_stream(kind)
     if "jsonl" in stream and str(json) == "-":
         raise UserError("--stream jsonl and --json - are both for stdout: give --json a file")
     check_writable(json, plot)
     name = str(read if channel is None else channel)
     models = KnownModels(model, start)
     streams = Streams(node=node)
-    contacts: dict[int, Contact] = {}
-    histories: dict[int, dict[str, list[AxisReport]]] = {}
+    console = Console(stderr=True)
+
+    def say(line: str) -> None:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
+
     with held() as ending, patient(), ExitStack() as stack:
         source: Link | FrameLog
         if channel is None:
-            source = stack.enter_context(FrameLog(name, speed))
-            contact, title = None, name
+            source, contact, title = stack.enter_context(FrameLog(name, speed)), None, name
         else:
             options = {} if bitrate is None else {"bitrate": bitrate}
             source = stack.enter_context(open_bus(interface, channel, **options))
             contact, title = Contact(), f"{interface} {channel}"
-        end = math.inf if duration is None else time.monotonic() + duration
+        end_s = math.inf if duration is None else time.monotonic() + duration
         writer = None if log is None else stack.enter_context(FrameWriter(log))
-        sinks = open_streams(stream, stack)
-
-        def pass_on(reports: Sequence[AxisReport], at_s: float) -> None:
-            for report in (one for one in reports if one.axis in (axes or AXES)):
-                told = content(report, models.names(streams.decoders[report.node].status))
-                for sink in sinks:
-                    sink.send(told, at_s)
-                if writer is not None:
-                    writer.report(told, at_s)
-
-        opened, came_s = time.monotonic(), time.time()
-        view = View(
-            streams,
-            source,
-            title,
-            contact=contact,
-            contacts=contacts,
-            axes=axes,
-            names=models.names,
-            advice=models.advice,
-        )
+        run = Run(source, name, axes, models, streams, open_streams(stream, stack), writer, contact)
+        view = View(streams, source, title, None, contact, axes, run.contacts, models.names, models.advice)
         try:
             with view:
-                while not ending.asked and (left := end - time.monotonic()) > 0.0:
-                    if writer is not None:
-                        writer.keep()
-                    if source.closed:
-                        if once or not isinstance(source, Link):
-                            break
-                        if not source.reconnect():
-                            time.sleep(min(LOOK_S, left))
-                        opened = time.monotonic()
-                        continue
-                    malformed = source.malformed
-                    frame = source.recv(min(0.25, left))
-                    reports = [] if frame is None else feed(streams, frame, contacts if contact is not None else None)
-                    if contact is not None and (frame is not None or source.malformed > malformed):
-                        contact.heard(in_a_row=False, paced=any(one.paced for one in contacts.values()))
-                    if frame is None:
-                        if contact is not None and min(contact.silent_s, time.monotonic() - opened) > REOPEN_S:
-                            cast(Link, source).open_again()  # a module that has restarted waits for that
-                            opened = time.monotonic()
-                        continue
-                    if writer is not None:
-                        writer.write(frame)
-                    if streams.known and all(one.surely_foreign for one in streams.known.values()):
-                        break
-                    view.show(reports)
-                    came_s = time.time() if contact is not None else frame.timestamp
-                    pass_on(reports, came_s)
-                    for report in reports:
-                        if report.axis in (axes or AXES):
-                            keep(histories.setdefault(report.node, {}), [report])
+                run.listen(view, ending, end_s, once)
             wanted = ending.asked
         except KeyboardInterrupt:
             wanted = True
         left_over = streams.flush()
         view.show(left_over)
-        pass_on(left_over, came_s)
+        run.pass_on(left_over)
         view.print_last()
         outcome = Outcome(**vars(streams.statistics))
-        console = Console(stderr=True)
-        for line in farewell(source, contact, contacts, streams, name):
+        for line in run.farewell():
             outcome.contact_lost = not wanted
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            say(line)
         for decoder in streams.known.values():
             if decoder.twins:
                 outcome.twins = True
-                console.print(f"{name}: {decoder.twins}", highlight=False, markup=False, soft_wrap=True)
-    known = streams.known
-    foreign = {number: decoder.foreign for number, decoder in known.items() if decoder.foreign}
-    if foreign and len(foreign) == len(known):
-        raise UserError(f"{name}: {next(iter(foreign.values()))}")
-    reported = {
-        number: {axis: histories[number][axis] for axis in AXES if axis in histories[number]}
-        for number in sorted(histories)
-        if number in known and histories[number]
-    }
-    if (json is not None or plot is not None) and not reported:
-        why = {axis: word for one in known.values() for axis, word in reasons(one.status, one.corrected).items()}
-        said = "".join(f"; {axis}: {REASONS.get(word, word)}" for axis, word in why.items())
-        raise UserError(f"{name}: no complete report came, so there is nothing to write{said}")
-    names = {number: models.names(known[number].status) for number in reported}
+                say(f"{name}: {decoder.twins}")
+    reported = run.reported(needed=json is not None or plot is not None)
     if json is not None:
-        documents = {
-            number: document(history, known[number], name, names[number], number)
-            for number, history in reported.items()
-        }
-        several = {"schema": MODULES, "modules": {str(number): one for number, one in documents.items()}}
-        write_json(next(iter(documents.values())) if len(documents) == 1 else several, json)
+        write_json(run.document(reported), json)
     if plot is not None:
         for number, history in reported.items():
-            file = Path(plot) if len(reported) == 1 else Path(plot).with_stem(f"{Path(plot).stem}-node{number}")
-            which = f" of node {number}" if len(reported) > 1 or number else ""
-            plot_run(history, file, f"{Path(name).name}: the module's telemetry{which}", names=names[number])
-            console.print(f"plot: {file}", highlight=False, markup=False, soft_wrap=True)
+            several = len(reported) > 1
+            file = Path(plot).with_stem(f"{Path(plot).stem}-node{number}") if several else Path(plot)
+            title = f"{Path(name).name}: the module's telemetry{f' of node {number}' if several or number else ''}"
+            plot_run(history, file, title, names=run.names(number))
+            say(f"plot: {file}")
     return outcome
 
 

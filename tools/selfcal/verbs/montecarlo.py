@@ -50,8 +50,8 @@ def montecarlo(
     if loaded.regressors:
         raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
     loaded.group_of(axis)
-    jobs = [(law, one) for one in seeds for law in loaded.hypotheses]
-    found = spread(
+    jobs = [(law, record_seed) for record_seed in seeds for law in loaded.hypotheses]
+    rows = spread(
         partial(rows_of, loaded, axis, duration_s),
         jobs,
         settings={"schema": SCHEMA, "model": settings_of(loaded), "axis": axis, "duration_s": duration_s, "seed": seed},
@@ -59,7 +59,7 @@ def montecarlo(
         results=results,
         count=workers,
     )
-    document = summary(found, records, duration_s, axis)
+    document = summary(rows, records, duration_s, axis)
     if json is not None:
         write_json(document, json)
     return document

@@ -11,7 +11,7 @@ from selfcal.base.options import option
 from selfcal.verbs._shared import Results, Scheduler
 
 if TYPE_CHECKING:
-    from selfcal.studies.paper_figures.told import Told
+    from selfcal.studies.paper_figures.reproduction import Reproduction
 
 
 def paper(
@@ -27,7 +27,7 @@ def paper(
     tracks: Annotated[
         Path | str | None, option("Folder for the map errors of Section 4.2, a recording a track", metavar="DIR")
     ] = None,
-) -> list[Told]:
+) -> list[Reproduction]:
     """Write the page to `output`; returns its figures.
 
     `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
@@ -43,7 +43,7 @@ def paper(
     from selfcal.model.file import Model
     from selfcal.studies.paper import DATA, EXPLAINED, page, with_reason
     from selfcal.studies.paper_figures import section3, section4, survey
-    from selfcal.studies.paper_figures.told import Told
+    from selfcal.studies.paper_figures.reproduction import Reproduction
     from selfcal.verbs.diagnose import diagnose
 
     check_writable(output)
@@ -56,25 +56,25 @@ def paper(
         survey.write_tracks(Path(tracks), areas)
     priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
     rows = section3.ensemble(priors, seeds, seed, scheduler, results)
-    told = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
+    figures = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
     console = Console(stderr=True)
     with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
         task = progress.add_task("Figs 5 to 8", total=5)
         simulated = section4.simulated(seed)
-        told += section4.figures_5_and_6(default, simulated, False, seed)
+        figures += section4.figures_5_and_6(default, simulated, False, seed)
         progress.advance(task)
         real = section4.real(folder, default)
         progress.advance(task)
         if len(real) == len(section4.STRETCHES):
-            told += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED, diagnose)
+            figures += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED, diagnose)
         else:
             missing = sorted({name for name, _ in section4.STRETCHES if not (folder / name).exists()})
             note(
                 f"REAL DATA ABSENT: {', '.join(missing)} not in {folder}: Figs 5 and 6 are of simulated records alone;"
                 " name their folder with --data DIR"
             )
-            told.append(
-                Told(
+            figures.append(
+                Reproduction(
                     "Figs 5, 6, real",
                     (),
                     "P(random walk) goes to 1 on four accelerometer records.",
@@ -83,17 +83,17 @@ def paper(
                 )
             )
         progress.advance(task)
-        told += section4.figures_7(default, simulated | real, seed)
+        figures += section4.figures_7(default, simulated | real, seed)
         progress.advance(task)
-        told += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
+        figures += [section4.figure_8(priors, seed), survey.figure(priors, areas)]
         progress.advance(task)
-    write_text(output, page(told, records, seed))
-    return told
+    write_text(output, page(figures, records, seed))
+    return figures
 
 
-def show(told: list[Told], given: Mapping[str, Any]) -> int:
+def show(figures: list[Reproduction], given: Mapping[str, Any]) -> int:
     """Print a line a figure."""
     from selfcal.studies.paper import show as table
 
-    table(told, given["output"])
+    table(figures, given["output"])
     return 0

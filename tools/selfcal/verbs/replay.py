@@ -10,29 +10,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 from selfcal.base.errors import UserError, note, say_once
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import (
-    Axes,
-    End,
-    From,
-    Gate,
-    Json,
-    Logs,
-    ModelFile,
-    SincePowerOn,
-    Start,
-    to_stderr,
-)
+from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.show.results import Identification
 
 
 def replay(
-    log: Logs,
+    log: shared.Logs,
     *,
-    axes: Axes = (),
-    model: ModelFile = None,
-    start: From = None,
+    axes: shared.Axes = (),
+    model: shared.ModelFile = None,
+    start: shared.From = None,
     target: Annotated[
         Literal["host", "cortex-m4f", "cortex-m0"], option("Where the firmware runs: here, or in QEMU")
     ] = "host",
@@ -45,11 +34,11 @@ def replay(
     report_every: Annotated[
         float | None, option("Seconds between reports; default: 100 in all, fewer in QEMU", metavar="S")
     ] = None,
-    gate: Gate = False,
-    start_s: Start = None,
-    end_s: End = None,
-    since_power_on_s: SincePowerOn = 0.0,
-    json: Json = None,
+    gate: shared.Gate = False,
+    start_s: shared.Start = None,
+    end_s: shared.End = None,
+    since_power_on_s: shared.SincePowerOn = 0.0,
+    json: shared.Json = None,
     plot: Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")] = None,
     **reading: Unpack[Reading],
 ) -> Identification:
@@ -116,13 +105,17 @@ def replay(
     sent_model, rows = sent(loaded_model, recording, taken) if foreign else (loaded_model, recording)
     on_wire = list(taken.values())
     if target == "host" and transport is None:
-        told, said = run_here(rows, sent_model, on_wire, report_every, gate, known)
+        reports, said = run_here(rows, sent_model, on_wire, report_every, gate, known)
     else:
         firmware = build(sent_model, recording.rate_hz, on_wire, target, start=known)
         how = transport or "slcan"
-        told, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel)
-    history = {name: [replace(one, axis=name) for one in told[at]] for name, at in taken.items() if at in told}
-    why = {name: said[at] for name, at in taken.items() if at in said}
+        reports, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel)
+    history = {
+        name: [replace(report, axis=name) for report in reports[sent_as]]
+        for name, sent_as in taken.items()
+        if sent_as in reports
+    }
+    why = {name: said[sent_as] for name, sent_as in taken.items() if sent_as in said}
     document = document_of(recording, loaded_model, history, why, gate)
     add_sources(document, of_file, loaded_model)
     document["recording"] |= {"start_s": known_s, "since_power_on_s": since_power_on_s}
@@ -142,7 +135,7 @@ def replay(
 
 def show(document: Identification, given: Mapping[str, Any]) -> int:
     """Print the table of `identify`."""
-    from selfcal.show.table import show as table
+    from selfcal.show.identification import show as table
 
-    table(document, to_stderr=to_stderr(given))
+    table(document, to_stderr=shared.to_stderr(given))
     return 0

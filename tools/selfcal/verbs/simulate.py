@@ -65,7 +65,7 @@ def simulate(
     dt_s = scene.bank_block / scene.rate_hz
     axes = [axis_of(truth[name], model.group_of(name), dt_s, scene.bank_block) for name in model.axes]
     applied = [applied_to(text, model, scene, axes) for text in (*model.simulate["effects"], *effects)]
-    asked = [(one["id"], axis) for one in applied[len(model.simulate["effects"]) :] for axis in one["axes"]]
+    asked = [(effect["id"], axis) for effect in applied[len(model.simulate["effects"]) :] for axis in effect["axes"]]
     for name, axis in asked:
         if asked.count((name, axis)) > 1 and not CAUSES[name].several:
             raise UserError(f"--effect {name}: twice on {axis}, which has room for one effect of a kind")

@@ -40,35 +40,30 @@ def worth(
     from selfcal.batch.spread import record_seeds, spread
     from selfcal.model.file import Model
     from selfcal.model.parts import LAWS
-    from selfcal.studies.worth import (
-        HORIZONS_S,
-        REFERENCE_S,
-        RESTS_S,
-        SCHEMA,
-        Job,
-        recorded,
-        regret,
-        simulated,
-        summary,
-    )
+    from selfcal.studies import worth as study
 
     check_writable(json)
     loaded = replace(Model.load(model), regressors=(), half_life_s=0.0)
     seeds = record_seeds(records, seed)
     if logs:
-        rows = [row for log in logs for row in recorded(log, loaded, axes)]
+        rows = [row for log in logs for row in study.recorded(log, loaded, axes)]
         if not rows:
-            span = RESTS_S[0] + HORIZONS_S[-1] + REFERENCE_S
+            span = study.RESTS_S[0] + study.HORIZONS_S[-1] + study.REFERENCE_S
             raise UserError(f"the recordings are too short: {span} s without a gap are needed; record longer")
     else:
-        jobs = [Job(law, rest, one) for law in LAWS for rest in RESTS_S for one in seeds]
-        settings = {"schema": SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
+        jobs = [study.Job(law, rest, record_seed) for law in LAWS for rest in study.RESTS_S for record_seed in seeds]
+        settings = {"schema": study.SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
         settings["records"] = str(records)  # the jobs' order has it
         rows = spread(
-            partial(simulated, loaded), jobs, settings=settings, piece=32, scheduler=scheduler, results=results
+            partial(study.simulated, loaded), jobs, settings=settings, piece=32, scheduler=scheduler, results=results
         )
-    cases = summary(rows)
-    document = {"schema": SCHEMA, "recordings": [str(log) for log in logs], "cases": cases, "regret": regret(cases)}
+    cases = study.summary(rows)
+    document = {
+        "schema": study.SCHEMA,
+        "recordings": [str(log) for log in logs],
+        "cases": cases,
+        "regret": study.regret(cases),
+    }
     if json is not None:
         write_json(document, json)
     return document

@@ -21,15 +21,15 @@ from selfcal.wire.frames import AxisReport, names_of
 
 Array = NDArray[np.float64]
 
-#: s from a report to the middle of the readings that it is held against; their length, s: white noise averages out.
+#: Time from a report to the middle of the readings that test it, and their length, s: white noise averages out.
 AHEAD_S, MEAN_S = 300.0, 60.0
-#: Reports that make a figure.
+#: Fewest reports of a figure.
 LEAST = 3
 
 
 @dataclass(frozen=True)
 class Known:
-    """The bias at a time, s of the recording, and the coefficients [p] of the model's columns; 0 of one not in use."""
+    """The bias at a time, s of the recording, and the coefficients [p] of the model's columns; 0 if not in use."""
 
     time_s: float
     bias: float
@@ -62,7 +62,9 @@ def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence
 
 def of_report(report: AxisReport, model: Model) -> Known:
     """What a module's report says of its axis: a column is in use where that is the likelier."""
-    told = report.coefficients(names_of(model))
-    sent = [told.get(column, (0.0, 0.0, 0.0)) for one in offered(model, report.axis) for column in one.columns]
+    known = report.coefficients(names_of(model))
+    sent = [
+        known.get(column, (0.0, 0.0, 0.0)) for regressor in offered(model, report.axis) for column in regressor.columns
+    ]
     coefficients = np.array([mean if probability > 0.5 else 0.0 for mean, _, probability in sent], np.float64)
     return Known(report.time_s, report.value("bias_mean"), coefficients)

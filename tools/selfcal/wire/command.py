@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     import can
 
 CHALLENGE = "challenge"
-#: s to wait for a challenge, and for an answer: a module obeys between reports, and a Cortex-M0's takes 200 s.
+#: Timeout of a challenge, and of an answer, s: a module obeys between reports, and a Cortex-M0's report takes 200 s.
 CHALLENGE_S, ANSWER_S = 5.0, 400.0
-#: s after a challenge or a wrong tag within which a module gives no other.
+#: Pause of a module after a challenge or a wrong tag, s.
 PAUSE_S = 1.0
-#: Of every answer: whoever is on the wire can give it.
+#: Note on every answer: whoever is on the wire can give it.
 UNVERIFIED = "unverified: an answer has a checksum, but no tag"
 #: Orders that go to no module.
 OWN_ORDERS = ("new-key", "build-flag")

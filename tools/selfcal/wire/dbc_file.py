@@ -1,7 +1,7 @@
 """DBC files of modules, written from the pattern `frames.dbc`.
 
 The pattern holds one message of each kind, for axis gx and hypothesis 0. Here it becomes a file with a message for
-every axis and hypothesis: `lib/selfcal.dbc`, whose names are places, or that of one module, whose names are a model's.
+every axis and hypothesis: `lib/selfcal.dbc`, with names of places, or the file of a module, with a model's names.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from selfcal.base.errors import remark
+from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
 
 PATTERN = Path(__file__).parent / "frames.dbc"
@@ -20,7 +21,7 @@ PATTERN = Path(__file__).parent / "frames.dbc"
 AXIS_UNITS = {"gx": "deg/s", "gy": "deg/s", "gz": "deg/s", "ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}
 #: Identifier of node 0's first message, identifiers of a node, and nodes of a bus.
 BASE, NODE_IDS, NODES = 0x200, 128, 12
-#: Hypotheses, parameters of one hypothesis, and regressor columns that telemetry has room for.
+#: Hypotheses, parameters of a hypothesis, and regressor columns that telemetry has room for.
 HYPOTHESES, PLACES, COLUMNS = 8, 3, 6
 #: Names of the places where no model gives better ones.
 PLACE_NAMES = ("N", "p1", "p2")
@@ -94,8 +95,8 @@ def _patterns(text: str) -> tuple[list[str], dict[str, Pattern], str]:
 
     def change(id_: str, name: str, **changes: object) -> None:
         signals = messages[int(id_)].signals
-        at = next(index for index, signal in enumerate(signals) if signal.name == name)
-        signals[at] = replace(signals[at], **changes)  # type: ignore[arg-type]
+        index = next(index for index, signal in enumerate(signals) if signal.name == name)
+        signals[index] = replace(signals[index], **changes)  # type: ignore[arg-type]
 
     for line in text.splitlines():
         if match := re.match(r"BO_ (\d+) (\w+): 8 (\w+)", line):
@@ -135,16 +136,16 @@ def _in_unit(unit: str) -> Callable[[Signal], Signal]:
 
 
 def _hypothesis(names: Names, k: int, reading: str) -> Callable[[Signal], Signal | None]:
-    """Signals of one hypothesis: a place that it lacks has none."""
+    """Signals of a hypothesis, without the places that it lacks."""
 
     def change(signal: Signal) -> Signal | None:
         place, _, statistic = signal.name.partition("_")
         if place not in PLACE_NAMES:
             return signal
-        at = PLACE_NAMES.index(place)
-        if at >= len(names.parameters[k]):
+        index = PLACE_NAMES.index(place)
+        if index >= len(names.parameters[k]):
             return None
-        parameter = names.parameters[k][at]
+        parameter = names.parameters[k][index]
         unit = "" if statistic == "flags" else parameter_unit(parameter, reading)
         comment = signal.comment
         if names.known:
@@ -183,13 +184,13 @@ def symbol(name: str) -> str:
 
 def _different(names: Iterable[str]) -> list[str]:
     """The symbols of names, made different where two are alike."""
-    found: list[str] = []
+    symbols: list[str] = []
     for name in names:
-        one, number = symbol(name), 2
-        while one in found:
-            one, number = f"{symbol(name)[:16]}_{number}", number + 1
-        found.append(one)
-    return found
+        free, number = symbol(name), 2
+        while free in symbols:
+            free, number = f"{symbol(name)[:16]}_{number}", number + 1
+        symbols.append(free)
+    return symbols
 
 
 def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS_UNITS)) -> str:
@@ -211,49 +212,33 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
 
     add("STATUS", offset("STATUS"), "STATUS", same, patterns["STATUS"].comment)
     for axis in axes:
-        at, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
-        add("GX", offset("GX") + at, big, _in_unit(unit), patterns["GX"].comment.replace("gx", axis))
+        index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
+        add("GX", offset("GX") + index, big, _in_unit(unit), patterns["GX"].comment.replace("gx", axis))
     for name in ("CORRECTED", "COMMAND", "ANSWER"):
         add(name, offset(name), name, same, patterns[name].comment)
     small = [name.lower() for name in _different(names.hypotheses)]
     for axis in axes:
-        at, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
+        index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
         if names.columns:
             comment = patterns["GX_COEFFICIENTS"].comment.replace("gx", axis)
             change = _coefficients(names, unit)
-            add("GX_COEFFICIENTS", offset("GX_COEFFICIENTS") + at, f"{big}_COEFFICIENTS", change, comment)
+            add("GX_COEFFICIENTS", offset("GX_COEFFICIENTS") + index, f"{big}_COEFFICIENTS", change, comment)
         comment = patterns["GX_ADEQUACY"].comment.replace("gx", axis)
-        add("GX_ADEQUACY", offset("GX_ADEQUACY") + at, f"{big}_ADEQUACY", same, comment)
+        add("GX_ADEQUACY", offset("GX_ADEQUACY") + index, f"{big}_ADEQUACY", same, comment)
         for k, hypothesis in enumerate(names.hypotheses):
             comment = patterns["GX_H0"].comment.replace("gx", axis)
             comment = comment.replace(
                 "hypothesis 0", f"hypothesis {k}{f', {remark(hypothesis)}' if names.known else ''}"
             )
-            where = offset("GX_H0") + HYPOTHESES * at + k
+            where = offset("GX_H0") + HYPOTHESES * index + k
             add("GX_H0", where, f"{big}_{small[k].upper()}", _hypothesis(names, k, unit), comment)
-    return "\n".join(_text([line.replace("MODULE", sender) for line in head], messages, whole, sender))
-
-
-def _text(head: Sequence[str], messages: Sequence[Pattern], whole: str, sender: str) -> list[str]:
-    """The lines of the file. Comments of signals stand at the first message that has them."""
-    lines = list(head)
-    for message in messages:
-        lines.append(f"BO_ {message.id} {message.name}: 8 {message.sender.replace('MODULE', sender)}")
-        for signal in message.signals:
-            lines.append(f' SG_ {signal.name}{signal.before}"{signal.unit}"{signal.after.replace("MODULE", sender)}')
-        lines.append("")
-    lines.append(whole)
     said: set[tuple[str, str]] = set()
-    for message in messages:
-        lines.append(f'CM_ BO_ {message.id} "{message.comment}";')
-        for signal in message.signals:
-            if signal.comment and ((signal.name, signal.comment) not in said):
-                lines.append(f'CM_ SG_ {message.id} {signal.name} "{signal.comment}";')
-                said.add((signal.name, signal.comment))
-    lines.append("")
-    for message in messages:
-        lines += [f"VAL_ {message.id} {signal.name} {signal.choices} ;" for signal in message.signals if signal.choices]
-    lines.append("")
-    for message in messages:
-        lines += [f"SIG_VALTYPE_ {message.id} {signal.name} : 1;" for signal in message.signals if signal.is_float]
-    return [*lines, ""]
+
+    def first_with(signal: Signal) -> bool:
+        """Whether this is the first signal of its name with its comment."""
+        known = len(said)
+        said.update([(signal.name, signal.comment)] if signal.comment else [])
+        return len(said) > known
+
+    values = {"head": head, "messages": messages, "whole": whole, "sender": sender, "first_with": first_with}
+    return of_code(Path(__file__).parent / "templates").get_template("module.dbc.jinja").render(values)

@@ -8,12 +8,12 @@ import time
 from selfcal.wire.frames import ROOT
 
 SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
-#: s of module time between reports, at least. A host takes one a second.
+#: Least interval of reports, s of module time. A host takes one a second.
 REPORT_S = 10.0
 FASTEST = 1000.0
 #: python-can's own group and port, so that its tools listen there without more.
 GROUP, PORT = "239.74.163.2", 43113
-#: s that the firmware waits for a host: longer than anybody does.
+#: Time that the firmware waits for a host, s: longer than anybody does.
 FOREVER_S = 999_999.0
 
 

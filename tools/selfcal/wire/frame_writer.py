@@ -15,7 +15,7 @@ from selfcal.wire.streams import McapLog
 if TYPE_CHECKING:
     import can
 
-#: s that a frame may wait on its way to the disk: what a killed monitor loses.
+#: Longest wait of a frame on its way to the disk, s: a killed monitor loses that.
 FLUSH_S = 1.0
 
 

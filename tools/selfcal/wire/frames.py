@@ -17,7 +17,6 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.bank.result import AxisResult, Estimate
@@ -37,15 +36,15 @@ STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
-#: nat; the item of an evidence difference ends there: so much less, or none at all.
+#: Largest evidence difference of its item, nats: that or more, or no evidence at all.
 LEAST_EVIDENCE = -(2**31) * 0.001
 
 COUNTER = 64  # the counter is modulo this
-JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward cannot be told from backward
+JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward and backward are alike
 BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
-FOREIGN_STATUSES = 2  # whole statuses in a row that state another version, of a module that stated this one before
-TWINS = 3  # statuses that only two modules can have sent; a restart on the way of a status looks like one of them
-RESYNC = 3  # frames in a row, each one ahead of the last, that restart the counter; a stream is no stranger's from then
+FOREIGN_STATUSES = 2  # whole statuses in a row with another version, of a module that stated this version before
+TWINS = 3  # statuses that only two modules can have sent; a restart within a status looks like it
+RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is no stranger's from then
 
 
 #: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
@@ -75,7 +74,7 @@ def names_of(model: Model) -> Names:
     """The model's names of hypotheses, of their parameters by place, and of regressor columns.
 
     Place 0 is N, place 1 the drift parameter, place 2 the bandwidth or ratio."""
-    columns = tuple((column, one.unit) for one in model.regressors for column in one.columns)
+    columns = tuple((column, regressor.unit) for regressor in model.regressors for column in regressor.columns)
     return Names(tuple(model.hypotheses), tuple(model.laws[name].parameters for name in model.hypotheses), columns)
 
 
@@ -90,7 +89,7 @@ def choices(message: str, signal: str) -> dict[int, str]:
     return {number: str(name) for number, name in named.items()}
 
 
-#: What the words of a reason mean (selfcal_reason_t), and what to do. Those of a judgement alone are not among them.
+#: Meaning and remedy of each word of a reason (selfcal_reason_t), without those of a judgement alone.
 REASONS = {
     "no_report": "no report yet: leave it at rest for three bank samples; none come: see the sensor's state",
     "moving": "moving: a report needs rest",
@@ -104,18 +103,18 @@ REASONS = {
 }
 
 
-def reasons(*told: Mapping[str, float]) -> dict[str, str]:
-    """Why each axis has no calibration to rely on, in the DBC's words; axes without a reason are left out. `told`:
-    status and corrected sample, as far as they came; of two the later one counts."""
-    found: dict[str, str] = {}
+def reasons(*messages: Mapping[str, float]) -> dict[str, str]:
+    """Why each axis has no calibration to rely on, in the DBC's words; axes without a reason are left out. `messages`:
+    status and corrected sample, as far as they came; of two the later counts."""
+    known: dict[str, str] = {}
     latest = -math.inf
-    for values in told:
+    for values in messages:
         said = {axis: values[f"reason_{axis}"] for axis in AXES if f"reason_{axis}" in values}
         if said and values.get("time_ms", -math.inf) >= latest:
             latest = values.get("time_ms", -math.inf)
             words = {axis: choices(STATUS, f"reason_{axis}").get(int(code), f"{code:g}") for axis, code in said.items()}
-            found = {axis: word for axis, word in words.items() if word != "none"}
-    return found
+            known = {axis: word for axis, word in words.items() if word != "none"}
+    return known
 
 
 def status_text(signal: str, value: float) -> str:
@@ -156,9 +155,9 @@ def frame_crc(frame_id: int, data: bytes) -> int:
 
 @dataclass
 class Statistics:
-    """Frames of one stream.
+    """Frames of a stream.
 
-    `lost` were sent but not accepted, as far as the counters tell; those that arrived `damaged` (checksum) are among
+    `lost` were sent but not accepted, by the counters; those that arrived `damaged` (checksum) are among
     them. `refused` had a wrong form (id, length, item), a value that cannot be, or a counter that repeats or goes back.
     `foreign` stated another version of the wire.
     """
@@ -172,7 +171,7 @@ class Statistics:
 
 @dataclass(frozen=True)
 class AxisReport:
-    """What arrived of one axis's report.
+    """What arrived of an axis's report.
 
     `values` by signal name, units as in the DBC; those of hypothesis k begin with `hk_`. `time_s`: module time when it
     was begun, to the second below if the opening frame is missing.
@@ -243,7 +242,7 @@ class AxisReport:
         return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, moved, change)
 
     def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
-        """Mean, sd and probability of use of each regressor column that was told."""
+        """Mean, sd and probability of use of each regressor column that came."""
         return {
             name: (self.value(f"c{c}_mean"), self.value(f"c{c}_sd"), self.value(f"c{c}_probability"))
             for c, (name, _) in enumerate(names.columns)
@@ -344,7 +343,7 @@ def node_of(identifier: int) -> int | None:
 
 
 class Decoder:
-    """Turns the frames of one node into reports and keeps the count of what went wrong.
+    """Turns the frames of a node into reports and keeps the count of what went wrong.
 
     `from_start`: the stream is watched from the module's first frame, so frames lost before the first accepted one
     count too.
@@ -360,16 +359,16 @@ class Decoder:
         self._corrects = False  # what comes belongs to that sample
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
-        #: The latest module time that a frame has told, unwrapped, ms. It goes back only if the module starts anew.
+        #: Latest module time of a frame, unwrapped, ms. It goes back only if the module starts anew.
         self.time_ms = 0
         #: The module has said that no sample will follow, and this was its last status.
         self.finished = False
         #: Module time of the first status, ms, and of the last.
         self.status_ms: tuple[int, int] | None = None
         self._good = 0  # frames of a right form and checksum since the last status
-        self._last_sent: int | None = None  # its frames_sent, and the one from which a status went back
+        self._last_sent: int | None = None  # its frames_sent, and the count from which a status went back
         self._left_sent: int | None = None
-        self._twins = 0  # statuses that one module cannot have sent
+        self._twins = 0  # statuses that a single module cannot have sent
         self._counter: int | None = COUNTER - 1 if from_start else None
         self._origin: int | None = 0 if from_start else None  # frames_sent of the first frame watched
         self._sent = 0  # frames sent since then, as far as known
@@ -383,7 +382,7 @@ class Decoder:
     def foreign(self) -> str:
         """What is wrong if the module speaks another version of the wire; empty if it does not.
 
-        A module that has spoken this one has to state another in FOREIGN_STATUSES whole statuses in a row.
+        A module that has spoken this version has to state another in FOREIGN_STATUSES whole statuses in a row.
         """
         if self._other is None or self._ours:
             return ""
@@ -394,7 +393,7 @@ class Decoder:
 
     @property
     def twins(self) -> str:
-        """What is wrong if two modules send as this node; empty if they do not. Their reports are none of either."""
+        """What is wrong if two modules send as this node; empty if they do not. Their reports are of neither."""
         return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= TWINS else ""
 
     @property
@@ -403,7 +402,7 @@ class Decoder:
         return bool(self.foreign) and self._others >= FOREIGN_STATUSES
 
     def feed(self, message: can.Message) -> list[AxisReport]:
-        """Take one frame; return the reports that it closes (none, one or two)."""
+        """Take a frame; return the reports that it closes (none, one or two)."""
         kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
         if (
             kind is None
@@ -496,7 +495,7 @@ class Decoder:
             self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
 
     def _look_for_twin(self, sent: int) -> None:
-        """Count a status that no one module can have sent, by the frames that have come since the last one.
+        """Count a status that no single module can have sent, by the frames that have come since the last one.
 
         More have come than were sent. Or the count goes on from where it was before it went back, and too few have come
         for that: after a restart the count begins anew."""
@@ -583,15 +582,15 @@ class Decoder:
         return closed
 
     def _begun(self, second: int) -> int:
-        """Module time of a frame that tells its second alone, modulo 256: the nearest to what is known."""
+        """Module time of a frame that has its second alone, modulo 256: the nearest to what is known."""
         wrapped = self.time_ms % 2**32
         ahead = _ahead(second, wrapped // 1000, 256)
         return max(0, self.time_ms - wrapped % 1000 + 1000 * ahead)
 
 
-def _ahead(told: int, known: int, modulus: int) -> int:
-    """How far `told`, modulo `modulus`, lies before or behind what is known, by the shorter way."""
-    return (told - known + modulus // 2) % modulus - modulus // 2
+def _ahead(second: int, known: int, modulus: int) -> int:
+    """How far `second`, modulo `modulus`, lies before or behind what is known, by the shorter way."""
+    return (second - known + modulus // 2) % modulus - modulus // 2
 
 
 @lru_cache(maxsize=1)
@@ -601,12 +600,12 @@ def _starts() -> tuple[int, ...]:
     for kind in _kinds().values():
         if kind.axis == AXES[0]:
             ids = [signal.multiplexer_ids[0] for signal in kind.message.signals if signal.multiplexer_ids]
-            items[kind.part] = 1 + max(one for one in ids if one != _END_ITEM)
+            items[kind.part] = 1 + max(id_ for id_ in ids if id_ != _END_ITEM)
     return tuple(sum(items[before] for before in range(part)) for part in range(_END + 1))
 
 
 def _order(kind: _Kind, item: int) -> int:
-    """Place of a frame among all that a report may have. No more frames lie between two than their places tell."""
+    """Place of a frame among all that a report may have. Two places differ by the most frames between them."""
     return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
 
 
@@ -634,9 +633,9 @@ def _whole(values: Mapping[str, float]) -> bool:
 
 
 class Streams:
-    """The decoders of all nodes that are heard, one each.
+    """The decoders of all nodes that are heard, by node.
 
-    A node is heard from its first good frame on: its form and its checksum are right. `node`: look at this one alone.
+    A node is heard from its first good frame on: its form and its checksum are right. `node`: look at this node alone.
     """
 
     def __init__(self, *, node: int | None = None) -> None:
@@ -646,7 +645,7 @@ class Streams:
 
     @staticmethod
     def of(decoder: Decoder) -> Streams:
-        """Those of one decoder that is there already."""
+        """Streams of a decoder that is there already."""
         streams = Streams(node=decoder.node)
         streams.decoders[decoder.node] = decoder
         return streams
@@ -679,7 +678,11 @@ class Streams:
     def known(self) -> dict[int, Decoder]:
         """The nodes that are no passing stranger, by number. Until there is one: whatever is heard."""
         heard = dict(sorted(self.decoders.items()))  # the view asks from a thread of its own
-        sure = {node: one for node, one in heard.items() if one.statistics.received >= RESYNC or self._node == node}
+        sure = {
+            node: decoder
+            for node, decoder in heard.items()
+            if decoder.statistics.received >= RESYNC or self._node == node
+        }
         return sure or heard
 
     @property
@@ -688,14 +691,14 @@ class Streams:
         known = self.known
         total = Statistics(**vars(self.strangers))
         for node, decoder in list(self.decoders.items()):
-            one = decoder.statistics
-            total.damaged += one.damaged
-            total.foreign += one.foreign
+            counted = decoder.statistics
+            total.damaged += counted.damaged
+            total.foreign += counted.foreign
             if node in known:
-                total.received, total.lost = total.received + one.received, total.lost + one.lost
-                total.refused += one.refused
+                total.received, total.lost = total.received + counted.received, total.lost + counted.lost
+                total.refused += counted.refused
             else:
-                total.refused += one.refused + one.received
+                total.refused += counted.refused + counted.received
         return total
 
 
@@ -724,7 +727,7 @@ class Link:
         while not self.closed:
             try:
                 return self.bus.recv(max(0.0, end - time.monotonic()))
-            except (IndexError, ValueError):  # python-can slcan: a line cut short, a digit that is none
+            except (IndexError, ValueError):  # python-can slcan: a line cut short, an invalid digit
                 self.malformed += 1
             except can.CanOperationError as error:
                 if error.__cause__ is None or isinstance(error.__cause__, OSError):
@@ -780,7 +783,7 @@ class Link:
             self.closed = True
 
     def close(self) -> None:
-        """Close channel and line; one that is gone already is no error."""
+        """Close channel and line; closed ones are no error."""
         import can
 
         try:
@@ -791,13 +794,11 @@ class Link:
     def __enter__(self) -> Link:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
-#: s that a write to a serial line may take: on a pseudo-terminal that nobody reads it would never end.
+#: Timeout of a write to a serial line, s: on a pseudo-terminal that nobody reads it would never end.
 WRITE_S = 1.0
 #: Frames that wait in a UDP socket while the host is busy: a report of six axes is 322, and a datagram takes 768 bytes.
 UDP_BUFFER = 4 << 20
@@ -808,7 +809,7 @@ def open_bus(interface: str, channel: str, **options: Any) -> Link:
     takes. Raises UserError when that fails."""
     import can
 
-    logging.getLogger("can").setLevel(logging.CRITICAL)  # what its drivers lack is told by their errors
+    logging.getLogger("can").setLevel(logging.CRITICAL)  # its drivers' errors say what they lack
     if interface not in can.VALID_INTERFACES:
         known = ", ".join(sorted(can.VALID_INTERFACES))
         raise UserError(f"--interface {interface}: python-can has no such interface (there are {known})")
@@ -857,7 +858,7 @@ def _leave_out_line_feeds(port: Any) -> None:
 
 
 def _check_port(interface: str, channel: str) -> None:
-    """Raises UserError if a channel can be no serial port, `PATH` or `PATH@BAUD`; a URL of pyserial's may be one."""
+    """Raises UserError if a channel can be no serial port, `PATH` or `PATH@BAUD`; a URL of pyserial's may be a port."""
     if "://" in channel:
         return
     name, _, baud = channel.partition("@")
@@ -876,10 +877,10 @@ def serial_ports() -> str:
     """The machine's serial ports, in words."""
     from serial.tools.list_ports import comports
 
-    found = sorted(port.device for port in comports())
-    if not found:
+    ports = sorted(port.device for port in comports())
+    if not ports:
         return "this machine has none: is the module plugged in?"
-    return f"there are {', '.join(found[:8])}{' and more' if len(found) > 8 else ''}"
+    return f"there are {', '.join(ports[:8])}{' and more' if len(ports) > 8 else ''}"
 
 
 def _can_devices() -> str:

@@ -8,22 +8,25 @@ from __future__ import annotations
 import argparse
 import re
 import textwrap
-from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 
 from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
+from jinja2 import Template
 
 from selfcal.base.errors import UserError
+from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
 from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, REASON, dbc
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
-#: Messages of one axis, by what follows its name, with what their items are called in C. Those of all axes are alike.
+#: Messages of an axis, by what follows its name, and the name of their items in C; alike for all axes.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
-#: Those that modules send.
+#: Messages that modules send.
 SENT = ("", "_H0", "_COEFFICIENTS", "_ADEQUACY")
 #: Headings of lib/WIRE.md, by what follows an axis's name or by message.
 HEADINGS = {
@@ -43,7 +46,7 @@ LATER = re.compile(r"c[1-9]_")
 
 @dataclass(frozen=True)
 class Field:
-    """One signal of one item: bits `start` to `start + length - 1` of the 32-bit value."""
+    """One signal of an item: bits `start` to `start + length - 1` of the 32-bit value."""
 
     name: str
     item: int
@@ -52,22 +55,37 @@ class Field:
     kind: str  # uint, int or float
     scale: float
     unit: str
-    comment: str
-    choices: str
+    meaning: str
 
     @property
     def macro(self) -> str:
         """Name in C, less the prefix."""
         return self.name.upper()
 
+    @property
+    def shape(self) -> str:
+        """Kind, scale and bits in words."""
+        return f"{self.kind}{self.length}" + (f" × {self.scale:g}" if self.scale != 1.0 else "") + self.bits
+
+    @property
+    def bits(self) -> str:
+        """Where it lies, if it does not fill the value."""
+        if self.length == 32:
+            return ""
+        last = self.start + self.length - 1
+        return f", bit {last}" if self.length == 1 else f", bits {self.start} to {last}"
+
 
 def _as_elsewhere(signal: Signal) -> bool:
-    """Its words are those of the judgement's reason: selfcal_reason_t."""
+    """Whether its words are the judgement's reasons: selfcal_reason_t."""
     return signal.name.startswith(f"{REASON}_")
 
 
-def _words(signal: Signal) -> str:
-    return ", ".join(f"{number} {name}" for number, name in (signal.choices or {}).items())
+def _meaning(signal: Signal) -> str:
+    """Comment and choices of a signal."""
+    words = ", ".join(f"{number} {name}" for number, name in (signal.choices or {}).items())
+    words = "" if _as_elsewhere(signal) else words
+    return (signal.comment or "").rstrip(".") + (f": {words}" if words else "")
 
 
 def _field(message: Message, signal: Signal) -> Field:
@@ -89,8 +107,7 @@ def _field(message: Message, signal: Signal) -> Field:
         kind="float" if signal.is_float else "int" if signal.is_signed else "uint",
         scale=float(signal.conversion.scale),
         unit=signal.unit or "",
-        comment=(signal.comment or "").rstrip("."),
-        choices="" if _as_elsewhere(signal) else _words(signal),
+        meaning=_meaning(signal),
     )
 
 
@@ -102,17 +119,8 @@ def fields(message: Message) -> list[Field]:
         signal = message.get_signal_by_name(name)
         if (signal.start, signal.length) != bits or signal.is_signed or signal.byte_order != "little_endian":
             raise UserError(f"selfcal.dbc: {message.name}.{name}: must be bits {bits[0]} to {sum(bits) - 1}, unsigned")
-    found = [_field(message, signal) for signal in message.signals if signal.name not in COMMON]
-    return sorted(found, key=lambda field: (field.item, field.start))
-
-
-def _bits(field: Field) -> str:
-    """Where a field lies, if it does not fill the value."""
-    if field.length == 32:
-        return ""
-    if field.length == 1:
-        return f", bit {field.start}"
-    return f", bits {field.start} to {field.start + field.length - 1}"
+    members = [_field(message, signal) for signal in message.signals if signal.name not in COMMON]
+    return sorted(members, key=lambda field: (field.item, field.start))
 
 
 def _shape(field: Field) -> tuple[object, ...]:
@@ -131,12 +139,12 @@ def check(database: Database) -> None:
     if columns != list(range(3 * COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
     suffixes = [*OF_AXIS, *(f"_H{k}" for k in range(1, HYPOTHESES))]
-    for place, axis in enumerate(AXES):
+    for index, axis in enumerate(AXES):
         for suffix in suffixes:
             pattern = _first(database, "_H0" if suffix.startswith("_H") else suffix)
             message = database.get_message_by_name(axis.upper() + suffix)
             k = int(suffix[2:]) if suffix.startswith("_H") else None
-            if message.frame_id != pattern.frame_id + (place if k is None else HYPOTHESES * place + k):
+            if message.frame_id != pattern.frame_id + (index if k is None else HYPOTHESES * index + k):
                 raise UserError(f"selfcal.dbc: {message.name}: identifier {message.frame_id:#x} is out of line")
             mine = fields(message)
             if [_shape(field) for field in mine] != [_shape(field) for field in fields(pattern)]:
@@ -150,134 +158,60 @@ def check(database: Database) -> None:
                     raise UserError(f"selfcal.dbc: {message.name}.{field.name}: unit '{field.unit}', not '{unit}'")
 
 
-def _items(prefix: str, members: Iterable[Field]) -> list[str]:
-    lines: list[str] = []
-    by_item: dict[int, list[Field]] = {}
-    for field in members:
-        by_item.setdefault(field.item, []).append(field)
-    lines.append("enum {")
-    for item, group in by_item.items():
-        for field in group:
-            kind = f"{field.kind}{field.length}" + (f" x {field.scale:g}" if field.scale != 1.0 else "")
-            unit = f", {field.unit}" if field.unit else ""
-            lines.append(f"    {prefix}_{field.macro} = {item}, /* {kind}{_bits(field)}{unit} */")
-    lines += ["};", ""]
-    for group in by_item.values():
-        for field in group:
-            if field.length != 32:
-                lines.append(f"#define {prefix}_{field.macro}_SHIFT {field.start}U")
-                lines.append(f"#define {prefix}_{field.macro}_MASK 0x{(1 << field.length) - 1:X}U")
-            if field.scale != 1.0:
-                lines.append(f"#define {prefix}_{field.macro}_PER_UNIT {1.0 / field.scale:.1f}")
-    lines.append("")
-    return lines
-
-
 def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
     check(database)
-    lines = [
-        "/* The telemetry frame format in numbers. selfcal.dbc describes every item.",
-        " * Generated: python -m selfcal.wire.frames_codegen. Do not edit. */",
-        "#ifndef SELFCAL_FRAMES_H",
-        "#define SELFCAL_FRAMES_H",
-        "",
-        f"#define SELFCAL_FRAMES_VERSION {int(database.version or 0)}U",
-        "",
-        "/* First bit and width of what every frame carries, in its 8 bytes read as one little-endian number.",
-        " * The value of the item is in bits 0 to 31. */",
-    ]
-    for name, (start, length) in COMMON.items():
-        lines.append(f"#define SELFCAL_FRAME_{name.upper()}_SHIFT {start}U")
-        lines.append(f"#define SELFCAL_FRAME_{name.upper()}_MASK 0x{(1 << length) - 1:X}U")
-    lines += [
-        "",
-        "/* Identifiers of node 0. Those of node n are SELFCAL_FRAME_NODE_IDS n higher. */",
-        f"#define SELFCAL_FRAME_NODES {NODES}U",
-        f"#define SELFCAL_FRAME_NODE_IDS {NODE_IDS}U",
-    ]
-    for name in (STATUS, CORRECTED, COMMAND, ANSWER):
-        lines.append(f"#define SELFCAL_FRAME_{name}_ID 0x{database.get_message_by_name(name).frame_id:X}U")
-    lines += [
-        "",
-        "/* Those of the first axis. The next axis has the next one, or the next SELFCAL_FRAME_HYPOTHESES. */",
-    ]
-    for suffix in SENT:
-        lines.append(f"#define SELFCAL_FRAME_{OF_AXIS[suffix]}_ID 0x{_first(database, suffix).frame_id:X}U")
-    names = ", ".join(f'"{name}"' for name in AXES)
-    lines += [
-        "",
-        "/* Axes in the order of their messages. Room for hypotheses, parameters of each, and statistics of those. */",
-        f"#define SELFCAL_FRAME_AXES {len(AXES)}U",
-        f"#define SELFCAL_FRAME_AXIS_NAMES {{{names}}}",
-        f"#define SELFCAL_FRAME_HYPOTHESES {HYPOTHESES}U",
-        f"#define SELFCAL_FRAME_PLACES {PLACES}U",
-        f"#define SELFCAL_FRAME_STATISTICS {len(STATISTICS)}U",
-        "",
-        "/* Units are those of a gyro axis; an accelerometer's are alike in m/s^2. */",
-    ]
-    for suffix in SENT:
-        lines += _of_message(_first(database, suffix), OF_AXIS[suffix])
-    for name in (STATUS, CORRECTED, ANSWER):
-        lines += _of_message(database.get_message_by_name(name), name)
-    lines += ["#endif", ""]
-    return "\n".join(lines)
+    status, corrected, command, answer = map(database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER))
+    values = {
+        "version": int(database.version or 0),
+        "of_axis": {OF_AXIS[suffix]: _first(database, suffix) for suffix in SENT},
+        "of_node": [status, corrected],
+        "command": command,
+        "of_host": [answer],
+        "members_of": lambda message: [field for field in fields(message) if not LATER.match(field.name)],
+        "later_of": lambda message: any(LATER.match(field.name) for field in fields(message)),
+        "choices_of": _choices,
+        "COMMON": COMMON,
+        **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES, "PLACES": PLACES},
+        "STATISTICS": STATISTICS,
+    }
+    return _template("selfcal_frames.h.jinja").render(values)
 
 
-def _of_message(message: Message, name: str) -> list[str]:
-    """Items of a message, and the numbers of their choices."""
-    members = [field for field in fields(message) if not LATER.match(field.name)]
-    more = "" if len(members) == len(fields(message)) else f" Each later column's are {len(members)} higher."
-    lines = [f"/* Items of the message {message.name}.{more} */", *_items(f"SELFCAL_{name}", members)]
-    for signal in message.signals:
-        for number, word in ({} if _as_elsewhere(signal) else signal.choices or {}).items():
-            lines.append(f"#define SELFCAL_{name}_{signal.name.upper()}_{str(word).upper()} {number}U")
-    return lines if lines[-1] == "" else [*lines, ""]
-
-
-def _entry(head: str, text: str) -> str:
-    """An item of a list, as long lines as the documents have."""
-    return textwrap.fill(
-        f"- {head}: {text}", 120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False
-    )
+def _choices(message: Message) -> list[tuple[str, int, str]]:
+    """Signal, number and word of each choice."""
+    signals = [signal for signal in message.signals if not _as_elsewhere(signal)]
+    return [(signal.name, number, str(word)) for signal in signals for number, word in (signal.choices or {}).items()]
 
 
 def table(database: Database) -> str:
     """Every signal of every message for lib/WIRE.md, as Markdown lists."""
     check(database)
-    lines = ["Every frame:", "", _entry("bits 0 to 31, `value`", "as the item says")]
-    status = database.get_message_by_name(STATUS)
-    for name, (start, length) in COMMON.items():
-        comment = (status.get_signal_by_name(name).comment or "").rstrip(".")
-        lines.append(_entry(f"bits {start} to {start + length - 1}, `{name}`", comment))
-    titles = {}
+    status, command = map(database.get_message_by_name, (STATUS, COMMAND))
+    messages: list[tuple[str, str, list[Field], dict[str, str]]] = []
     for suffix in OF_AXIS:
-        ids = [database.get_message_by_name(a.upper() + suffix).frame_id for a in AXES]
-        said = ", ".join(f"`0x{id_:X}` {a.upper()}{suffix}" for id_, a in zip(ids, AXES, strict=True))
+        first, *_, last = of_axes = [database.get_message_by_name(axis.upper() + suffix) for axis in AXES]
+        ids = ", ".join(f"`0x{message.frame_id:X}` {message.name}" for message in of_axes)
         more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
-        titles[AXES[0].upper() + suffix] = said + more
-    titles |= {
-        name: f"`0x{database.get_message_by_name(name).frame_id:X}` {name}" for name in (STATUS, CORRECTED, ANSWER)
+        units = {field.name: field.unit for field in fields(last)}
+        messages.append((HEADINGS[suffix], ids + more, fields(first), units))
+    for message in map(database.get_message_by_name, (STATUS, CORRECTED, ANSWER)):
+        messages.append((HEADINGS[message.name], f"`0x{message.frame_id:X}` {message.name}", fields(message), {}))
+    values = {
+        "COMMON": COMMON,
+        "comments": {name: (status.get_signal_by_name(name).comment or "").rstrip(".") for name in COMMON},
+        "messages": messages,
+        "command": command,
+        "orders": [(s.start, s.start + s.length - 1, s.name, _meaning(s)) for s in command.signals],
     }
-    for name, title in titles.items():
-        lines += ["", f"### {HEADINGS[name.removeprefix(AXES[0].upper())]}", "", *textwrap.wrap(title, 120), ""]
-        suffix = name.removeprefix(AXES[0].upper())
-        theirs = [database.get_message_by_name(AXES[-1].upper() + suffix)] if suffix in OF_AXIS else []
-        accel = {field.name: field.unit for message in theirs for field in fields(message)}
-        for field in fields(database.get_message_by_name(name)):
-            kind = f"{field.kind}{field.length}" + (f" × {field.scale:g}" if field.scale != 1.0 else "")
-            unit = f", {field.unit}" if field.unit else ""
-            if accel.get(field.name, field.unit) != field.unit:
-                unit += f" (accelerometers: {accel[field.name]})"
-            meaning = field.comment + (f": {field.choices}" if field.choices else "")
-            lines.append(_entry(f"{field.item} `{field.name}`, {kind}{_bits(field)}{unit}", meaning))
-    command = database.get_message_by_name(COMMAND)
-    lines += ["", "### Command, from the host", "", f"`0x{command.frame_id:X}` COMMAND", ""]
-    for signal in command.signals:
-        choices = _words(signal)
-        meaning = (signal.comment or "").rstrip(".") + (f": {choices}" if choices else "")
-        lines.append(_entry(f"bits {signal.start} to {signal.start + signal.length - 1}, `{signal.name}`", meaning))
-    return "\n".join(lines) + "\n"
+    return _template("WIRE.md.jinja").render(values)
+
+
+def _template(name: str) -> Template:
+    templates = of_code(Path(__file__).parent / "templates")
+    wrap = partial(textwrap.fill, width=120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    templates.filters |= {"entry": lambda text: wrap(f"- {text}"), "wrapped": partial(textwrap.fill, width=120)}
+    return templates.get_template(name)
 
 
 def page(text: str, database: Database) -> str:

@@ -1,4 +1,4 @@
-"""Which model a module runs: the one whose tables have the `model_id` that its status tells."""
+"""Which model a module runs: the one whose tables have the `model_id` of its status."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from selfcal.wire.frames import AXES, names_of
 
 class KnownModels:
     """The default model, and that of the file `path`, with the diagnosis `start` that its module was built from. Raises
-    UserError for a file that is no model, or a start that is not of it."""
+    UserError for an invalid model, or the start of another one."""
 
     def __init__(self, path: Path | str | None = None, start: Path | str | None = None) -> None:
         if start is not None and path is None:
@@ -30,9 +30,9 @@ class KnownModels:
         self._named = lru_cache(maxsize=32)(self._find)
 
     def names(self, status: Mapping[str, float]) -> Names:
-        """Names of the model that a module with this status runs; BY_PLACE if it is none of these, or not told yet."""
-        told = tuple(status.get(key, math.nan) for key in ("model_id", "bank_interval", "bank_block"))
-        return BY_PLACE if any(math.isnan(value) for value in told) else self._named(*told)
+        """Names of the model that a module with this status runs; BY_PLACE until the model is known."""
+        known = tuple(status.get(key, math.nan) for key in ("model_id", "bank_interval", "bank_block"))
+        return BY_PLACE if any(math.isnan(value) for value in known) else self._named(*known)
 
     def advice(self, status: Mapping[str, float]) -> str:
         """What to do where the names are places; empty if nothing is."""
@@ -68,17 +68,17 @@ def _chosen(tables: Tables, axes: tuple[int, ...]) -> Tables:
     """The tables of some of the axes."""
     return replace(
         tables,
-        axes=tuple(tables.axes[at] for at in axes),
+        axes=tuple(tables.axes[k] for k in axes),
         hypotheses=tuple(
-            replace(h, priors=tuple(h.priors[at] for at in axes)) if h.priors else h for h in tables.hypotheses
+            replace(h, priors=tuple(h.priors[k] for k in axes)) if h.priors else h for h in tables.hypotheses
         ),
         regressors=tuple(
             replace(
-                one,
-                coefficient_sd=tuple(one.coefficient_sd[at] for at in axes),
-                ln_odds=tuple(one.ln_odds[at] for at in axes),
-                coefficient_mean=tuple(one.coefficient_mean[at] for at in axes if one.coefficient_mean),
+                column,
+                coefficient_sd=tuple(column.coefficient_sd[k] for k in axes),
+                ln_odds=tuple(column.ln_odds[k] for k in axes),
+                coefficient_mean=tuple(column.coefficient_mean[k] for k in axes if column.coefficient_mean),
             )
-            for one in tables.regressors
+            for column in tables.regressors
         ),
     )

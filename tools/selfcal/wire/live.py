@@ -1,4 +1,4 @@
-"""The live view of the telemetry of one module or several, for the terminal."""
+"""The live view of the telemetry of a module or several, for the terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from types import TracebackType
 from typing import Protocol, TextIO
 
 from rich.console import Console, Group, RenderableType
@@ -34,28 +33,28 @@ from selfcal.wire.frames import (
     status_text,
 )
 
-#: Of the status, what is told elsewhere or to programs alone.
+#: Status fields that this view omits.
 UNTOLD = {"time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent"}
 UNTOLD |= {f"reason_{axis}" for axis in AXES}
-#: What the user has to do something about.
-#: degC that a temperature must move before its coefficient is worth having: ArduPilot's rule (TCAL).
+#: Least change of the temperature for a coefficient, degC: ArduPilot's rule (TCAL).
 TEMPERATURE_NEEDED = 10.0
+#: States that need the user.
 TROUBLE = {"sensor_state": "failed", "clock": "internal", "state_found": "refused"}
-#: Reasons that need somebody, the most urgent first; the others pass by themselves.
+#: Reasons that need the user, the most urgent first; the others pass by themselves.
 URGENT = ("retired", "stuck", "bad_sample", "outside_priors", "inadequate", "moving")
 HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 #: Cells of a probability bar and of the bias's sparkline, at least and at most. Many hypotheses leave no room for bars.
 BAR, SPARK = (4, 30), (8, 40)
-#: Of an axis's lines after the first.
+#: Indentation of an axis's further lines.
 INDENT = 2
-#: Lines of the status, at most.
+#: Most lines of the status.
 STATUS_LINES = 2
-#: s without a byte after which contact is lost, and how often the longest interval that was seen has to pass.
+#: Silence after which contact is lost: s, and times the longest interval so far.
 SILENT_S, INTERVALS = 3.0, 3.0
-#: s that a module may be silent before its second status has shown how often it speaks: it sends one every 10 s
-#: (STATUS_MS in port/app/app_frames.c), and a save takes up to 2 s.
+#: Silence of a module before its second status, s: it sends a status every 10 s (STATUS_MS in port/app/app_frames.c),
+#: and a save takes up to 2 s.
 FIRST_S = 12.0
-#: Characters that wait for a terminal, from which on it gets no more, and s that the end waits for it to read them.
+#: Most characters that wait for a terminal, and the time for it to read them at the end, s.
 MOST_WAITING, DRAIN_S = 1 << 16, 1.0
 BLOCKS = "▁▂▃▄▅▆▇█"
 #: Colours of a module's judgement of its model.
@@ -115,8 +114,8 @@ class Patient(io.TextIOBase):
 
 @contextmanager
 def patient() -> Iterator[None]:
-    """Within, stderr is a Patient where it is a terminal: a view on one that nobody reads ends as any other. It stays
-    one where the terminal still does not read at the end."""
+    """Within, a terminal's stderr is a Patient: a view that nobody reads ends as any other. It stays a Patient if the
+    terminal still does not read at the end."""
     if not sys.stderr.isatty():
         yield
         return
@@ -141,8 +140,8 @@ class Contact:
     """When the module was heard last, by the host's clock (`clock`, s).
 
     Contact is lost after SILENT_S, or after three times the longest interval that lay between two frames in a row,
-    whichever is longer. Intervals in which frames were lost tell nothing of how often the module speaks. Before its
-    second status nothing tells: contact is then lost after FIRST_S.
+    whichever is longer. Intervals with lost frames do not count. Before the module's second status its
+    interval is unknown: contact is then lost after FIRST_S.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -187,11 +186,11 @@ class Module:
 
     @property
     def reasons(self) -> dict[str, str]:
-        """Why axes have no calibration to rely on, as it was told last."""
+        """Why axes have no calibration to rely on, by the last message."""
         return reasons(dict(self.decoder.status), dict(self.decoder.corrected))
 
     def now(self) -> float:
-        """Module time, s. If it goes back, the module has started anew and its reports of before are none any more."""
+        """Module time, s. If it goes back, the module has started anew and its earlier reports are void."""
         time_s = self.decoder.time_ms / 1000.0
         if time_s < self.time_s:
             self.last.clear()
@@ -265,9 +264,7 @@ class View:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._live.stop()
 
     def print_last(self) -> None:
@@ -279,15 +276,15 @@ class View:
         width = self._console.width
         modules = {node: self._module(node) for node in self._streams.known}
         first = next(iter(modules.values()), None)
-        numbered = not set(modules) <= {0}  # a bus of which node 0 is not the only one
+        numbered = not set(modules) <= {0}  # a bus with other nodes than node 0
         title = Text(self._title, "bold") if numbered else self._title_of(self._title, first)
         parts: list[RenderableType] = [_line(self._verdict(modules)), _line(title)]
         if self._total_s is not None and not whole:
             done = round(min(1.0, (first.now() if first else 0.0) / self._total_s) * (width // 2))
             parts.append(Text.assemble(("━" * done, "green"), ("━" * (width // 2 - done), "dim")))
         height = None if whole else self._console.height - len(parts) - (len(modules) > 1)
-        for place, (node, module) in enumerate(modules.items()):
-            share = None if height is None else height // (len(modules) - place)
+        for row, (node, module) in enumerate(modules.items()):
+            share = None if height is None else height // (len(modules) - row)
             lines = [_line(self._title_of(f"node {node}", module))] if numbered else []
             lines += self._lines(module, width, None if share is None else share - len(lines))
             height = None if height is None else height - len(lines)
@@ -333,11 +330,11 @@ class View:
             return f"{trouble}: see port/README.md"
         why = {axis: word for axis, word in module.reasons.items() if axis in shown}
         word = next((word for word in URGENT if word in why.values()), next(iter(why.values()), ""))
-        names = ", ".join(axis for axis, one in why.items() if one == word)
+        names = ", ".join(axis for axis, reason in why.items() if reason == word)
         return f"{names}: {REASONS.get(word, word)}" if word else ""
 
     def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
-        """What is to be seen of one module, below its title; `height` lines at most."""
+        """What is to be seen of a module, below its title; `height` lines at most."""
         foreign = module.decoder.foreign
         if foreign:
             return [*_flow([Text(word, "bold red") for word in foreign.split()], width, 1), self._counts(module)]
@@ -362,9 +359,16 @@ class View:
 
     @staticmethod
     def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
-        """What the record cannot tell yet."""
-        told = [report.adequacy for report, _ in last.values()]
-        moved = max((one.temperature_moved for one in told if one and one.temperature_moved is not None), default=None)
+        """What the record is too short for."""
+        judgements = [report.adequacy for report, _ in last.values()]
+        moved = max(
+            (
+                judgement.temperature_moved
+                for judgement in judgements
+                if judgement and judgement.temperature_moved is not None
+            ),
+            default=None,
+        )
         if moved is None or moved >= TEMPERATURE_NEEDED:
             return []
         said = f"temperature has moved {moved:.1f} of the {TEMPERATURE_NEEDED:g} degC that a temperature law needs"
@@ -385,7 +389,7 @@ class View:
         ]
 
     def _counts(self, module: Module) -> Text:
-        """The frames of one module, and, if it is the only one, of strangers."""
+        """The frames of a module, and of strangers if it is alone."""
         whole = len(self._streams.known) == 1
         said = frame_counts(self._streams, self._source) if whole else counted(module.decoder.statistics)
         return _line(Text(said, "dim"))
@@ -461,7 +465,7 @@ def _told(status: Mapping[str, float], name: str) -> str:
 
 
 def counted(s: Statistics) -> str:
-    """What became of the frames of one stream."""
+    """What became of the frames of a stream."""
     foreign = f", {s.foreign} foreign" if s.foreign else ""
     return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused{foreign}"
 
@@ -472,13 +476,13 @@ def frame_counts(streams: Streams | Decoder, source: Source) -> str:
 
 
 def told_of(report: AxisReport) -> int:
-    """How many hypotheses a report tells of, at least."""
+    """Fewest hypotheses of a report, by its values."""
     return max((k + 1 for k in range(len(BY_PLACE.hypotheses)) if f"h{k}_probability" in report.values), default=0)
 
 
 def most_probable(report: AxisReport, names: Names = BY_PLACE) -> int | None:
-    """The hypothesis with the greatest probability; None if one that did not arrive, or is no number, could be
-    greater. Where the report does not tell how many there are, a model's `names` do."""
+    """The hypothesis with the greatest probability; None if a missing probability, or NaN, could be
+    greater. If the report lacks their number, a model's `names` have it."""
     count = report.hypotheses or (len(names.hypotheses) if names.known else None)
     signals = {k: f"h{k}_probability" for k in range(told_of(report))}
     known = {k: report.values[signal] for k, signal in signals.items() if signal in report.values}
@@ -490,7 +494,7 @@ def most_probable(report: AxisReport, names: Names = BY_PLACE) -> int | None:
 
 
 def _bar_cells(hypotheses: int, width: int) -> int:
-    """Cells of a bar; 0 where there is no room for one."""
+    """Cells of a bar; 0 without room."""
     cells = min(BAR[1], (width - 20) // max(1, hypotheses) - 8)
     return cells if cells >= BAR[0] else 0
 
@@ -575,7 +579,7 @@ def _spark(trend: Sequence[float], sd: float, cells: int) -> str:
 
 
 def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> list[str]:
-    """The parameters of the most probable hypothesis, medians with their intervals; first N, or why there is none.
+    """The parameters of the most probable hypothesis, medians with their intervals; first N, or why it is missing.
     `named`: its name before them, as without a model's names."""
     k = most_probable(report, names)
     if k is None:
@@ -602,7 +606,7 @@ def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> lis
 
 
 def _coefficients(report: AxisReport, names: Names) -> list[str]:
-    """Coefficients of the regressor columns that were told, with the probability that each is in use."""
+    """Coefficients of the regressor columns that came, with the probability that each is in use."""
     reading, units = axis_unit(report.axis), dict(names.columns)
     said = []
     for name, (mean, sd, probability) in report.coefficients(names).items():

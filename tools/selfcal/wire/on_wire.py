@@ -1,7 +1,7 @@
 """Axes of any name and unit on the wire of the host's module: each takes the message of an axis that it does not have.
 
 Telemetry has messages for six axes in fixed units. A number in it has no unit of its own, so any axis fits. Axes of one
-group take messages of one unit, those of the accelerometer first: the gate watches a gyro in its own way.
+group take messages of the same unit, the accelerometer's first: the gate watches a gyro in its own way.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from selfcal.wire.dbc_file import AXIS_UNITS
 
 
 def places(model: Model, axes: Sequence[str]) -> dict[str, str]:
-    """By axis the one whose message it takes: itself where it has one. Raises UserError for a standard axis in another
-    unit, and where there is no room."""
+    """Message of each axis, by the axis it is named after; a standard axis has its own. Raises UserError for a standard
+    axis in another unit, and without room."""
     for name in axes:
         unit = model.group_of(name).unit
         if name in AXIS_UNITS and AXIS_UNITS[name] != unit:
@@ -25,19 +25,19 @@ def places(model: Model, axes: Sequence[str]) -> dict[str, str]:
                 f"{model.path}: axis {name} is in {unit}; telemetry carries it in {AXIS_UNITS[name]}, so the model "
                 "must be in that unit"
             )
-    found = {name: name for name in axes if name in AXIS_UNITS}
+    names = {name: name for name in axes if name in AXIS_UNITS}
     for group in model.groups:
         foreign = [name for name in group.axes if name in axes and name not in AXIS_UNITS]
-        free = [name for name in AXIS_UNITS if name not in found.values()]
+        free = [name for name in AXIS_UNITS if name not in names.values()]
         rooms = [[name for name in free if AXIS_UNITS[name] == unit] for unit in ("m/s^2", "deg/s")]
-        room = next((one for one in rooms if len(one) >= len(foreign)), None)
+        room = next((room for room in rooms if len(room) >= len(foreign)), None)
         if room is None:
             raise UserError(
                 f"telemetry has no room for {', '.join(foreign)}: it carries six axes, three of one unit; choose fewer "
                 "with --axis"
             )
-        found |= zip(foreign, room, strict=False)
-    return {name: found[name] for name in axes}
+        names |= zip(foreign, room, strict=False)
+    return {name: names[name] for name in axes}
 
 
 def sent(model: Model, recording: Recording, taken: Mapping[str, str]) -> tuple[Model, Recording]:
@@ -48,10 +48,12 @@ def sent(model: Model, recording: Recording, taken: Mapping[str, str]) -> tuple[
         if names:
             groups.append(_renamed(group, {name: taken[name] for name in names}))
     columns = dict(recording.columns)
-    for name, place in taken.items():
+    for name, sent_as in taken.items():
         values = recording.in_unit(name, model.group_of(name).unit)
-        columns[place] = replace(recording.columns[name], name=place, unit=AXIS_UNITS[place], values=values)
-    regressors = tuple(replace(one, column=taken.get(one.column, one.column)) for one in model.regressors)
+        columns[sent_as] = replace(recording.columns[name], name=sent_as, unit=AXIS_UNITS[sent_as], values=values)
+    regressors = tuple(
+        replace(regressor, column=taken.get(regressor.column, regressor.column)) for regressor in model.regressors
+    )
     return replace(model, groups=tuple(groups), regressors=regressors), replace(recording, columns=columns)
 
 

@@ -28,18 +28,18 @@ VERSIONS = {
 
 def version(library: Path) -> str:
     """SELFCAL_VERSION. Raises UserError where lib/selfcal.h has none."""
-    found = re.search(r'^#define SELFCAL_VERSION "([^"]+)"', (library / "selfcal.h").read_text("utf-8"), re.MULTILINE)
-    if found is None:
+    defined = re.search(r'^#define SELFCAL_VERSION "([^"]+)"', (library / "selfcal.h").read_text("utf-8"), re.MULTILINE)
+    if defined is None:
         raise UserError(f"{library / 'selfcal.h'}: no SELFCAL_VERSION")
-    return found[1]
+    return defined[1]
 
 
 def write(library: Path) -> None:
     """Write all into `library`, a folder like lib/. Raises UserError for a manifest without a version."""
     model = Model.load(None)
     write_tables(model, make_tables(model, model.sensor_rate_hz, None, TARGET), library / "default", TARGET)
-    for name, place in VERSIONS.items():
-        text, count = place.subn(version(library), (library / name).read_text("utf-8"))
+    for name, pattern in VERSIONS.items():
+        text, count = pattern.subn(version(library), (library / name).read_text("utf-8"))
         if count != 1:
             raise UserError(f"{library / name}: {count} lines with a version, not one")
         (library / name).write_text(text, encoding="utf-8")

@@ -48,16 +48,16 @@ from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, nam
 from selfcal.wire.live import View, frame_counts
 
 MAGIC = b"SELFCAL2"
-#: What every sample has beside the channels of the model (port/port.h), not a number where the recording has it not.
+#: Channels of every sample apart from the model's (port/port.h); not a number if the recording lacks them.
 SIDE = tuple(SIDE_CHANNELS.values())
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
 GONE_S = 2.0  # s without a frame after which none will come from firmware that has ended
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
-#: s without a frame from an emulated module: its reports are slow, and so may the machine be.
+#: Longest silence of an emulated module, s: its reports are slow, and so may the machine be.
 EMULATED_TIMEOUT_S = 600.0
-#: What a firmware is made of, and variables of the environment that its `make` file takes.
+#: Sources of a firmware, and the environment variables that its `make` file reads.
 SOURCES = (".c", ".h", ".ld", ".mk")
-#: Debian's packages of the programs that it takes to build and to run it.
+#: Debian packages of the programs that build and run it.
 PROGRAMS = {
     "make": "make",
     "cc": "gcc libc6-dev",
@@ -327,19 +327,18 @@ def ms(period_s: float) -> int:
     return math.ceil(float(f"{period_s:.6f}") * 1000.0)
 
 
-def can_bus(channel: str, port: int | None = None) -> tuple[str, Link]:
+def can_bus(channel: str) -> tuple[str, Link]:
     """A CAN bus between programs of this machine: its name for the firmware (port/posix/can.h), and the host's link.
 
-    The CAN device `channel`, or else UDP in python-can's multicast group at `port` (default: one that is free).
+    The CAN device `channel`, or else UDP in python-can's multicast group at a free port.
     """
     from can.interfaces.udp_multicast import UdpMulticastBus
 
     if channel:
         return channel, open_bus("socketcan", channel)
-    if port is None:
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
-            free.bind(("", 0))
-            port = free.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("", 0))
+        port = free.getsockname()[1]
     group = UdpMulticastBus.DEFAULT_GROUP_IPv4
     return f"{group}:{port}", open_bus("udp_multicast", group, port=port)
 
@@ -359,8 +358,8 @@ def running(
     """The running firmware, the channel its telemetry comes by, and what it said before; killed at the end. The host's
     ends by itself where this process is killed before.
 
-    `more`: arguments for the host's (port/posix/main.c). The channel is empty if the firmware did not get as far as
-    having one: then it is ending.
+    `more`: arguments for the host's (port/posix/main.c). The channel is empty if the firmware ended before it opened
+    a channel.
     """
     with socket.create_server(("127.0.0.1", 0)) if TARGETS[target].board else nullcontext() as server:
         if server is None:
@@ -474,26 +473,26 @@ def document_of(
     gate: bool,
 ) -> dict[str, Any]:
     """The document `selfcal.identify/1` of what telemetry carried."""
-    found: dict[str, Identified | UserError] = {}
+    identified: dict[str, Identified | UserError] = {}
     for name, reports in history.items():
         try:
-            found[name] = _identified(recording, model, name, reports, gate)
+            identified[name] = _identified(recording, model, name, reports, gate)
         except UserError as error:
-            found[name] = error
-    with_reasons(found, recording, model)
-    document = to_document(recording, found)
+            identified[name] = error
+    with_reasons(identified, recording, model)
+    document = to_document(recording, identified)
     again = f"{called()} diagnose {as_typed(document['recording'])}"
     for name, axis in document["axes"].items():
         axis["module_reason"] = why.get(name)
         if "error" not in axis:
-            told = history[name][-1].adequacy
-            axis["module_says"] = asdict(told) if told is not None else None
+            judgement = history[name][-1].adequacy
+            axis["module_says"] = asdict(judgement) if judgement is not None else None
             axis["ahead"] = None if gate else _ahead(recording, model, name, history[name])
             axis["outliers_kept_out"] = int(history[name][-1].values.get("outliers", 0))
-            if told is not None and told.change is not None and told.state != "inadequate":
-                note(f"{name}: the module says {told.change}; the checks here look at the record as one")
-            if told is not None and told.state == "inadequate":
-                note(f"{name}: the module says {told}; why, and what mends it: {again}")
+            if judgement is not None and judgement.change is not None and judgement.state != "inadequate":
+                note(f"{name}: the module says {judgement.change}; the checks here look at the record as one")
+            if judgement is not None and judgement.state == "inadequate":
+                note(f"{name}: the module says {judgement}; why, and what mends it: {again}")
     if gate:
         for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry
@@ -525,14 +524,16 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
         judged = judge(blocks, tables, group, result, used)
         judged = with_drift(judged, blocks, tables, result, recording, may_act(model, recording, name), used)
         judged = with_readings(judged, readings, group, unit, tables.dt_s, as_fed=True)
-    at = tables.dt_s, blocks.mean.size, tables.block
-    told = in_unit(with_white(result, group, *at), group.unit, unit)
+    extent = tables.dt_s, blocks.mean.size, tables.block
+    in_reading_unit = in_unit(with_white(result, group, *extent), group.unit, unit)
     mask = (1 << len(tables.regressors)) - 1 if scored is not None and scored.best == 1 else 0
-    scored = replace(scored, result=told) if scored else None
+    scored = replace(scored, result=in_reading_unit) if scored else None
     beside = None if gate else weigh(tables, group, samples, recording.missing_before, columns, mask)
-    numbers = summarize(result, group, *at, beside)
-    more = beside.laws(told.probability) if beside else {}
-    return Identified(unit, group.unit, told, judged, blocks.kept_out, scored, summary=numbers, more_laws=more)
+    numbers = summarize(result, group, *extent, beside)
+    more = beside.laws(in_reading_unit.probability) if beside else {}
+    return Identified(
+        unit, group.unit, in_reading_unit, judged, blocks.kept_out, scored, summary=numbers, more_laws=more
+    )
 
 
 def _with_coefficients(
@@ -546,26 +547,26 @@ def _with_coefficients(
     result = report.result(names_of(model))
     if not regressors:
         return result, None
-    told = report.coefficients(names_of(model))
-    columns = [column for one in regressors for column in one.columns]
-    probability = told[columns[0]][2] if columns[0] in told else 0.0
+    coefficients = report.coefficients(names_of(model))
+    columns = [column for regressor in regressors for column in regressor.columns]
+    probability = coefficients[columns[0]][2] if columns[0] in coefficients else 0.0
     if not math.isfinite(probability):
         probability = 0.0
-    sent = [told.get(column, (math.nan, math.nan, 0.0))[:2] for column in columns]
+    sent = [coefficients.get(column, (math.nan, math.nan, 0.0))[:2] for column in columns]
     used = probability > 0.5
     if used:
         result = replace(result, coefficients={law: tuple(sent) for law in result.probability})
     factor = factor_of(model.group_of(report.axis).unit, unit)
     inclusion = {
-        one.name: Inclusion(
+        regressor.name: Inclusion(
             probability,
             tuple(
-                normal_coefficient(column, coefficient_unit(unit, one.unit), mean * factor, sd * factor)
+                normal_coefficient(column, coefficient_unit(unit, regressor.unit), mean * factor, sd * factor)
                 for column, (mean, sd) in zip(columns, sent, strict=True)
-                if column in one.columns
+                if column in regressor.columns
             ),
         )
-        for one in regressors
+        for regressor in regressors
     }
     choices = ((), regressors)
     # P(data) = P(data | sent) P(sent) / P(sent | data)

@@ -30,11 +30,11 @@ from selfcal.wire.live import told_of
 if TYPE_CHECKING:
     import can
 
-#: Where the programs listen, or look, unless they are told otherwise: PlotJuggler's UDP server, Foxglove's websocket.
+#: Default ports of the programs: PlotJuggler's UDP server, Foxglove's websocket.
 PORTS = {"udp-json": 9870, "foxglove": 8765}
 KINDS = (*PORTS, "jsonl")
 HOST = "127.0.0.1"
-#: Statistics of a parameter that are told.
+#: Statistics of a parameter in a report.
 TOLD = ("mean", "median", "sd", "q05", "q95")
 
 
@@ -49,9 +49,9 @@ class Stream(Protocol):
 
 
 def content(report: AxisReport, names: Names) -> dict[str, Any]:
-    """A report as JSON has it, by the module's `names`; what did not arrive is not there, what is no number null."""
+    """A report as JSON has it, by the module's `names`; values that did not arrive are absent, NaN is null."""
     v, unit = report.values, axis_unit(report.axis)
-    found: dict[str, Any] = {
+    entry: dict[str, Any] = {
         "node": report.node,
         "axis": report.axis,
         "time_s": report.time_s,
@@ -60,7 +60,7 @@ def content(report: AxisReport, names: Names) -> dict[str, Any]:
         "bias": {key: v[f"bias_{key}"] for key in ("mean", "sd") if f"bias_{key}" in v},
     }
     if "count" in v:
-        found["averages"] = int(v["count"])
+        entry["averages"] = int(v["count"])
     laws: dict[str, Any] = {}
     for k in range(report.hypotheses or told_of(report)):
         known = k < len(names.hypotheses)
@@ -68,19 +68,19 @@ def content(report: AxisReport, names: Names) -> dict[str, Any]:
         if f"h{k}_probability" in v:
             law["probability"] = v[f"h{k}_probability"]
         for place, parameter in zip(PLACE_NAMES, names.parameters[k] if known else PLACE_NAMES, strict=False):
-            told = {key: v[f"h{k}_{place}_{key}"] for key in TOLD if f"h{k}_{place}_{key}" in v}
-            if told:
-                law[parameter] = {**told, "unit": parameter_unit(parameter, unit)}
+            statistics = {key: v[f"h{k}_{place}_{key}"] for key in TOLD if f"h{k}_{place}_{key}" in v}
+            if statistics:
+                law[parameter] = {**statistics, "unit": parameter_unit(parameter, unit)}
         laws[names.hypotheses[k] if known else f"h{k}"] = law
-    found["laws"] = laws
+    entry["laws"] = laws
     if report.adequacy is not None:
-        found["adequacy"] = {"state": report.adequacy.state, "suspicion": report.adequacy.suspicion}
+        entry["adequacy"] = {"state": report.adequacy.state, "suspicion": report.adequacy.suspicion}
     coefficients = report.coefficients(names)
     if coefficients:
-        found["coefficients"] = {
+        entry["coefficients"] = {
             column: {"mean": mean, "sd": sd, "probability": p} for column, (mean, sd, p) in coefficients.items()
         }
-    plain: dict[str, Any] = finite(found)
+    plain: dict[str, Any] = finite(entry)
     return plain
 
 
@@ -162,7 +162,7 @@ class _Foxglove:
         if name not in self._channels:  # all of a module, so that a viewer misses the first report at most
             names = [topic({**report, "axis": axis}) for axis in AXES]
             schema = {"type": "object"}
-            self._channels |= {one: foxglove.Channel(one, schema=schema, context=self._context) for one in names}
+            self._channels |= {name: foxglove.Channel(name, schema=schema, context=self._context) for name in names}
         self._channels[name].log(dict(report), log_time=round(at_s * 1e9))
 
     def close(self) -> None:
@@ -177,21 +177,21 @@ def check(wanted: str) -> tuple[str, str, int]:
     if not where:
         return kind, HOST, PORTS.get(kind, 0)
     if kind == "jsonl" or len(where) != 2 or not where[0] or not where[1].isdecimal() or not 0 < int(where[1]) < 65536:
-        raise UserError(f"--stream {wanted}: write {' or '.join(f'{one}:HOST:PORT' for one in PORTS)}, or jsonl")
+        raise UserError(f"--stream {wanted}: write {' or '.join(f'{kind}:HOST:PORT' for kind in PORTS)}, or jsonl")
     return kind, where[0], int(where[1])
 
 
 def open_streams(wanted: Sequence[str], stack: ExitStack) -> list[Stream]:
     """The streams of `--stream`, closed with the `stack`. Raises UserError."""
-    found: list[Stream] = []
-    for one in wanted:
-        kind, host, port = check(one)
+    sinks: list[Stream] = []
+    for stream in wanted:
+        kind, host, port = check(stream)
         if kind == "jsonl":
-            found.append(_Lines())
+            sinks.append(_Lines())
         else:
-            found.append(_Udp(host, port) if kind == "udp-json" else _Foxglove(host, port))
-        stack.callback(found[-1].close)
-    return found
+            sinks.append(_Udp(host, port) if kind == "udp-json" else _Foxglove(host, port))
+        stack.callback(sinks[-1].close)
+    return sinks
 
 
 class McapLog:
@@ -213,22 +213,22 @@ class McapLog:
 
     def __call__(self, frame: can.Message) -> None:
         """Add a frame, as python-can's loggers do."""
-        told = {
+        entry = {
             "id": frame.arbitration_id,
             "extended": frame.is_extended_id,
             "data": base64.b64encode(bytes(frame.data)).decode(),
         }
-        self._add(FRAMES, "Frame", told, frame.timestamp or time.time())
+        self._add(FRAMES, "Frame", entry, frame.timestamp or time.time())
 
     def send(self, report: Mapping[str, Any], at_s: float) -> None:
         """Add a report's content."""
         self._add(topic(report), "Report", report, at_s)
 
-    def _add(self, name: str, schema: str, told: Mapping[str, Any], at_s: float) -> None:
+    def _add(self, name: str, schema: str, entry: Mapping[str, Any], at_s: float) -> None:
         if name not in self._channels:
             self._channels[name] = self._writer.register_channel(name, "json", self._schemas[schema])
         at_ns = max(0, round(at_s * 1e9))
-        data = json.dumps(told, allow_nan=False).encode()
+        data = json.dumps(entry, allow_nan=False).encode()
         self._writer.add_message(self._channels[name], log_time=at_ns, publish_time=at_ns, data=data)
 
     def stop(self) -> None:

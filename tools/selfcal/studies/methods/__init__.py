@@ -35,8 +35,8 @@ class Rival:
     def load(self) -> Callable[[Problem], Answer]:
         """The function. Its import is not part of the time that is measured."""
         module = import_module(self.module if self.foreign else f"selfcal.studies.methods.{self.module}")
-        found: Callable[[Problem], Answer] = getattr(module, self.function)
-        return found
+        method: Callable[[Problem], Answer] = getattr(module, self.function)
+        return method
 
     @property
     def missing(self) -> str:

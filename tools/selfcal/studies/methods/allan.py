@@ -10,7 +10,7 @@ from selfcal.adequacy.allan import overlapping
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Peak, Problem, Value, maximum, weights
 
-#: Slopes within this of +-1/2 count as that slope: half-way to the flat part.
+#: Largest distance of a slope from +-1/2: half-way to the flat part.
 SLOPE_TOLERANCE = 0.25
 #: Shortest record part that a point averages over: fewer windows say nothing.
 WINDOWS = 5

@@ -16,9 +16,9 @@ def of_coefficients(law: str, phi: float, theta: float, variance: float, dt_s: f
     1 and 0. A random walk has phi = 1."""
     white = -theta * variance / phi if phi else math.nan
     step = (1.0 + theta**2) * variance - (1.0 + phi**2) * white
-    found = {"N": root(white * dt_s)}
+    parameters = {"N": root(white * dt_s)}
     if law == "random_walk":
-        return found | {"K": root(step / dt_s)}
+        return parameters | {"K": root(step / dt_s)}
     stable = 0.0 < phi < 1.0
-    found["sigma_m"] = root(step / (1.0 - phi**2)) if stable else Value(math.nan)
-    return found | {"alpha": Value(-math.log(phi) / dt_s if stable else math.nan)}
+    parameters["sigma_m"] = root(step / (1.0 - phi**2)) if stable else Value(math.nan)
+    return parameters | {"alpha": Value(-math.log(phi) / dt_s if stable else math.nan)}

@@ -24,25 +24,25 @@ def autocorrelation(problem: Problem) -> Answer:
     """Random walk: from the first two covariances of the differences. Gauss-Markov: an exponential through the
     covariances by least squares. The method states no interval and chooses no law."""
     dt = problem.dt_s
-    found: dict[str, dict[str, Value]] = {}
+    by_law: dict[str, dict[str, Value]] = {}
     if "random_walk" in problem.laws:
         difference = np.diff(problem.y)
         step = covariances(difference, difference, 2)
         white, walk = -step[1], step[0] + 2.0 * step[1]
-        found["random_walk"] = {"N": root(white * dt), "K": root(walk / dt)}
+        by_law["random_walk"] = {"N": root(white * dt), "K": root(walk / dt)}
     if "gauss_markov" in problem.laws:
         c = covariances(problem.y, problem.y, max(4, round(PART * problem.y.size)))
         lag = np.arange(1, c.size) * dt
 
-        def distance(at: Floats) -> Floats:
-            return np.asarray(at[0] * np.exp(-math.exp(at[1]) * lag) - c[1:])
+        def distance(theta: Floats) -> Floats:
+            return np.asarray(theta[0] * np.exp(-math.exp(theta[1]) * lag) - c[1:])
 
         start = [max(float(c[1]), 1e-3 * float(c[0])), -math.log(float(lag[-1]) / 3.0)]
         bounds = ([0.0, math.log(1e-3 / lag[-1])], [np.inf, math.log(10.0 / dt)])
         variance, ln_alpha = optimize.least_squares(distance, start, bounds=bounds, x_scale=[c[0], 1.0]).x
-        found["gauss_markov"] = {
+        by_law["gauss_markov"] = {
             "N": root((c[0] - variance) * dt),
             "sigma_m": root(variance),
             "alpha": Value(math.exp(float(ln_alpha))),
         }
-    return Answer(found)
+    return Answer(by_law)

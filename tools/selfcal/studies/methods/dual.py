@@ -21,7 +21,7 @@ from selfcal.studies.methods.recursive import FORGET, KEEP
 LN_MEAN, LN_VARIANCE = -1.270363, 0.5 * math.pi**2
 #: The parameters stay within this many sd of the prior's mean: a poor first step leads no further.
 REACH = 3.0
-#: Of a square that has no logarithm, as a part of the innovation variance.
+#: Least square with a logarithm, a part of the innovation variance.
 LEAST = 1e-12
 ROW = np.ones(2)
 

@@ -78,7 +78,7 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
     prior's limit for every method alike, because a user who sees a white noise of 1e-10 knows better. `unclipped` is
     the ratio without that.
     """
-    found = []
+    entries = []
     for samples in dict.fromkeys(row["samples"] for row in rows):
         for law in dict.fromkeys(row["law"] for row in rows):
             cell = [row for row in rows if row["samples"] == samples and row["law"] == law]
@@ -91,8 +91,8 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
                     for parameter in NAMED[law].parameters
                 }
                 entry["choice"] = {one: _choice(mine, one, law) for one in _criteria(mine)}
-                found.append(entry)
-    return found
+                entries.append(entry)
+    return entries
 
 
 def _rivals(rows: Sequence[Row]) -> list[str]:

@@ -16,7 +16,7 @@ from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, prob
 
 #: Nodes: of the ratio for a walk, of the ratio and of alpha, and of the white noise within its likelihood's width.
 WALK, MARKOV, NOISE = 160, (110, 40), 41
-#: Width of the last, in standard deviations of ln sigma_v.
+#: Width of the grid of white noise, in standard deviations of ln sigma_v.
 REACH = 7.0
 
 
@@ -32,8 +32,8 @@ def grid(problem: Problem) -> Answer:
         weight /= weight.sum()
         estimates[law] = {}
         for name, ln_value in zip(NAMED[law].parameters, at, strict=True):
-            values, place = np.unique(ln_value, return_inverse=True)
-            mass = np.bincount(place, weight)
+            values, index = np.unique(ln_value, return_inverse=True)
+            mass = np.bincount(index, weight)
             low, high = np.interp([0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)
             estimates[law][name] = Value(math.exp(float(weight @ ln_value)), math.exp(low), math.exp(high))
     return Answer(estimates, probabilities(ln_evidence))

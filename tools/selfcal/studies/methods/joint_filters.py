@@ -57,20 +57,20 @@ def _run(problem: Problem, law: str, *, unscented: bool) -> dict[str, Value]:
     row = np.zeros((1, d))
     row[0, :2] = 1.0
     for value in y.tolist():
-        at = np.asarray(joint.x).ravel()
+        state = np.asarray(joint.x).ravel()
         joint.Q = np.zeros((d, d))
-        joint.Q[1, 1] = step_variance(at)
-        joint.R = np.array([[math.exp(2.0 * min(at[2], 50.0)) / dt]])
+        joint.Q[1, 1] = step_variance(state)
+        joint.R = np.array([[math.exp(2.0 * min(state[2], 50.0)) / dt]])
         if unscented:
             joint.predict()
             joint.P = 0.5 * (joint.P + joint.P.T) + 1e-18 * np.eye(d)
             joint.update(np.array([value]))
         else:
             joint.F = np.eye(d)
-            joint.F[1, 1] = phi(at)
+            joint.F[1, 1] = phi(state)
             if law == "gauss_markov":
-                joint.F[1, 4] = -math.exp(at[4]) * dt * phi(at) * at[1]
-            moved = move(at, dt)
+                joint.F[1, 4] = -math.exp(state[4]) * dt * phi(state) * state[1]
+            moved = move(state, dt)
             joint.P = joint.F @ joint.P @ joint.F.T + joint.Q
             joint.x = moved[:, None]
             joint.update(np.array([[value]]), lambda _: row, lambda x: row @ x)

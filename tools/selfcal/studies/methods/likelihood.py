@@ -12,7 +12,7 @@ from statsmodels.tsa.statespace.structural import UnobservedComponents
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, information_criteria, logarithmic
 
-#: What statsmodels calls the laws. All have a free level, so their likelihoods are of the same samples.
+#: Names of the laws in statsmodels. All have a free level, so their likelihoods are of the same samples.
 _MODEL = {"constant": {"level": "dconstant"}, "random_walk": {"level": "llevel"}}
 _MODEL["gauss_markov"] = {"level": "dconstant", "autoregressive": 1}  # type: ignore[dict-item]
 
@@ -28,16 +28,16 @@ def maximum_likelihood(problem: Problem) -> Answer:
             warnings.simplefilter("ignore")  # of a search that has not converged: the figures show it
             fitted = UnobservedComponents(y, **_MODEL[law]).fit(disp=False, maxiter=200)
         ln_likelihood[law] = float(fitted.llf) - y.size * math.log(scale)
-        found = np.asarray(fitted.params, dtype=float)
+        parameters = np.asarray(fitted.params, dtype=float)
         try:
             covariance = np.asarray(fitted.cov_params(), dtype=float)
         except (np.linalg.LinAlgError, ValueError):
-            covariance = np.full((found.size, found.size), math.nan)
-        estimates[law] = _continuous(law, found, covariance, scale, problem.dt_s)
+            covariance = np.full((parameters.size, parameters.size), math.nan)
+        estimates[law] = _continuous(law, parameters, covariance, scale, problem.dt_s)
     return Answer(estimates, information_criteria(ln_likelihood, y.size))
 
 
-def _continuous(law: str, found: Floats, covariance: Floats, scale: float, dt_s: float) -> dict[str, Value]:
+def _continuous(law: str, fitted: Floats, covariance: Floats, scale: float, dt_s: float) -> dict[str, Value]:
     """Parameters of continuous time; the interval by the derivatives of their logarithms."""
 
     def ln_of(p: Floats) -> Floats:
@@ -49,10 +49,10 @@ def _continuous(law: str, found: Floats, covariance: Floats, scale: float, dt_s:
         variance, phi = p[1], p[2]
         return np.array([N, 0.5 * _ln(variance * scale**2 / (1.0 - phi**2)), _ln(-_ln(phi) / dt_s)])
 
-    slope = _derivative(ln_of, found)
+    slope = _derivative(ln_of, fitted)
     return {
         name: value if math.isfinite(value.value) and value.value > 0.0 else Value(math.nan)
-        for name, value in logarithmic(NAMED[law].parameters, ln_of(found), slope @ covariance @ slope.T).items()
+        for name, value in logarithmic(NAMED[law].parameters, ln_of(fitted), slope @ covariance @ slope.T).items()
     }
 
 
@@ -61,6 +61,6 @@ def _ln(value: float) -> float:
     return math.log(value) if value > 0.0 else math.nan
 
 
-def _derivative(function: Callable[[Floats], Floats], at: Floats) -> Floats:
-    steps = np.diag(1e-5 * np.abs(at) + 1e-12)
-    return np.array([(function(at + s) - function(at - s)) / (2.0 * s.sum()) for s in steps]).T
+def _derivative(function: Callable[[Floats], Floats], theta: Floats) -> Floats:
+    steps = np.diag(1e-5 * np.abs(theta) + 1e-12)
+    return np.array([(function(theta + s) - function(theta - s)) / (2.0 * s.sum()) for s in steps]).T

@@ -64,18 +64,18 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
 def kalman_filter(problem: Problem, law: str, theta: Floats) -> KalmanFilter:
     """Level and drift at one node."""
     dt = problem.dt_s
-    found = KalmanFilter(dim_x=2, dim_z=1)
-    found.H = np.ones((1, 2))
-    found.R = np.array([[theta[0] ** 2 / dt]])
-    found.P = np.diag([(LEVEL_SD * float(problem.y.std())) ** 2, 0.0])
-    found.Q = np.zeros((2, 2))
+    kalman = KalmanFilter(dim_x=2, dim_z=1)
+    kalman.H = np.ones((1, 2))
+    kalman.R = np.array([[theta[0] ** 2 / dt]])
+    kalman.P = np.diag([(LEVEL_SD * float(problem.y.std())) ** 2, 0.0])
+    kalman.Q = np.zeros((2, 2))
     if law == "random_walk":
-        found.Q[1, 1] = theta[1] ** 2 * dt
+        kalman.Q[1, 1] = theta[1] ** 2 * dt
     elif law == "gauss_markov":
-        found.F = np.diag([1.0, math.exp(-theta[2] * dt)])
-        found.Q[1, 1] = theta[1] ** 2 * -math.expm1(-2.0 * theta[2] * dt)
-        found.P[1, 1] = theta[1] ** 2
-    return found
+        kalman.F = np.diag([1.0, math.exp(-theta[2] * dt)])
+        kalman.Q[1, 1] = theta[1] ** 2 * -math.expm1(-2.0 * theta[2] * dt)
+        kalman.P[1, 1] = theta[1] ** 2
+    return kalman
 
 
 def estimates(problem: Problem, law: str, theta: Floats, weight: Floats) -> dict[str, Value]:
@@ -84,10 +84,10 @@ def estimates(problem: Problem, law: str, theta: Floats, weight: Floats) -> dict
     if not weight.any():
         return {name: Value(math.nan) for name in NAMED[law].parameters}
     mass = weight / weight.sum()
-    found = {"N": Value(float(mass @ theta[0]))}
+    parameters = {"N": Value(float(mass @ theta[0]))}
     shape = NODES[law]
     for k, (name, edge) in enumerate(zip(NAMED[law].parameters[1:], edges(problem, law), strict=True)):
         along = mass.reshape(shape).sum(axis=tuple(j for j in range(len(shape)) if j != k))
         reached = np.concatenate([[0.0], np.cumsum(along)])
-        found[name] = Value(*np.exp(np.interp([0.5, 0.05, 0.95], reached, edge)).tolist())
-    return found
+        parameters[name] = Value(*np.exp(np.interp([0.5, 0.05, 0.95], reached, edge)).tolist())
+    return parameters

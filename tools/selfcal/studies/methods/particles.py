@@ -90,13 +90,13 @@ def step(
 
 def transition(problem: Problem, law: str, ln_theta: Floats) -> tuple[Floats, Floats]:
     """What remains of the drift after a sample, and the variance of what is added, at parameters [d, m]."""
-    one = np.ones(ln_theta.shape[1:])
+    ones = np.ones(ln_theta.shape[1:])
     if law == "random_walk":
-        return one, np.exp(2.0 * ln_theta[1]) * problem.dt_s
+        return ones, np.exp(2.0 * ln_theta[1]) * problem.dt_s
     if law == "gauss_markov":
         rate = np.exp(ln_theta[2]) * problem.dt_s
         return np.exp(-rate), np.exp(2.0 * ln_theta[1]) * -np.expm1(-2.0 * rate)
-    return one, 0.0 * one
+    return ones, 0.0 * ones
 
 
 def _draw(prior: Prior, rng: np.random.Generator) -> Floats:

@@ -17,7 +17,7 @@ def arma(problem: Problem) -> Answer:
     """Estimates without an interval: the coefficients' own is not one of N, K, sigma_m or alpha."""
     y, dt = problem.y - problem.y.mean(), problem.dt_s
     scale = float(y.std()) or 1.0
-    found: dict[str, dict[str, Value]] = {}
+    by_law: dict[str, dict[str, Value]] = {}
     for law in problem.drifts:
         if law not in _ORDER:
             continue
@@ -25,5 +25,5 @@ def arma(problem: Problem) -> Answer:
             warnings.simplefilter("ignore")  # of a search that has not converged: the figures show it
             model = ARIMA(y / scale, order=_ORDER[law], trend="c" if law == "gauss_markov" else "n")
             p = dict(zip(model.param_names, np.asarray(model.fit().params, dtype=float).tolist(), strict=True))
-        found[law] = of_coefficients(law, p.get("ar.L1", 1.0), p["ma.L1"], p["sigma2"] * scale**2, dt)
-    return Answer(found)
+        by_law[law] = of_coefficients(law, p.get("ar.L1", 1.0), p["ma.L1"], p["sigma2"] * scale**2, dt)
+    return Answer(by_law)

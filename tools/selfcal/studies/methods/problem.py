@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 REACH = 1e5
 #: Step of a derivative, in the logarithm of a parameter: a tenth of the least posterior sd at 3000 samples.
 STEP = 1e-3
-#: A Kalman filter with a level begins at the first reading, with an sd of this many times the record's.
+#: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
 LEVEL_SD = 10.0
 
 
@@ -91,23 +91,23 @@ class Peak:
 
 def logarithmic(names: Sequence[str], ln_value: Floats, covariance: Floats) -> dict[str, Value]:
     """Estimates from logarithms and their covariance. A variance that is not positive gives no interval."""
-    found = {}
+    values = {}
     for k, name in enumerate(names):
         variance = float(covariance[k, k])
         half = HALF_90 * math.sqrt(variance) if variance > 0.0 else math.nan
         ln = float(ln_value[k])
-        found[name] = Value(_exp(ln), _exp(ln - half), _exp(ln + half))
-    return found
+        values[name] = Value(_exp(ln), _exp(ln - half), _exp(ln + half))
+    return values
 
 
 def weighted(names: Sequence[str], ln_theta: Floats, weight: Floats) -> dict[str, Value]:
     """Weighted medians with 5 % and 95 % points of ln parameters [d, m]; `weight` [m] sums to 1."""
-    found = {}
+    parameters = {}
     for name, column in zip(names, ln_theta, strict=True):
-        values, place = np.unique(column, return_inverse=True)
-        mass = np.bincount(place, weight)
-        found[name] = Value(*np.exp(np.interp([0.5, 0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)).tolist())
-    return found
+        values, index = np.unique(column, return_inverse=True)
+        mass = np.bincount(index, weight)
+        parameters[name] = Value(*np.exp(np.interp([0.5, 0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)).tolist())
+    return parameters
 
 
 def ln_moments(prior: Prior) -> tuple[float, float]:
@@ -131,32 +131,34 @@ def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> P
     for start in starts:
         bounds = [(value - reach, value + reach) for value in start]
         with np.errstate(all="ignore"):
-            found = optimize.minimize(lambda at: -_finite(objective(at)), start, method="L-BFGS-B", bounds=bounds)
-        if best is None or -found.fun > best[0]:
-            best = (-float(found.fun), np.asarray(found.x))
+            optimum = optimize.minimize(
+                lambda theta: -_finite(objective(theta)), start, method="L-BFGS-B", bounds=bounds
+            )
+        if best is None or -optimum.fun > best[0]:
+            best = (-float(optimum.fun), np.asarray(optimum.x))
     assert best is not None
     with np.errstate(all="ignore"):
         curvature = -hessian(objective, best[1])
     return Peak(best[1], best[0], inverse(curvature))
 
 
-def hessian(objective: Callable[[Floats], float], at: Floats) -> Floats:
+def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
     """Second derivatives by central differences."""
-    d = at.size
+    d = theta.size
     step = np.eye(d) * STEP * 10.0
-    found = np.empty((d, d))
+    matrix = np.empty((d, d))
     for i in range(d):
         for j in range(i, d):
             values = [
-                objective(at + a * step[i] + b * step[j])
+                objective(theta + a * step[i] + b * step[j])
                 for a, b in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
             ]
-            found[i, j] = found[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * (STEP * 10.0) ** 2)
-    return found
+            matrix[i, j] = matrix[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * (STEP * 10.0) ** 2)
+    return matrix
 
 
 def inverse(information: Floats) -> Floats:
-    """The inverse of a positive definite matrix; NaN if it is none: the record does not determine the parameters."""
+    """The inverse of a positive definite matrix; NaN for another one: the record does not determine the parameters."""
     try:
         np.linalg.cholesky(information)
     except np.linalg.LinAlgError:

@@ -15,7 +15,7 @@ from selfcal.studies.methods.problem import Answer, Floats, Problem
 
 #: Start of the covariance of the coefficients: a thousand times their greatest square.
 START = 1e3
-#: What the first sample forgets, and how much of this each further sample keeps: the early errors are poor.
+#: Forgetting of the first sample, and the share that each further sample keeps of it: the early errors are poor.
 FORGET, KEEP = 0.05, 0.99
 #: A root of the error polynomial beyond it has no stable filter.
 STABLE = 0.99
@@ -23,13 +23,13 @@ STABLE = 0.99
 
 def recursive_least_squares(problem: Problem) -> Answer:
     """Estimates without an interval, as for `arma`. The method gives no weights of laws."""
-    found = {}
+    by_law = {}
     for law in problem.drifts:
         y = np.diff(problem.y) if law == "random_walk" else problem.y - problem.y.mean()
         scale = float(y.std()) or 1.0
         phi, theta, variance = coefficients(y / scale, pole=law != "random_walk")
-        found[law] = of_coefficients(law, phi, theta, variance * scale**2, problem.dt_s)
-    return Answer(found)
+        by_law[law] = of_coefficients(law, phi, theta, variance * scale**2, problem.dt_s)
+    return Answer(by_law)
 
 
 def coefficients(y: Floats, *, pole: bool) -> tuple[float, float, float]:

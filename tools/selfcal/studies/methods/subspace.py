@@ -22,11 +22,11 @@ def subspace(problem: Problem) -> Answer:
     """Estimates without an interval. The method gives no weights of laws."""
     y = problem.y - problem.y.mean()
     phi, gain, variance = realization(y, lags(y))
-    found = {}
+    by_law = {}
     for law in problem.drifts:
         pole = 1.0 if law == "random_walk" else phi
-        found[law] = of_coefficients(law, pole, gain - pole, variance, problem.dt_s)
-    return Answer(found)
+        by_law[law] = of_coefficients(law, pole, gain - pole, variance, problem.dt_s)
+    return Answer(by_law)
 
 
 def lags(y: Floats) -> int:

@@ -25,15 +25,15 @@ _SECOND = ((0, 1.0), (1, -2.0), (2, 1.0))
 def covariance(terms: Terms, m: Floats, n: int) -> Floats:
     """Of the overlapping Allan variances [t, t] at `m` readings of a normal record of `n`: twice the sum of the squared
     covariances of the differences behind them."""
-    found = np.empty((m.size, m.size))
+    covariance = np.empty((m.size, m.size))
     for i, a in enumerate(m.tolist()):
         for k, b in enumerate(m.tolist()[: i + 1]):
             first, second = n - 2 * int(a) + 1, n - 2 * int(b) + 1
             lag = np.arange(-(first - 1), second, dtype=float)
             cross = sum(p * q * terms.sums(lag + (v * b - u * a)) for u, p in _SECOND for v, q in _SECOND) / (a * b)
             pairs = np.minimum(np.minimum(lag + first, second - lag), min(first, second))
-            found[i, k] = found[k, i] = 0.5 * float((pairs * cross**2).sum()) / (first * second)
-    return found
+            covariance[i, k] = covariance[k, i] = 0.5 * float((pairs * cross**2).sum()) / (first * second)
+    return covariance
 
 
 def gmwm(problem: Problem) -> Answer:
@@ -42,7 +42,7 @@ def gmwm(problem: Problem) -> Answer:
     m = 2.0 ** np.arange(max(1, math.floor(math.log2(max(2, y.size // WINDOWS))) + 1), dtype=np.float64)
     variance = np.array([overlapping(y, int(length))[0] for length in m.tolist()])
     own = np.diag(y.size / (2.0 * m * variance**2))
-    found: dict[str, dict[str, Value]] = {}
+    by_law: dict[str, dict[str, Value]] = {}
     for law in problem.laws:
         if m.size < len(NAMED[law].parameters):
             continue
@@ -57,9 +57,9 @@ def gmwm(problem: Problem) -> Answer:
         first = maximum(partial(objective, own), problem.starts(law))
         weight = inverse(covariance(problem.terms(law, first.at), m, y.size))
         if not np.isfinite(weight).all():
-            found[law] = {name: Value(value.value) for name, value in first.values(law).items()}
+            by_law[law] = {name: Value(value.value) for name, value in first.values(law).items()}
             continue
-        at = maximum(partial(objective, weight), [first.at]).at
-        jacobian = np.array([(model(at + s) - model(at - s)) / (2.0 * STEP) for s in np.eye(at.size) * STEP])
-        found[law] = logarithmic(NAMED[law].parameters, at, inverse(jacobian @ weight @ jacobian.T))
-    return Answer(found)
+        theta = maximum(partial(objective, weight), [first.at]).at
+        jacobian = np.array([(model(theta + s) - model(theta - s)) / (2.0 * STEP) for s in np.eye(theta.size) * STEP])
+        by_law[law] = logarithmic(NAMED[law].parameters, theta, inverse(jacobian @ weight @ jacobian.T))
+    return Answer(by_law)

@@ -22,11 +22,11 @@ from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import curve, fit
 from selfcal.studies.methods.problem import Problem
 from selfcal.studies.methods.whittle import whittle
-from selfcal.studies.paper_figures.told import Told
+from selfcal.studies.paper_figures.reproduction import Reproduction
 
 Floats = NDArray[np.float64]
 
-#: s, at which the bank reports: the ticks of the paper's axes (Fig. 1 to 600 s, Fig. 2 to 400 s), the T of its text,
+#: Times of the bank's reports, s: the ticks of the paper's axes (Fig. 1 to 600 s, Fig. 2 to 400 s), the T of its text,
 #: and times between. At 0 the prior holds.
 MARKS = (10, 20, 50, 100, 150, 200, 250, 300, 350, 400, 450, 500, 550, 600, 1000)
 #: False identification that the paper falls below, and its T.
@@ -52,12 +52,12 @@ def over_time(model: Model, axis: str, dt_s: float, y: Floats, marks: Sequence[i
 
     rate = 1.0 / dt_s
     bank = Bank(make_tables(model, rate, (axis,), bank_rate_hz=rate))
-    found, at = [], 0
+    reports, begin = [], 0
     for mark in marks:
-        bank.push(y[at:mark, None])
-        found.append(bank.report(0))
-        at = mark
-    return found
+        bank.push(y[begin:mark, None])
+        reports.append(bank.report(0))
+        begin = mark
+    return reports
 
 
 def own_seed(law: str, seed: int) -> int:
@@ -66,7 +66,7 @@ def own_seed(law: str, seed: int) -> int:
 
 
 def rows_of(model: Model, job: tuple[str, int]) -> list[Row]:
-    """A row for each mark of one record, and one of the prior, at 0."""
+    """A row for each mark of a record, and one of the prior, at 0."""
     law, seed = job
     group = model.group_of("gx")
     truth = draw(group, law, np.random.default_rng([seed, list(NAMED).index(law)]))
@@ -95,7 +95,7 @@ def ensemble(
     return spread(partial(rows_of, model), jobs, settings=settings, scheduler=scheduler, results=results)
 
 
-def figure_1(rows: Sequence[Row]) -> Told:
+def figure_1(rows: Sequence[Row]) -> Reproduction:
     """False identification, calculated (19) and actual (20)."""
     times = (0, *MARKS)
     t = np.array(times, dtype=float)
@@ -113,10 +113,10 @@ def figure_1(rows: Sequence[Row]) -> Told:
     )
     worst = float(np.max(np.abs(actual - calculated) / sd))
     below = (calculated < BELOW) & (actual < BELOW)
-    at = t[np.logical_and.accumulate(below[::-1])[::-1]]  # and stay there
-    here = f"both below 10 % from {at[0]:g} s on" if at.size else "not below 10 %"
+    below_s = t[np.logical_and.accumulate(below[::-1])[::-1]]  # and stay there
+    here = f"both below 10 % from {below_s[0]:g} s on" if below_s.size else "not below 10 %"
     some = [times.index(mark) for mark in (0, 100, 200, 300, 400, 600, TEXT_S)]
-    return Told(
+    return Reproduction(
         "Fig. 1",
         Figure(
             "Fig. 1",
@@ -133,15 +133,15 @@ def figure_1(rows: Sequence[Row]) -> Told:
     )
 
 
-def figure_2(rows: Sequence[Row]) -> Told:
+def figure_2(rows: Sequence[Row]) -> Reproduction:
     """Real (16) and calculated (17) rms errors under the second hypothesis."""
     times = (0, *(mark for mark in MARKS if mark <= FIGURE_2_S))
     t = np.array(times, dtype=float)
     mine = [[row for row in rows if row["t"] == mark and row["law"] == SECOND] for mark in times]
     panels, worst = [], 0.0
     for name, label in NAMES.items():
-        error = np.array([[row[f"mean.{name}"] - row[f"truth.{name}"] for row in at] for at in mine])
-        stated = np.array([[row[f"sd.{name}"] for row in at] for at in mine])
+        error = np.array([[row[f"mean.{name}"] - row[f"truth.{name}"] for row in rows_of] for rows_of in mine])
+        stated = np.array([[row[f"sd.{name}"] for row in rows_of] for rows_of in mine])
         real, calculated = np.sqrt((error**2).mean(axis=1)), np.sqrt((stated**2).mean(axis=1))
         sd = (error**2).std(axis=1) / math.sqrt(error.shape[1])  # of the mean square
         worst = max(worst, float(np.max(np.abs(real**2 - calculated**2) / sd)))
@@ -160,7 +160,7 @@ def figure_2(rows: Sequence[Row]) -> Told:
         )
     figures = [Figure(f"Fig. 2, {label.partition(',')[0]}", "", [panel]) for label, panel in panels]
     count = len(mine[0])
-    return Told(
+    return Reproduction(
         "Fig. 2",
         figures,
         "Real and calculated rms of σm, α and σv coincide over 400 s, from the priors' 0.43, 0.026 and 0.43 on.",
@@ -191,7 +191,7 @@ def choices(seed: int) -> dict[str, float]:
     return {tool: number / (CHOICES * len(ALIKE)) for tool, number in wrong.items()}
 
 
-def figures_3_and_4(seed: int) -> list[Told]:
+def figures_3_and_4(seed: int) -> list[Reproduction]:
     """Spectrum and Allan deviation of one record of each law with the true curves, and how well they choose a law."""
     group = Model.load(PAPER).group_of("gx")
     spectra: list[Panel] = []
@@ -214,7 +214,7 @@ def figures_3_and_4(seed: int) -> list[Told]:
     )
     wrong = choices(seed)
     return [
-        Told(
+        Reproduction(
             name,
             Figure(name, made, panels),
             f"The {many} of the two laws hardly differ, and give neither the law nor its parameters by themselves.",

@@ -19,12 +19,12 @@ from selfcal.model.tables import Tables, make_tables
 from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import fit
 from selfcal.studies.methods.problem import Problem, Value
+from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section3 import PAPER, over_time
-from selfcal.studies.paper_figures.told import Told
 
 Floats = NDArray[np.float64]
 
-AXIS, UNIT = "ax", "m/s²"
+AXIS = "ax"
 #: The paper's result, of which the simulated records are made: m/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
 PAPER_N, PAPER_K = 0.025, 2e-4
 #: Units of the pictures, with the size of one, and the paper's value.
@@ -106,24 +106,26 @@ def _rms(values: Sequence[Sequence[float]], stated: Sequence[Sequence[float]], t
 def by_bank(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
     """Errors of the bank by (law that it filters for, parameter that the truth has), on an ensemble of `law`."""
     seen = [over_time(model, AXIS, 1.0, y, ALLAN_MARKS) for y in _drawn(law, TRUTHS[law], seed, SCATTER)]
-    found = {}
+    by_law = {}
     for filtered in model.hypotheses:
         for name, true in _compared(law, TRUTHS[law], filtered).items():
-            estimates = [[one.parameters[filtered][name] for one in reports] for reports in seen]
+            estimates = [[report.parameters[filtered][name] for report in reports] for reports in seen]
             medians, stated = ([[getattr(e, key) for e in row] for row in estimates] for key in ("median", "ln_sd"))
-            found[filtered, name] = _rms(medians, stated, true)
-    return found
+            by_law[filtered, name] = _rms(medians, stated, true)
+    return by_law
 
 
 def linear(model: Model, truth: Mapping[str, float], seed: int) -> dict[str, Rms]:
     """Real (16) and computed (17) rms errors of the walk's parameters, in their units, on an ensemble of `truth`."""
     drawn = _drawn("random_walk", truth, seed, SCATTER)
     seen = [[r.parameters["random_walk"] for r in over_time(model, AXIS, 1.0, y, ALLAN_MARKS)] for y in drawn]
-    found = {}
+    shares = {}
     for name, true in truth.items():
-        mean, sd = (np.array([[getattr(one[name], key) for one in row] for row in seen]) for key in ("mean", "sd"))
-        found[name] = Rms(np.sqrt(((mean - true) ** 2).mean(axis=0)), np.sqrt((sd**2).mean(axis=0)))
-    return found
+        mean, sd = (
+            np.array([[getattr(report[name], key) for report in row] for row in seen]) for key in ("mean", "sd")
+        )
+        shares[name] = Rms(np.sqrt(((mean - true) ** 2).mean(axis=0)), np.sqrt((sd**2).mean(axis=0)))
+    return shares
 
 
 def by_allan(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
@@ -132,12 +134,14 @@ def by_allan(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
     laws = tuple(model.hypotheses)
     drawn = _drawn(law, TRUTHS[law], seed, SCATTER)
     fits = [[fit(Problem(y[:mark], 1.0, group, laws)).estimates for mark in ALLAN_MARKS] for y in drawn]
-    found = {}
+    spreads = {}
     for filtered in laws:
         for name, true in _compared(law, TRUTHS[law], filtered).items():
-            values = [[_within(one[filtered][name].value, group.priors[name]) for one in row] for row in fits]
-            found[filtered, name] = _rms(values, [[_stated(one[filtered][name]) for one in row] for row in fits], true)
-    return found
+            values = [[_within(report[filtered][name].value, group.priors[name]) for report in row] for row in fits]
+            spreads[filtered, name] = _rms(
+                values, [[_stated(report[filtered][name]) for report in row] for row in fits], true
+            )
+    return spreads
 
 
 def _compared(law: str, truth: Mapping[str, float], filtered: str) -> dict[str, float]:
@@ -152,45 +156,45 @@ def _within(value: float, prior: Prior) -> float:
 
 def real(folder: Path, model: Model) -> dict[str, Floats]:
     """1 s means of the stretches; those whose file is absent are left out."""
-    found, loaded = {}, {}
+    records, loaded = {}, {}
     for name, start in STRETCHES:
-        place = folder / name
-        if not place.exists():
+        path = folder / name
+        if not path.exists():
             continue
         if name not in loaded:
-            loaded = {name: load(place)}
+            loaded = {name: load(path)}
         recording = loaded[name]
         samples = as_float(recording.in_unit(AXIS, "m/s^2")).astype(np.float64)
         block = round(recording.rate_hz)
         whole = samples[: samples.size // block * block].reshape(-1, block).mean(axis=1)
         run = name.removeprefix("adis16405_").removesuffix(".npz")
-        found[f"{run}, {start} s"] = whole[start : start + DURATION]
-    return found
+        records[f"{run}, {start} s"] = whole[start : start + DURATION]
+    return records
 
 
-def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Told]:
-    """Probability of the random walk, its parameters, and their rms, over time."""
-    reports = {name: over_time(model, AXIS, 1.0, y, MARKS) for name, y in records.items()}
+def _figure_5(
+    model: Model, records: Mapping[str, Floats], reports: Mapping[str, Sequence[AxisResult]], kind: str, where: str
+) -> Reproduction:
+    """Probability of the random walk over time. `reports` at MARKS; `kind`, `where`: words for the records."""
     t = np.array(MARKS, dtype=float)
-    kind = "real" if real_ones else "simulated with the paper's values"
     panels = [
         Panel(
             name,
             "time, s",
             "probability",
             [
-                Curve("random walk", t, np.array([one.probability["random_walk"] for one in seen])),
-                Curve("Gauss–Markov", t, np.array([one.probability["gauss_markov"] for one in seen]), "fitted"),
+                Curve("random walk", t, np.array([report.probability["random_walk"] for report in seen])),
+                Curve("Gauss–Markov", t, np.array([report.probability["gauss_markov"] for report in seen]), "fitted"),
             ],
         )
         for name, seen in reports.items()
     ]
     last = {name: seen[-1].probability["random_walk"] for name, seen in reports.items()}
     short = {name: over_time(short_memory(model), AXIS, 1.0, y, [DURATION])[0] for name, y in records.items()}
-    limited = ", ".join(f"{one.probability['random_walk']:.3f}" for one in short.values())
+    limited = ", ".join(f"{report.probability['random_walk']:.3f}" for report in short.values())
     ok = all(value > 0.9 for value in last.values())
-    fifth = Told(
-        f"Fig. 5, {'real' if real_ones else 'simulated'}",
+    return Reproduction(
+        f"Fig. 5, {where}",
         Figure(f"Fig. 5, {kind}", f"P(random walk) against Gauss–Markov, {AXIS}, {kind}.", panels),
         "The probability of the random walk goes to 1 on all four accelerometer records.",
         "After 3000 s: "
@@ -199,6 +203,13 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
         "agrees" if ok else "differs",
         "The default prior lets a Gauss–Markov drift last 5000 s, longer than the record: nearly a random walk.",
     )
+
+
+def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Reproduction]:
+    """Probability of the random walk, its parameters, and their rms, over time."""
+    reports = {name: over_time(model, AXIS, 1.0, y, MARKS) for name, y in records.items()}
+    t = np.array(MARKS, dtype=float)
+    kind = "real" if real_ones else "simulated with the paper's values"
     figures = []
     for letter, (name, (_, scale, paper_value)) in zip("ab", SHOWN.items(), strict=True):
         line = [] if real_ones else [Curve("the paper", t[[0, -1]], np.full(2, paper_value / scale), "fitted")]
@@ -232,8 +243,8 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
             for title, seen in reports.items()
         ]
         about = "the medians of the four records" if real_ones else "the paper's values"
-        told = f"({letter}) {name}: the bank's own sd, beside the real rms error of simulated records with {about}."
-        rms_figures.append(Figure(f"Fig. 6 ({letter}), rms of {name}, {kind}", told, panels))
+        caption = f"({letter}) {name}: the bank's own sd, beside the real rms error of simulated records with {about}."
+        rms_figures.append(Figure(f"Fig. 6 ({letter}), rms of {name}, {kind}", caption, panels))
         ratio = rms.ratio
         said.append(
             f"{name}: computed {_span(sd[name])} at {DURATION} s; computed over real rms {_span(ratio)} at "
@@ -242,8 +253,8 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
     where = "real" if real_ones else "simulated"
     own = [float(errors[name].ratio[-1]) for name in SHOWN]
     return [
-        fifth,
-        Told(
+        _figure_5(model, records, reports, kind, where),
+        Reproduction(
             f"Fig. 6 (a, b), {where}",
             figures,
             "N 0.025 (m/s²)/√Hz and K 2e-4 (m/s³)/√Hz, nearly the same in the four records.",
@@ -251,7 +262,7 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
             "agrees" if consistent else "differs",
             "" if consistent else "The stretches are parts of three runs, whose drift is not one walk (see Fig. 5).",
         ),
-        Told(
+        Reproduction(
             f"Fig. 6 (c, d), {where}",
             rms_figures,
             f"The computed rms falls over time, to {PAPER_N_SD:g} (m/s²)/√Hz of N and 6e-5 (m/s³)/√Hz of K.",
@@ -280,7 +291,7 @@ def _parameter(title: str, seen: Sequence[AxisResult], name: str, t: Floats, lin
     return Panel(title, "time, s", unit, curves, [Band("5 to 95 %", t, low, high, "spread")], log_y=name == "K")
 
 
-def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[Told]:
+def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[Reproduction]:
     """N and K by the Allan variance; the rms that it computes against the real one; and both on the other law."""
     group = replace(model.group_of(AXIS), axes=(AXIS,))
     t = np.array(ALLAN_MARKS, dtype=float)
@@ -299,17 +310,17 @@ def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[To
                     y = np.array([_within(value[name].value, group.priors[name]) for value in values])
                     panels.append(Panel(title, "time, s", unit, [Curve("Allan fit", t, y / scale)], log_y=name == "K"))
             if panels:
-                told = f"{name} by a weighted fit of the Allan deviation, kept within the bank's prior."
+                caption = f"{name} by a weighted fit of the Allan deviation, kept within the bank's prior."
                 figure = f"Fig. 7 ({'a' if name == 'N' else 'b'}), {name}, {'real' if kind == 'run' else kind}"
-                estimates.append(Figure(figure, told, panels))
+                estimates.append(Figure(figure, caption, panels))
         panels = []
         for method, errors in (("Allan fit", allan), ("bank", bank)):
-            one = errors["random_walk"]["random_walk", name]
-            curves = [Curve("real", t, one.real), Curve("computed", t, one.computed, "fitted")]
+            errors_of = errors["random_walk"]["random_walk", name]
+            curves = [Curve("real", t, errors_of.real), Curve("computed", t, errors_of.computed, "fitted")]
             panels.append(Panel(method, "time, s", f"rms of ln {name}", curves, log_y=True))
         letter = "c" if name == "N" else "d"
-        told = f"({letter}) rms of ln {name} over {SCATTER} simulated records with the paper's values."
-        rms.append(Figure(f"Fig. 7 ({letter}), rms of {name}", told, panels))
+        caption = f"({letter}) rms of ln {name} over {SCATTER} simulated records with the paper's values."
+        rms.append(Figure(f"Fig. 7 ({letter}), rms of {name}", caption, panels))
         ours, theirs = (errors["random_walk"]["random_walk", name] for errors in (bank, allan))
         said.append(
             f"{name}: the Allan fit's real error is {_span(theirs.real / ours.real)} times the bank's; computed over "
@@ -318,7 +329,7 @@ def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[To
     K = allan["random_walk"]["random_walk", "K"]
     small = float(np.median(K.ratio)) < 1.0 / NEAR
     slower = float(np.median(K.real / bank["random_walk"]["random_walk", "K"].real)) > 1.0
-    seventh = Told(
+    seventh = Reproduction(
         "Fig. 7",
         [*estimates, *rms],
         "The same values at the end, slower to settle, rougher; the computed rms is too small for the real scatter.",
@@ -333,7 +344,7 @@ def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[To
 
 def _both_ways(
     allan: Mapping[str, Mapping[tuple[str, str], Rms]], bank: Mapping[str, Mapping[tuple[str, str], Rms]], t: Floats
-) -> Told:
+) -> Reproduction:
     """The claim of Fig. 7 on both truths, for the right law and the wrong one."""
     panels: dict[str, list[Panel]] = {"N": [], "drift": []}
     said: list[str] = []
@@ -360,7 +371,7 @@ def _both_ways(
         for key, shown in panels.items()
     ]
     agrees = all(theirs < ours and 1.0 / NEAR < ours < NEAR for theirs, ours in right)
-    return Told(
+    return Reproduction(
         "Fig. 7, both ways",
         figures,
         "The Allan variance's computed rms is smaller than its real error, the bank's is consistent.",
@@ -394,9 +405,9 @@ def of_map_error(tables: Tables, y: Floats) -> tuple[float, tuple[float, float, 
     return report.probability["gauss_markov"], (rms / MGAL, 1.0 / alpha / 60.0, noise / MGAL / math.sqrt(AREA_STEP_S))
 
 
-def figure_8(model: Model, seed: int) -> Told:
+def figure_8(model: Model, seed: int) -> Reproduction:
     """Shares of the records for which Gauss-Markov is the more probable, and the parameters found."""
-    shares, correct, found = {}, [], {}
+    shares, correct, fits = {}, [], {}
     rate = 1.0 / AREA_STEP_S
     tables = map_tables(model)
     for number, (area, (rms, minutes, noise)) in enumerate(AREAS.items()):
@@ -413,11 +424,11 @@ def figure_8(model: Model, seed: int) -> Told:
             chosen += p > 0.5
             correct.append(max(p, 1.0 - p))
             estimates.append(estimate)
-        shares[area], found[area] = 100.0 * chosen / AREA_RECORDS, np.array(estimates)
+        shares[area], fits[area] = 100.0 * chosen / AREA_RECORDS, np.array(estimates)
     figures = []
     for column, (what, limit) in enumerate((("process rms", "σm"), ("white noise", "N"))):
         panels = []
-        for area, values in found.items():
+        for area, values in fits.items():
             rms, minutes, noise = AREAS[area]
             interval = np.sort(values[:, 1])[[0, -1]]
             panels.append(
@@ -438,12 +449,12 @@ def figure_8(model: Model, seed: int) -> Told:
         figures.append(
             Figure(f"Fig. 8, {what}", f"{limit} over the correlation interval, {AREA_RECORDS} records an area.", panels)
         )
-    medians = {area: np.median(values, axis=0) for area, values in found.items()}
+    medians = {area: np.median(values, axis=0) for area, values in fits.items()}
     negligible = all(noise < 0.1 * rms for rms, _, noise in medians.values())
     paper_shares = ", ".join(f"{share}" for share in PAPER_SHARES.values())
     sure = 100.0 * float(np.mean(correct))
     agrees = sure >= 95.0 and negligible
-    return Told(
+    return Reproduction(
         "Fig. 8 and the shares",
         figures,
         f"Gauss–Markov is the more probable in {paper_shares} % of the records, the mean calculated probability of "

@@ -23,8 +23,8 @@ from selfcal.base.output import check_place
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.show.chart import Curve, Figure, Panel
+from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section4 import AREA_SAMPLES, AREA_STEP_S, MGAL, map_tables, of_map_error
-from selfcal.studies.paper_figures.told import Told
 
 Floats = NDArray[np.float64]
 
@@ -75,18 +75,18 @@ def write_tracks(folder: Path, areas: Mapping[str, Floats]) -> None:
     except OSError as error:
         raise UserError(f"--tracks {folder}: cannot make this folder ({error.strerror})") from error
     for area, errors in areas.items():
-        for k, one in enumerate(errors, start=1):
-            place = folder / f"{area.replace(' ', '-')}-track-{k:02d}.csv"
-            check_place(place)
-            save(place, {"gravity": ("mGal", one)}, 1.0 / AREA_STEP_S, t=AREA_STEP_S * np.arange(one.size))
+        for k, track in enumerate(errors, start=1):
+            path = folder / f"{area.replace(' ', '-')}-track-{k:02d}.csv"
+            check_place(path)
+            save(path, {"gravity": ("mGal", track)}, 1.0 / AREA_STEP_S, t=AREA_STEP_S * np.arange(track.size))
 
 
-def figure(model: Model, areas: Mapping[str, Floats]) -> Told:
+def figure(model: Model, areas: Mapping[str, Floats]) -> Reproduction:
     """The law of the errors by area, and whether more tracks make them smaller and longer."""
     tables = map_tables(model)
-    found = {area: [of_map_error(tables, MGAL * one) for one in errors] for area, errors in areas.items()}
-    shares = {area: 100.0 * float(np.mean([p > 0.5 for p, _ in each])) for area, each in found.items()}
-    estimates = {area: np.array([estimate for _, estimate in each]) for area, each in found.items()}
+    fits = {area: [of_map_error(tables, MGAL * error) for error in errors] for area, errors in areas.items()}
+    shares = {area: 100.0 * float(np.mean([p > 0.5 for p, _ in each])) for area, each in fits.items()}
+    estimates = {area: np.array([estimate for _, estimate in each]) for area, each in fits.items()}
     medians = np.array([np.median(values, axis=0) for values in estimates.values()])
     ends = (next(iter(areas)), list(areas)[-1])
     t = AREA_STEP_S / 3600.0 * np.arange(AREA_SAMPLES, dtype=np.float64)
@@ -119,8 +119,8 @@ def figure(model: Model, areas: Mapping[str, Floats]) -> Told:
     ]
     falls = medians[-1] < medians[0]
     agrees = bool(min(shares.values()) > 50.0 and falls[0] and falls[2] and not falls[1])
-    sure = 100.0 * float(np.mean([max(p, 1.0 - p) for each in found.values() for p, _ in each]))
-    return Told(
+    sure = 100.0 * float(np.mean([max(p, 1.0 - p) for each in fits.values() for p, _ in each]))
+    return Reproduction(
         "Section 4.2, one track left out",
         [errors, *by_area],
         "Gauss–Markov is the more probable in 78 to 100 % of an area's records; the more tracks, the lower the rms "

@@ -31,7 +31,7 @@ class Unit:
         self.device: str = source.device or known.get("serial", "") or stem(source.path)
         dated: str = source.recorded_at or known.get("recorded_at", "")
         self.moment = moment(dated)
-        #: A date of its metadata that is none.
+        #: Invalid date of its metadata.
         self.undated = dated if self.moment is None else ""
         self.recorded_at = dated if self.moment is not None else ""
         self.error: str | None = record.get("error")
@@ -51,8 +51,8 @@ class Unit:
 
     def causes(self, axis: str) -> list[str]:
         """The causes that `diagnose` finds on an axis."""
-        found: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get("causes", [])
-        return found
+        causes: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get("causes", [])
+        return causes
 
     def small(self, axis: str) -> set[str]:
         """Those of them that change no number by as much as matters."""
@@ -76,7 +76,7 @@ def bias_of(axis: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
-    """The rows of a recording. A recording, or an axis, without a result is one row with its `error`."""
+    """The rows of a recording. A recording, or an axis, without a result is a row with its `error`."""
     source = unit.source
     head = dict(zip(COLUMNS, (unit.device, source.path, unit.recorded_at, source.station, source.lot), strict=False))
     head |= {"sha256": source.sha256, "version": version}
@@ -92,7 +92,9 @@ def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
         unjudged = unit.record.get("diagnosis", {}).get(name, {}).get("error")
         known |= {} if unjudged is None else {"error": f"not diagnosed: {unjudged}"}
         coefficients = {
-            column: one for of in axis.get("regressors", {}).values() for column, one in of["coefficients"].items()
+            column: coefficient
+            for of in axis.get("regressors", {}).values()
+            for column, coefficient in of["coefficients"].items()
         }
         for parameter, estimate in {**axis["parameters"][law], **coefficients, "bias": bias_of(axis)}.items():
             numbers = {key: estimate[key] for key in ("median", "q05", "q95")}
@@ -126,7 +128,7 @@ def write_table(path: Path | str, rows: Iterator[dict[str, Any]]) -> None:
 
 
 def write_csv(path: Path | str, columns: Sequence[str], rows: Iterator[dict[str, Any]]) -> None:
-    """Write rows with these columns; one that is absent or None is an empty cell."""
+    """Write rows with these columns; a value that is absent or None is an empty cell."""
     with (
         whole(path) as temporary,
         temporary.open("w", newline="", encoding="utf-8", errors="backslashreplace") as stream,
@@ -138,7 +140,7 @@ def write_csv(path: Path | str, columns: Sequence[str], rows: Iterator[dict[str,
 
 
 def _sound(value: Any) -> Any:
-    """A text without what a file's name may have that is none."""
+    """A text without the lone surrogates of a file's name."""
     return value.encode("utf-8", "backslashreplace").decode() if isinstance(value, str) else value
 
 

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-from rich import box
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -17,20 +16,20 @@ from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.base import units
 from selfcal.base.errors import called, printable
-from selfcal.base.output import TABLE_WIDTH, console_of
+from selfcal.base.output import TABLE_WIDTH, console_of, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 
-#: Laws of smaller probability are not spoken of where the grid does not bear them.
+#: Least probability of a law that is named if the grid is too coarse for it.
 TOLD_OF = 0.01
-#: Stretches of motion that are listed at most.
+#: Most stretches of motion in a line.
 TIMES_MOST = 4
-#: Checks that state no cause, by the beginning of their names.
+#: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
-#: Jumps of two axes so close to each other, s, are one event.
+#: Largest distance of jumps of one event, s.
 ONE_EVENT_S = 30.0
 
 
@@ -55,7 +54,7 @@ def show(
     summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
     laws = _fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
-    first.title, first.title_justify = title, "left"
+    first.title = title
     if numbered:
         console.print(summary)
     console.print(laws)
@@ -66,11 +65,11 @@ def show(
 
 
 def _fitting(console: Console, tables: Sequence[Table]) -> Table:
-    """The first of `tables` that the terminal is wide enough for, else the last; the first where there is none."""
+    """The first of `tables` that the terminal is wide enough for, else the last; without a terminal the first."""
     if not console.is_terminal:
         return tables[0]
     wide = console.options.update(width=10 * TABLE_WIDTH)
-    fitting = (one for one in tables if console.measure(one, options=wide).maximum <= console.width)
+    fitting = (table for table in tables if console.measure(table, options=wide).maximum <= console.width)
     return next(fitting, tables[-1])
 
 
@@ -85,9 +84,8 @@ _NUMBERS = {
 
 def _summary_table(axes: Mapping[str, Any], left_out: int) -> Table:
     """The numbers of a data sheet; without the intervals of the last `left_out` columns."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=left_out == 0, collapse_padding=left_out > 0)
-    for heading in ("axis", "", "in the recording's units", "as in data sheets"):
-        table.add_column(heading, no_wrap=True)
+    headings = ("axis", "", "in the recording's units", "as in data sheets")
+    table = table_of(headings, pad_edge=left_out == 0, collapse_padding=left_out > 0)
     for name, axis in axes.items():
         unit = axis["bias_now"]["unit"]
         kind = next((k for k, of in enumerate(("rad/s", "m/s^2")) if units.same_kind(unit, of)), 2)
@@ -112,22 +110,22 @@ def _number(spread: Mapping[str, Any], number: Mapping[str, Any], *, brief: bool
 
 
 def _by_reason(axes: Iterable[tuple[Reason, str]]) -> dict[Reason, str]:
-    """The axes that share a reason, in one text. `axes`: each reason with the name of its axis."""
-    found: dict[Reason, list[str]] = {}
+    """Names of the axes of each reason. `axes`: each reason with the name of its axis."""
+    names_of: dict[Reason, list[str]] = {}
     for reason, name in axes:
-        found.setdefault(reason, []).append(name)
-    return {reason: ", ".join(names) for reason, names in found.items()}
+        names_of.setdefault(reason, []).append(name)
+    return {reason: ", ".join(names) for reason, names in names_of.items()}
 
 
 def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     """Why numbers of the summary are not identified, a line a reason."""
-    found = _by_reason(
+    by_reason = _by_reason(
         ((_NUMBERS[key][0], number["reason"]), name)
         for name, axis in axes.items()
         for key, number in (axis.get("summary") or {}).items()
         if not number["identified"]
     )
-    lines = [f"{what} not identified: {names}: {reason}" for (what, reason), names in found.items()]
+    lines = [f"{what} not identified: {names}: {reason}" for (what, reason), names in by_reason.items()]
     for name, axis in axes.items():
         for parameter, rest_s in axis.get("halved_after_s", {}).items():
             times = f"not even {MOST_REST:g} times this rest halves"
@@ -171,11 +169,11 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
             more = len(outcome["intervals"]) - TIMES_MOST
             return f"{check}, left out: {times}{f' and {more} more' if more > 0 else ''}"
         case "channel":
-            told = f"{outcome['column']} ({outcome['form']}) explains {nats} nats of it"
-            return f"channel: {told}: N, K and the bias include that"
+            text = f"{outcome['column']} ({outcome['form']}) explains {nats} nats of it"
+            return f"channel: {text}: N, K and the bias include that"
         case "turn_on":
-            told = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {nats} nats"
-            return f"turn_on: {told}: K includes that"
+            text = f"a bias that settles within {outcome['tau_s']:.3g} s or so, by {nats} nats"
+            return f"turn_on: {text}: K includes that"
         case "jump":
             return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {nats} nats: K includes that"
     return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
@@ -184,19 +182,13 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
     """The table without the intervals of its last `left_out` columns."""
     brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        collapse_padding=left_out > 0,
-        pad_edge=left_out == 0,
-        caption=f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
-        "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else ""),
-        caption_justify="left",
-    )
     known = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
     drift = "K or sigma_m" if "B" not in known else "K, sigma_m or B"
     second = "1/alpha, s" + (", or ratio" if known & set(RATIOS) else "")
-    for heading in ("law", "P", "N", drift, second):
-        table.add_column(heading, no_wrap=True)
+    caption = f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
+    caption += "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else "")
+    headings = ("law", "P", "N", drift, second)
+    table = table_of(headings, caption=caption, collapse_padding=left_out > 0, pad_edge=left_out == 0)
     for name, axis in axes.items():
         best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
         bias = axis["bias_now"]
@@ -261,8 +253,8 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
     for name, axis in axes.items():
         if "more_laws" in axis:
             laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]
-            told = ", ".join(f"{law} {P:.2g}" for law, P in laws)
-            failed.append(f"with the laws of sums.yaml: {name}: {told}")
+            likeliest = ", ".join(f"{law} {P:.2g}" for law, P in laws)
+            failed.append(f"with the laws of sums.yaml: {name}: {likeliest}")
     if any(line.startswith("not adequate") for line in failed):
         there = Path(recording["path"]).exists() or recording.get("paths")
         typed = f"{called()} diagnose {as_typed(recording)}" if there else "selfcal.diagnose() of the same readings"
@@ -272,52 +264,54 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
 
 
 def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
-    """What speaks against the laws: a line an event or source. The statistics of an axis that shows one are its own."""
-    found: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
+    """Evidence against the laws: a line an event or source, which covers the statistics of its axes."""
+    events: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
     named: set[str] = set()
     for name, axis in axes.items():
         for check, outcome in axis["checks"].items():
             if outcome["passed"] or check.startswith(STATISTICS):
                 continue
             named.add(name)
-            known = next((one for one in found if one[0] == check and _one(check, one[2][0], outcome)), None)
+            known = next((event for event in events if event[0] == check and _same(check, event[2][0], outcome)), None)
             if known is None:
-                found.append((check, [name], [outcome]))
+                events.append((check, [name], [outcome]))
             else:
                 known[1].append(name)
                 known[2].append(outcome)
     lines = []
-    for check, names, outcomes in found:
-        values = [f"{one['value']:.0f}" for one in sorted(outcomes, key=lambda one: float(one["value"]))]
+    for check, names, outcomes in events:
+        values = [
+            f"{outcome['value']:.0f}" for outcome in sorted(outcomes, key=lambda outcome: float(outcome["value"]))
+        ]
         nats = values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
-        told = _why(check, outcomes[0], axes[names[0]]["bias_now"]["unit"], nats)
-        lines.append(f"not adequate: {', '.join(names)}: {told}")
+        text = _why(check, outcomes[0], axes[names[0]]["bias_now"]["unit"], nats)
+        lines.append(f"not adequate: {', '.join(names)}: {text}")
     beside = []
     for name, axis in axes.items():
-        failed = {check: one for check, one in axis["checks"].items() if not one["passed"]}
+        failed = {check: outcome for check, outcome in axis["checks"].items() if not outcome["passed"]}
         unit = axis["bias_now"]["unit"]
         # The model's deviation over the recording's, by averaging time.
         off = [
-            (100.0 * one["value"], check.removeprefix("allan_"))
-            for check, one in failed.items()
+            (100.0 * outcome["value"], check.removeprefix("allan_"))
+            for check, outcome in failed.items()
             if check.startswith("allan_")
         ]
         if name in named:
-            most, at = max(off, key=lambda one: abs(one[0]), default=(0.0, ""))
+            most, tau = max(off, key=lambda share: abs(share[0]), default=(0.0, ""))
             if any(check.startswith(STATISTICS) for check in failed):
-                beside.append(name + (f" (allan_{at} model {most:+.0f} %)" if off else ""))
+                beside.append(name + (f" (allan_{tau} model {most:+.0f} %)" if off else ""))
             continue
-        own = [_why(check, one, unit, "") for check, one in failed.items() if not check.startswith("allan_")]
+        own = [_why(check, outcome, unit, "") for check, outcome in failed.items() if not check.startswith("allan_")]
         if off:  # allan_16s model -9 %, 128s +22 %
-            own.append("allan_" + ", ".join(f"{at} {most:+.0f} %" for most, at in off).replace(" ", " model ", 1))
-        lines += [f"not adequate: {name}: {told}" for told in own]
+            own.append("allan_" + ", ".join(f"{tau} {most:+.0f} %" for most, tau in off).replace(" ", " model ", 1))
+        lines += [f"not adequate: {name}: {text}" for text in own]
     if beside:
         lines.append(f"not adequate: statistics of {', '.join(beside)} as well")
     return lines
 
 
-def _one(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
-    """Whether two axes fail a check by one event or source."""
+def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    """Whether two axes fail a check by the same event or source."""
     match check:
         case "jump":
             return bool(abs(a["time_s"] - b["time_s"]) < ONE_EVENT_S)
@@ -332,22 +326,17 @@ def _one(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 
 def _ahead(axes: Mapping[str, Any]) -> list[str]:
     """What the module's calibration is worth some time after a report, of `replay`."""
-    told = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
+    known = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
     return [
-        f"corrected output {one['horizon_s']:g} s after a report: {name}: rms error {one['rmse']:.3g} {one['unit']} "
-        f"({one['reports']} reports, means of {one['mean_s']:g} s)"
-        for name, one in told.items()
+        f"corrected output {ahead['horizon_s']:g} s after a report: {name}: rms error {ahead['rmse']:.3g} "
+        f"{ahead['unit']} ({ahead['reports']} reports, means of {ahead['mean_s']:g} s)"
+        for name, ahead in known.items()
     ]
 
 
 def _regressor_table(axes: Mapping[str, Any]) -> Table:
-    table = Table(
-        box=box.SIMPLE_HEAD,
-        caption="coefficients if in use: medians [5 %, 95 %]; the laws' parameters are those of each law's best subset",
-        caption_justify="left",
-    )
-    for heading in ("axis", "regressor", "P(in use)", "coefficient", "unit"):
-        table.add_column(heading, no_wrap=True)
+    caption = "coefficients if in use: medians [5 %, 95 %]; the laws' parameters are those of each law's best subset"
+    table = table_of(("axis", "regressor", "P(in use)", "coefficient", "unit"), caption=caption)
     for name, axis in axes.items():
         entries = list(axis.get("regressors", {}).items())
         for regressor, entry in entries:
@@ -372,7 +361,7 @@ def _interval(
     datasheet: str = "",
     brief: bool = False,
 ) -> str:
-    """Median and interval of the one of `names` that a law has, `brief` without the interval; `datasheet`: unit of the
+    """Median and interval of the law's parameter among `names`, `brief` without the interval; `datasheet`: unit of the
     axis, to be turned into that of data sheets."""
     name = next((name for name in names if name in parameters), None)
     if name is None:

@@ -9,7 +9,7 @@ from selfcal.show.chart import Figure
 
 
 @dataclass(frozen=True)
-class Told:
+class Reproduction:
     """`verdict`: agrees, differs, or skipped; `why` a difference, or what makes the figure worth looking at."""
 
     name: str

@@ -1,0 +1,168 @@
+"""The page of `selfcal fleet --report`: one file that loads nothing, at most 1 MB however many units there are."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from selfcal.base import units as unit_module
+from selfcal.base.output import write_text
+from selfcal.batch.population import Array, Population
+from selfcal.batch.summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
+from selfcal.show.chart import Band, Curve, Figure, Panel, draw
+from selfcal.show.template import render
+
+#: Most of what the page shows: lines of a list, those not folded, units of the matrix, pictures, points of a chart.
+MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES, MOST_POINTS = 150, 15, 100, 48, 400
+#: Keys of the document that name devices: what to do, and what they are in a line.
+KINDS = {
+    "failed": ("Beyond a limit: set these aside", "beyond a limit, or with the cause asked for"),
+    "unlike": ("Unlike the batch: look at these first", "unlike the batch"),
+    "drifting": (
+        "Drifting from recording to recording: measure these again, calibrate them more often",
+        "drifting",
+    ),
+    "not_judged": ("Not judged: record these again, or longer", "not judged"),
+}
+#: Limits of a chart of individuals and of a chart of moving ranges (n = 2), over the mean moving range.
+INDIVIDUALS, RANGES = 2.66, 3.267
+
+
+def write_page(
+    path: Path | str, document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str] | None = None
+) -> None:
+    """Write page() to `path`, whole or not at all."""
+    write_text(path, page(document, batch, pages or {}))
+
+
+def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> str:
+    """The page of the document `selfcal.fleet/1` and the batch that it is made of. `pages`: where the own page of a
+    device is, from this page's folder on."""
+    marked = _marked(batch)
+    histograms = batch.populations[:MOST_PICTURES]
+    paths = {name: units[-1].source.path for name, units in batch.devices.items()}
+    values = {
+        "document": document,
+        "kinds": KINDS,
+        "pages": pages,
+        "commands": {name: f"selfcal diagnose {shlex.quote(path)} --report page.html" for name, path in paths.items()},
+        "groups": list(group_lines(batch)),
+        "populations": batch.populations,
+        "plain": plain,
+        "seen_from": seen_from_words,
+        "unidentified": list(unidentified_lines(batch)),
+        "distributions": _drawn(
+            _histogram(population, _limits(document, population.measured.name)) for population in histograms
+        ),
+        "charts": _control(batch),
+        "devices": len(batch.devices),
+        "marked": marked,
+        "causes": sorted({cause for axes in marked.values() for cause in axes}),
+    }
+    values |= {"MOST_LINES": MOST_LINES, "OPEN_LINES": OPEN_LINES, "MOST_ROWS": MOST_ROWS}
+    return str(render("fleet.html", **values))
+
+
+def _drawn(figures: Iterable[Figure]) -> Markup:
+    return Markup().join(map(draw, figures))
+
+
+def _limits(document: Mapping[str, Any], name: str) -> list[tuple[float, str]]:
+    """Value and unit of each limit of a data sheet on a quantity."""
+    limits = [limit for limit in document["limits"] if f"{limit['axis']}.{limit['parameter']}" == name]
+    return list(dict.fromkeys((limit["value"], limit["unit"]) for limit in limits))
+
+
+def _histogram(population: Population, limits: Sequence[tuple[float, str]]) -> Figure:
+    measured = population.measured
+    marks = [value * unit_module.factor(unit, measured.unit) for value, unit in limits if unit != "1"]
+    y = measured.y
+    reach = float(np.ptp(y)) or 1.0
+    bins = int(np.clip(2.0 * y.size ** (1.0 / 3.0), 8, 60))
+    edges = np.linspace(float(y.min()) - 0.02 * reach, float(y.max()) + 0.02 * reach, bins + 1)
+    counts = np.histogram(y, edges)[0].astype(np.float64)
+    centre, middle, spread = 0.5 * (edges[1:] + edges[:-1]), population.fit.middle.median, population.fit.spread.median
+    sd = np.sqrt(spread**2 + float(np.median(measured.s)) ** 2)
+    expected = (
+        y.size * (edges[1] - edges[0]) / (sd * math.sqrt(2.0 * math.pi)) * np.exp(-0.5 * ((centre - middle) / sd) ** 2)
+    )
+    x = np.exp(centre) if measured.logarithm else centre
+    panel = Panel(
+        measured.name,
+        unit_module.typeset(measured.unit),
+        "units",
+        [Curve("units", x, counts), Curve("population with the records' errors", x, expected, "fitted")],
+        log_x=measured.logarithm,
+        marks=[mark for mark in marks if mark > 0.0 or not measured.logarithm],
+        stairs=True,
+        marked="data sheet's limit",
+    )
+    return Figure(measured.name, f"{y.size} units, {len(population.unlike)} of them unlike the others.", [panel])
+
+
+def _control(batch: Batch) -> Markup | None:
+    """Control charts of N and of the bias in the order of the dates: individuals and moving ranges. None: no dates."""
+    when = [units[-1].recorded_at for units in batch.devices.values()]
+    charts = [population for population in batch.populations if population.measured.name.endswith((".N", ".bias"))]
+    if len({date[:10] for date in when if date}) < 2 or not charts:
+        return None
+    figures: list[Figure] = []
+    for chart in charts[:MOST_PICTURES]:
+        measured = chart.measured
+        order = sorted(
+            (k for k, device in enumerate(measured.at.tolist()) if when[device]),
+            key=lambda k: when[int(measured.at[k])],
+        )
+        if len(order) >= 3:
+            y = np.asarray(np.exp(measured.y[order]) if measured.logarithm else measured.y[order], np.float64)
+            figures += _individuals(measured.name, unit_module.typeset(measured.unit), y)
+    return _drawn(figures)
+
+
+def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
+    """Charts of individuals and of moving ranges, each on its own scale."""
+    ranges: Array = np.concatenate([np.full(1, np.nan), np.abs(np.diff(y))])
+    mean, mean_range = float(y.mean()), float(np.nanmean(ranges))
+    beyond = int((np.abs(y - mean) > INDIVIDUALS * mean_range).sum()), int((ranges > RANGES * mean_range).sum())
+    every = max(1, math.ceil(y.size / MOST_POINTS))
+    shown = np.arange(0, y.size, every)
+    out = (np.abs(y - mean) > INDIVIDUALS * mean_range) | (ranges > RANGES * mean_range)
+    shown = np.union1d(shown, np.flatnonzero(out)[:MOST_POINTS])
+    x = np.asarray(shown + 1.0, np.float64)
+    whole: Array = np.ones(shown.size)
+    low, high = mean - INDIVIDUALS * mean_range, mean + INDIVIDUALS * mean_range
+    charts = {"individuals": (y, low, high), "moving range": (ranges, 0.0, RANGES * mean_range)}
+    panels = [
+        Panel(
+            f"{name}, {chart}",
+            "unit in the order of the dates",
+            unit,
+            [Curve("units", x, values[shown], "dots")],
+            [Band("limits by the moving range", x, least * whole, most * whole, "spread")],
+        )
+        for chart, (values, least, most) in charts.items()
+    ]
+    thinned = f" One in {every} is shown, and each beyond the limits." if every > 1 else ""
+    return [
+        Figure(f"{name} by date", f"{beyond[0]} of {y.size} units lie beyond the limits.{thinned}", panels[:1]),
+        Figure(f"{name}, moving range", f"{beyond[1]} ranges lie beyond the limits.{thinned}", panels[1:]),
+    ]
+
+
+def _marked(batch: Batch) -> dict[str, dict[str, list[str]]]:
+    """Axes with a cause or a mark, by device and cause; in brackets those whose cause is small."""
+    marked: dict[str, dict[str, list[str]]] = {}
+    for name, units in batch.devices.items():
+        for unit in units:
+            for axis, entry in unit.axes.items():
+                for cause in dict.fromkeys([*unit.causes(axis), *entry.get("marks", [])]):
+                    axes = marked.setdefault(name, {}).setdefault(cause, [])
+                    label = f"({axis})" if cause in unit.small(axis) else axis
+                    axes += [] if label in axes else [label]
+    return marked

@@ -1,0 +1,91 @@
+"""The page of `selfcal compare --report`: what changed, every quantity by recording, and the Allan deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from selfcal.base.output import write_text
+from selfcal.base.units import typeset
+from selfcal.show.chart import Band, Curve, Figure, Panel, draw
+from selfcal.show.template import render
+
+#: Characters that a picture's title has room for.
+LONGEST_TITLE = 22
+#: Allan deviations by axis and recording: the key `allan` of `selfcal.identify/1`.
+Curves = Mapping[str, Mapping[str, Mapping[str, Any]]]
+
+
+def write_page(path: Path | str, document: Mapping[str, Any], curves: Curves) -> None:
+    """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
+    write_text(path, page(document, curves))
+
+
+def page(document: Mapping[str, Any], curves: Curves) -> str:
+    """The page of a document `selfcal.compare/1`."""
+    names = _short(document["recordings"])
+    axes = [_axis(name, entry, document, curves.get(name, {}), names) for name, entry in document["axes"].items()]
+    changes = [(axis.name, change) for axis in axes for change in axis.changes]
+    changes.sort(key=lambda change: -abs(change[1].get("distance_sd", np.inf)))
+    title = f"Comparison of {' and '.join(names.values())}"
+    values = {"document": document, "title": title, "names": names, "axes": axes, "changes": changes}
+    return str(render("comparison.html", **values))
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """An axis: its changes, or the error why it is not compared, its quantities in each recording, and the picture."""
+
+    name: str
+    error: str
+    changes: Sequence[Mapping[str, Any]]
+    by_recording: Sequence[Mapping[str, Any]]
+    curves: Markup
+
+    @property
+    def quantities(self) -> list[str]:
+        return list(dict.fromkeys(key for quantities in self.by_recording for key in quantities))
+
+    @property
+    def changed(self) -> set[str]:
+        return {change["quantity"] for change in self.changes}
+
+
+def _axis(
+    name: str,
+    entry: Any,
+    document: Mapping[str, Any],
+    curves: Mapping[str, Mapping[str, Any]],
+    names: Mapping[str, str],
+) -> _Axis:
+    compared = not isinstance(entry, Mapping)
+    quantities = [document["quantities"].get(log, {}).get(name, {}) for log in names]
+    changes = entry if compared else entry["changes"]
+    return _Axis(name, "" if compared else entry["error"], changes, quantities, _deviations(name, curves, names))
+
+
+def _short(recordings: Sequence[str]) -> dict[str, str]:
+    """File names of the recordings; whole paths where two names are equal."""
+    short = [Path(log).name for log in recordings]
+    return dict(zip(recordings, short if len(set(short)) == len(short) else recordings, strict=True))
+
+
+def _deviations(name: str, curves: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]) -> Markup:
+    """The Allan deviations of an axis on one scale; nothing where their units differ."""
+    panels = []
+    for log, known in curves.items():
+        tau, measured, low, high = (np.array(known[key]) for key in ("tau_s", "recording", "model_q05", "model_q95"))
+        title = names[log] if len(names[log]) <= LONGEST_TITLE else f"{names[log][: LONGEST_TITLE - 1]}…"
+        curve, band = Curve("recording", tau, measured), Band("law, 5 to 95 %", tau, low, high)
+        unit = f"deviation, {typeset(known['unit'])}"
+        if tau.size > 1:
+            panels.append(Panel(title, "averaging time, s", unit, [curve], [band], log_x=True, log_y=True))
+    if len({panel.y_label for panel in panels}) != 1:
+        return Markup()
+    caption = "Each recording's Allan deviation beside the band of its likeliest law, all on one scale."
+    return draw(Figure(f"Allan deviation of {name}", caption, panels))
