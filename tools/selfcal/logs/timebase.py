@@ -162,20 +162,20 @@ def remarks(clock: Clock) -> list[str]:
     if off_grid is None or off_grid.size < 3:
         return []
     time = clock.time_s + off_grid
-    if changes := rate_changes(time):
-        after = ", ".join(f"{1.0 / one.after_s:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
-        return [f"the sampling rate changes: {1.0 / changes[0].before_s:.5g} Hz, {after}"]
     steps = np.diff(time)
     lattice = common_step(steps, 1e-9 / rate)
     gaps = np.flatnonzero(missing)
-    if gaps.size:
-        if not in_rhythm(gaps) and not in_pattern(missing + 1.0):
-            return []
+    if in_rhythm(gaps) or in_pattern(np.add(missing, 1.0)):
         lost, every, told = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
         other = float(f"{rate - rate * lost / every:.6g}")
         told = f"{told} {'are' if lost > 1 else 'is'} missing, at regular intervals"
         alike = lattice * rate > _NEARLY and np.ptp(time - np.arange(time.size) / other) * other < 1.0
         return [told + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
+    if changes := rate_changes(time):
+        after = ", ".join(f"{1.0 / one.after_s:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
+        return [f"the sampling rate changes: {1.0 / changes[0].before_s:.5g} Hz, {after}"]
+    if gaps.size:
+        return []
     if 0.0 < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:
         turns = np.rint(steps / lattice)
         if turns.min() == 1.0 and (lattice * rate > _NEARLY or in_pattern(turns)):
