@@ -132,10 +132,13 @@ def test_many_short_holds_are_named(q: float) -> None:
         assert abs(found.result.bias_mean - 0.02) < 5.0 * found.result.bias_sd
 
 
-def test_a_copied_axis_has_no_number() -> None:
+@pytest.mark.parametrize(("factor", "digits"), [(-2.0, 12), (1.0, 3), (-0.4, 2), (7.5, 1)])
+def test_a_copied_axis_has_no_number(factor: float, digits: int) -> None:
+    """A multiple of another axis, both printed with so many digits. What differs is rounding alone."""
     random = np.random.default_rng(93)
     x = random.standard_normal(6000)
-    recording = a_recording(gx=x, gy=0.3 - 2.0 * x, gz=random.standard_normal(6000))
+    copy = np.round(0.3 + factor * x, digits)
+    recording = a_recording(gx=np.round(x, digits), gy=copy, gz=np.round(random.standard_normal(6000), digits))
     with pytest.raises(UserError, match="its readings are those of gx, but for a factor"):
         identify_axis(recording, "gy", MODEL, "library", None)
     assert not moves_of(recording)

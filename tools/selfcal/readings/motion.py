@@ -87,7 +87,7 @@ ALIKE_LEAST, ALIKE = 2, 0.2
 CHANCE = 1e-5
 #: More than this share of a record is no exception.
 SHARE_MOST = 0.25
-#: Deviations beyond this count no more: the evidence of a stretch is certain long before.
+#: Deviations beyond this count no more: the evidence of a stretch is certain long before. No bias has such two levels.
 DEVIATION_MOST = 100.0
 
 
@@ -464,7 +464,8 @@ def _loud_blocks(
             square = np.minimum(away[a:b][far[a:b]], DEVIATION_MOST) ** 2
             nats = 0.5 * float((square - 1.0 - np.log(square)).sum())
             found.append(((max(0, a * block - margin), min(y.size, b * block + margin)), nats))
-    return [] if len(found) >= ALIKE_LEAST and _alike(sizes[0][moving]) else found
+    two_levels = len(found) >= ALIKE_LEAST and _alike(sizes[0][moving])
+    return [] if two_levels and float(np.median(away[moving])) < DEVIATION_MOST else found
 
 
 def _alike(levels: Array) -> bool:

@@ -24,7 +24,7 @@ from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import Uneven, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
-from selfcal.readings.lattice import Lattice, lattice_of
+from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import Recurring, recurring_of
 from selfcal.readings.misread import Misread, misread_of, spans_of
 from selfcal.readings.motion import Moved, loud, moves_of
@@ -53,8 +53,9 @@ AROUND = 32
 PILED_LEAST, PIECES, CODES_MOST = 30.0, 200, 40
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
-#: Two axes whose steps correlate this well are one, but for a factor, an offset and the rounding of numbers.
-SAME = 1.0 - 1e-7
+#: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
+#: of rounding to a lattice, over the variance of as many even steps.
+SAME, ROUNDING, LIKE = 1e-7, 1.4, 0.1
 #: Steps of EM at most, and the change of the noise at which it has settled.
 ITERATIONS, SETTLED = 200, 1e-6
 
@@ -715,7 +716,13 @@ def copied(recording: Recording, name: str, others: Sequence[str]) -> str:
             continue
         both = np.isfinite(own) & np.isfinite(theirs)
         a, b = own[both], theirs[both]
-        size = float(np.dot(a, a)) * float(np.dot(b, b))
-        if both.sum() >= PIECES and size > 0.0 and abs(float(np.dot(a, b))) >= SAME * math.sqrt(size):
+        if both.sum() < PIECES or not (a.any() and b.any()):
+            continue
+        factor = float(np.dot(a, b)) / float(np.dot(b, b))
+        left, size = float(np.mean((a - factor * b) ** 2)), float(np.mean(a**2))
+        if left < LIKE * size:
+            steps = (step_of(recording.columns[one].values)[0] for one in (name, other))
+            left -= ROUNDING / 6.0 * float(np.dot(np.square([*steps]), (1.0, factor**2)))
+        if left <= SAME * size:
             return f"its readings are those of {other}, but for a factor and an offset: which column is {name}?"
     return ""
