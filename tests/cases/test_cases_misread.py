@@ -116,14 +116,17 @@ def test_a_map_of_the_readings_is_named_in_both_verbs(read: Callable[[Array, Ran
 
 
 @pytest.mark.parametrize("q", [0.0, 0.12, 0.6])
-def test_many_short_holds_are_named(q: float) -> None:
-    """3 to 12 repeats of high readings, 2 % of the time: found, and N and the bias as without them within 5 sd."""
+@pytest.mark.parametrize("long", [0, 40])
+def test_many_short_holds_are_named(q: float, long: int) -> None:
+    """3 to 12 repeats of high readings, 2 % of the time: found, and N and the bias as without them within 5 sd. One run
+    that is `long` enough by itself does not hide the others."""
     for seed in range(case_records(2, 40)):
         random = np.random.default_rng([92, seed])
         x = random.standard_normal(60_000)
         y = x.copy()
         for at in np.flatnonzero((x > 1.0) & (random.random(x.size) < 0.02)):
             y[at : at + random.integers(4, 14)] = y[at]
+        y[31_000 : 31_000 + long] = y[31_000]
         y = 0.02 + 0.1 * (q * np.rint(y / q) if q else y)
         found = identify_axis(a_recording(400.0, gx=y), "gx", MODEL, "library", None)
         assert not found.judged.checks["stuck"]["passed"]

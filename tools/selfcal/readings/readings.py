@@ -43,9 +43,9 @@ COMMON_S, COMMON_OFF = 1.0, 3e-3
 GAP_MOST_S = 240.0
 #: ln of the probability, a record, of a run of equal readings that is no chance.
 LN_STUCK = -nats_of("stuck")
-#: Readings in a piece of the record that shows how common a code is, at least; longest runs that are counted; times
+#: Readings in a piece of the record that shows how common a code is, at least; nats of the runs that are counted; times
 #: that there are as many as chance makes, at least. Beyond so many steps in the noise chance is not well known.
-HELD_PIECE, HELD_MOST, HELD_TIMES, HELD_COARSEST = 64, 64, 1.5, 0.8
+HELD_PIECE, HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 64, 1.5, 0.8
 #: Samples on either side that make the level of one.
 AROUND = 32
 #: On a lattice coarser than the noise: the evidence in nats, pieces of a record that have a level each, and codes, at
@@ -450,29 +450,33 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
 def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]:
     """Repeats [n] in runs of equal readings of which there are more than the lattice makes, and the evidence in nats.
 
-    By chance a code of the share p of its piece of the record makes n (1 - p) p^k runs longer than k. A dependence of
-    neighbours raises every p alike: as much as the repeats that are single say."""
+    By chance a code of the share p of its piece of the record makes n (1 - p) p^k runs longer than k: a run is worth
+    -k ln p. A dependence of neighbours raises every p alike: as much as runs of two and of three readings say."""
     n, none = values.size, np.zeros(values.size, bool)
     size = max(HELD_PIECE, -(-n // PIECES))
-    longest = int(lengths.max(initial=0))
-    if longest < 3 or n < 2 * size:
+    if lengths.max(initial=0) < 3 or n < 2 * size:
         return none, 0.0
     piece = np.minimum(np.arange(n) // size, n // size - 1)
     _, code = np.unique(values, return_inverse=True)  # NaN are one code, and in no run
-    _, counts = np.unique(piece * np.int64(n) + code, return_counts=True)
+    _, cell, counts = np.unique(piece * np.int64(n) + code, return_inverse=True, return_counts=True)
+    # Chance of the first repeat, and of each later one; those that are alone show both.
     p = counts / size
     pairs, single = float((p * counts).sum()), float(np.count_nonzero(lengths == 2))
-    p = np.minimum(p * max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0)), 1.0 - 1.0 / n)
-    best, least = 0.0, 0
-    for length in range(3, min(longest, HELD_MOST) + 1):
-        expected = float((counts * (1.0 - p) * p ** (length - 1)).sum()) + 1.0
-        seen = float(np.count_nonzero(lengths >= length))
-        nats = seen * math.log(seen / expected) - seen + expected if seen > HELD_TIMES * expected else 0.0
-        if nats > best:
-            best, least = nats, length
+    first = np.minimum(p * max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0)), 1.0 - 1.0 / n)
+    alone = float(np.count_nonzero(lengths == 3)) / max(float((counts * first * p * (1.0 - first) ** 2).sum()), 1.0)
+    later = np.minimum(p * max(1.0, alone, first.sum() / p.sum()), 1.0 - 1.0 / n)
+    each, once = -np.log(later), -np.log(first)
+    worth = np.where(lengths > 2, (lengths - 2) * each[cell[starts]] + once[cell[starts]], 0.0)
+    best, least = 0.0, math.inf
+    for nats in range(HELD_NATS, 0, -1):
+        more = np.maximum(1.0, np.ceil((nats - once) / each))
+        expected = float((counts * (1.0 - first) * first * later**more).sum()) + 1.0
+        seen = float(np.count_nonzero(worth >= nats))
+        if seen > HELD_TIMES * expected:
+            best, least = max(best, seen * math.log(seen / expected) - seen + expected), nats
     if best < -LN_STUCK:
         return none, 0.0
-    held = np.repeat(lengths >= least, lengths)
+    held = np.repeat(worth >= least, lengths)
     held[starts] = False
     return held, best
 
@@ -506,16 +510,19 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
         chance = max(inside, (repeats + 0.5) / n, (twice + 0.5) / (repeats + 50.0), 0.01)
     least = min(limit, stated) if stated > 0 else limit
     stuck = lengths >= least
+    long = np.repeat(stuck, lengths)
+    rest = np.where(long, np.nan, values)
+    noise = float(np.nanstd(np.diff(rest))) / math.sqrt(2.0)
+    near = lattice is not None and (lattice.too_coarse or lattice.step > HELD_COARSEST * noise)
+    many, nats = (none, 0.0) if near else _many_runs(rest, *equal_runs(rest))
     if not stuck.any():
-        noise = float(np.nanstd(np.diff(values))) / math.sqrt(2.0)
-        near = lattice is not None and (lattice.too_coarse or lattice.step > HELD_COARSEST * noise)
-        return (none, 0.0) if near else _many_runs(values, change, lengths)
+        return many, nats
     frozen = values[change[stuck]]
     again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
     if again > 1 and 2 * int(lengths[stuck].sum()) > n:
         return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
-    nats = float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
-    return np.repeat(stuck, lengths), min(1e6, max(nats, -LN_STUCK))
+    nats += float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
+    return long | many, min(1e6, max(nats, -LN_STUCK))
 
 
 # ----------------------------------------------------------------------------------------------------- clipped readings
