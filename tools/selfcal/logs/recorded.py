@@ -90,8 +90,8 @@ class Recording:
         return round((self.since_power_on_s + self.start_s) * self.rate_hz)
 
     @cached_property
-    def motion_seen(self) -> dict[str, Any]:
-        """By axis its motion, once it was looked at (readings/motion.py)."""
+    def seen(self) -> dict[Any, Any]:
+        """What is known of its readings, once they were looked at (readings/)."""
         return {}
 
     @property

@@ -133,7 +133,8 @@ class Stretch:
 
 def moves_of(recording: Recording) -> dict[str, Moved]:
     """By axis when the sensor moved, s from the first row. Looked at once."""
-    if not recording.motion_seen:
+    seen: dict[str, Moved] = recording.seen.setdefault("motion", {})
+    if not seen:
         channels = {column for column, _ in SIDE_CHANNELS.values()}
         names = [name for name in recording.columns if name not in channels]
         energy = energy_of(recording, names)
@@ -144,8 +145,8 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         for k, name in enumerate(names):
             times = joined([_times(energy, one, recording) for one in found[name]])
             nats = sum(float(one.nats[k]) for one in found[name])
-            recording.motion_seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]))
-    return {name: one for name, one in recording.motion_seen.items() if one.intervals}
+            seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]))
+    return {name: one for name, one in seen.items() if one.intervals}
 
 
 def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, float]:

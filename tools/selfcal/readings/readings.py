@@ -37,6 +37,8 @@ Rows = NDArray[np.int64]
 CLOCK_LEAST = 1e-3
 #: Pieces on either side of a change, and standard deviations of their slopes that it takes.
 SLOPES, SLOPES_LEAST = 10, 8.0
+#: Rows of a recording whose readings are kept once they were looked at, at most.
+KEPT_MOST = 1 << 22
 #: Longest common interval of two rates, s, and how far off it may be.
 COMMON_S, COMMON_OFF = 1.0, 3e-3
 #: Longest gap that motion is looked for across, s.
@@ -194,7 +196,17 @@ def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
 
 
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
-    """The readings of an axis of an evened and thinned recording."""
+    """The readings of an axis of an evened and thinned recording. Looked at once, unless that takes much memory."""
+    if recording.samples > KEPT_MOST:
+        return _readings_of(recording, axis, group)
+    key = (axis, group.unit, group.range, group.stuck_limit)
+    if key not in recording.seen:
+        recording.seen[key] = _readings_of(recording, axis, group)
+    found: Readings = recording.seen[key]
+    return found
+
+
+def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     values = recording.in_unit(axis, group.unit)
     none = np.zeros(values.size, bool)
     misread = spans_of(values, recording.rate_hz)
@@ -242,6 +254,7 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         working, drawn = _unclipped(sound, clipped, lattice)
     if moving.any():
         working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
+    stuck, moving = (mask if mask.any() else none for mask in (stuck, moving))  # one array for all
     lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
     counts = {"saturated": lost, "stuck": int((stuck | repeats).sum())}
     if recurring is not None:
@@ -459,18 +472,25 @@ def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]
     piece = np.minimum(np.arange(n) // size, n // size - 1)
     _, code = np.unique(values, return_inverse=True)  # NaN are one code, and in no run
     _, cell, counts = np.unique(piece * np.int64(n) + code, return_inverse=True, return_counts=True)
+    long = lengths > 2
+    of_run = counts[cell[starts[long]]]
+    del piece, code, cell  # as long as the record
+    many, cells = np.unique(counts, return_counts=True)
+    readings, at = many * cells, np.searchsorted(many, of_run)
     # Chance of the first repeat, and of each later one; those that are alone show both.
-    p = counts / size
-    pairs, single = float((p * counts).sum()), float(np.count_nonzero(lengths == 2))
-    first = np.minimum(p * max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0)), 1.0 - 1.0 / n)
-    alone = float(np.count_nonzero(lengths == 3)) / max(float((counts * first * p * (1.0 - first) ** 2).sum()), 1.0)
-    later = np.minimum(p * max(1.0, alone, first.sum() / p.sum()), 1.0 - 1.0 / n)
+    p = many / size
+    pairs, single = float((p * readings).sum()), float(np.count_nonzero(lengths == 2))
+    alike = max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0))
+    first = np.minimum(p * alike, 1.0 - 1.0 / n)
+    alone = float(np.count_nonzero(lengths == 3)) / max(float((readings * first * p * (1.0 - first) ** 2).sum()), 1.0)
+    later = np.minimum(p * max(alike, alone), 1.0 - 1.0 / n)
     each, once = -np.log(later), -np.log(first)
-    worth = np.where(lengths > 2, (lengths - 2) * each[cell[starts]] + once[cell[starts]], 0.0)
+    worth = np.zeros(lengths.size)
+    worth[long] = (lengths[long] - 2) * each[at] + once[at]
     best, least = 0.0, math.inf
     for nats in range(HELD_NATS, 0, -1):
         more = np.maximum(1.0, np.ceil((nats - once) / each))
-        expected = float((counts * (1.0 - first) * first * later**more).sum()) + 1.0
+        expected = float((readings * (1.0 - first) * first * later**more).sum()) + 1.0
         seen = float(np.count_nonzero(worth >= nats))
         if seen > HELD_TIMES * expected:
             best, least = max(best, seen * math.log(seen / expected) - seen + expected), nats
@@ -510,17 +530,18 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
         chance = max(inside, (repeats + 0.5) / n, (twice + 0.5) / (repeats + 50.0), 0.01)
     least = min(limit, stated) if stated > 0 else limit
     stuck = lengths >= least
+    frozen = values[change[stuck]]
+    if 2 * int(lengths[stuck].sum()) > n and int((frozen == frozen[np.argmax(lengths[stuck])]).sum()) > 1:
+        return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
     long = np.repeat(stuck, lengths)
-    rest = np.where(long, np.nan, values)
-    noise = float(np.nanstd(np.diff(rest))) / math.sqrt(2.0)
+    rest = np.where(long, np.nan, values) if long.any() else values
+    steps = np.diff(rest)
+    steps = steps[np.isfinite(steps)]
+    noise = float(steps.std()) / math.sqrt(2.0) if steps.size else 0.0
     near = lattice is not None and (lattice.too_coarse or lattice.step > HELD_COARSEST * noise)
     many, nats = (none, 0.0) if near else _many_runs(rest, *equal_runs(rest))
-    if not stuck.any():
+    if not long.any():
         return many, nats
-    frozen = values[change[stuck]]
-    again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
-    if again > 1 and 2 * int(lengths[stuck].sum()) > n:
-        return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
     nats += float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
     return long | many, min(1e6, max(nats, -LN_STUCK))
 
