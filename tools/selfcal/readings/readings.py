@@ -26,7 +26,7 @@ from selfcal.readings.codes import Uneven, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import Recurring, recurring_of
-from selfcal.readings.misread import Misread, misread_of, spans_of
+from selfcal.readings.misread import ABOUT_ZERO, Misread, misread_of, spans_of
 from selfcal.readings.motion import Moved, loud, moves_of
 
 Array = NDArray[np.float64]
@@ -224,7 +224,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     lattice = lattice_of(_known(sound), recording.rate_hz)
     if misread is None and (lattice is None or not lattice.carried):
         misread = misread_of(sound, lattice)
-        limited = _clipped(sound, lattice) if misread is not None and misread.kind != "range_change" else None
+        limited = _clipped(sound, lattice) if misread is not None and misread.kind in ABOUT_ZERO else None
         if limited is not None and abs(limited.limit) > float(np.nanstd(sound)):
             misread = None  # it ends at a limit of the part, and not at zero
     recurring = recurring_of(sound, recording.rate_hz) if misread is None else None
