@@ -331,6 +331,53 @@ def test_losses_in_a_rhythm_are_told_and_either_rate_can_be_stated(rate_hz: floa
     assert int(load(log, rate=rate_hz).missing_before.sum()) == lost
 
 
+@pytest.mark.parametrize("pattern", ["110", "11011110", "0111101", "1110100", "11111111111100", "1100"])
+@pytest.mark.parametrize(("rate_hz", "digits"), [(40.0, 3), (30.0, 6), (62.5, 3), (13.7, 4)])
+@pytest.mark.parametrize("lost", [0.0, 0.004])
+def test_rows_lost_in_a_pattern_are_missing_and_told(
+    pattern: str, rate_hz: float, digits: int, lost: float, tmp_path: Path
+) -> None:
+    """Of each period the rows of the ones are kept, `lost` of them at random besides: the steps are whole intervals,
+    whatever the mean rate. Stamps are rounded to a few digits, of which intervals are no whole number or many. A rate
+    from rounded stamps is off by their digit over the length."""
+    random = np.random.default_rng([len(pattern), digits])
+    place = np.arange(9000)
+    kept = np.flatnonzero((np.array([*pattern])[place % len(pattern)] == "1") & (random.random(place.size) >= lost))
+    log = tmp_path / "log.csv"
+    rows = "\n".join(
+        f"{k / rate_hz:.{digits}f},{v:.4f}" for k, v in zip(kept, random.normal(size=kept.size), strict=True)
+    )
+    log.write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    recording = load(log)
+    assert recording.rate_hz == pytest.approx(rate_hz, rel=10.0**-digits * rate_hz / kept[-1] + 1e-9)
+    assert np.array_equal(recording.clock.place, kept - kept[0])
+    (note,) = recording.notes
+    assert "missing, at regular intervals" in note
+
+
+@pytest.mark.parametrize("pattern", ["110", "11110", "101101"])
+def test_a_pattern_of_ticks_names_the_rate_that_loses_rows(pattern: str, tmp_path: Path) -> None:
+    """A slower sensor stamped in ticks of 0.01 s writes the same, as 66.7 Hz does. The line names the rate to state."""
+    kept = np.flatnonzero(np.resize(np.array([*pattern]) == "1", 8000))
+    log = tmp_path / "log.csv"
+    log.write_text("t[s],gx[deg/s]\n" + "\n".join(f"{k / 100.0:.2f},{k % 7}" for k in kept) + "\n", encoding="utf-8")
+    (note,) = load(log).notes
+    stated = load(log, rate=float(note.split("--rate ")[1].split()[0]))
+    assert stated.rate_hz == 100.0
+    assert np.array_equal(stated.clock.place, kept - kept[0])
+
+
+@pytest.mark.parametrize(("before_hz", "after_hz"), [(25.0, 21.0), (64.0, 80.0), (10.0, 7.0)])
+def test_a_change_of_rate_has_a_line(before_hz: float, after_hz: float, tmp_path: Path) -> None:
+    """At 300 s, between neighbouring rows."""
+    time = np.concatenate([np.arange(300.0 * before_hz) / before_hz, 300.0 + np.arange(400.0 * after_hz) / after_hz])
+    log = tmp_path / "log.csv"
+    log.write_text("t[s],gx[deg/s]\n" + "\n".join(f"{t:.6f},{t % 0.7:.5f}" for t in time) + "\n", encoding="utf-8")
+    (note,) = load(log).notes
+    assert f"the sampling rate changes: {before_hz:g} Hz, {after_hz:g} Hz from " in note
+    assert float(note.split(" from ")[1].split()[0]) == pytest.approx(300.0, abs=1.5 / min(before_hz, after_hz))
+
+
 def test_a_stall_is_no_loss_and_no_sleep() -> None:
     """Rows that wait for up to 1.5 s and then come at once, 0.4 ms apart: none is missing."""
     for seed in range(case_records(3, 40)):

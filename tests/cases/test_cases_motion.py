@@ -134,6 +134,20 @@ def test_a_second_of_thirty_times_the_noise_moves(rate: float) -> None:
         assert abs(last - begin - 1.0) < 1.0
 
 
+@pytest.mark.parametrize(("rate", "count", "length_s"), [(60.0, 3, 0.3), (120.0, 2, 0.25), (40.0, 6, 0.45)])
+def test_strokes_of_one_height_are_no_bias_with_two_levels(rate: float, count: int, length_s: float) -> None:
+    """A self-test moves the level by the same every time, and by far more than a bias jumps: 500 noises."""
+    random = np.random.default_rng([6, count])
+    for _ in range(case_records(3, 60)):
+        t, y = drawn(random, rate, 900.0)
+        begins = 20.0 + 140.0 * np.arange(count) + random.uniform(0.0, 100.0, count)
+        for begin in begins:
+            y[(t >= begin) & (t < begin + length_s)] += 500.0
+        found = loud(y, rate)
+        assert found is not None
+        assert np.abs(np.array(found.intervals) - np.column_stack([begins, begins + length_s])).max() < 1.0
+
+
 def other(kind: str, random: np.random.Generator, t: Array, y: Array, rate: float) -> Array:
     """A record with something that is no motion."""
     share = t / t[-1]

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 import selfcal
 from selfcal import Recording, UserError
+from selfcal.base.errors import in_python
 from selfcal.show.identification import show
 from selfcal.show.results import Identification, Picture
 
@@ -65,9 +66,13 @@ def test_each_form_of_the_same_readings_is_the_file(tmp_path: Path) -> None:
         (pandas.DataFrame(plain, index=dates), {"units": "deg/s"}),
         (pandas.DataFrame({"t[s]": t, **named, "note": "x"}), {}),
         (recording, {}),
+        (y.tolist(), {"rate_hz": "8", "units": "deg/s"}),
+        (pandas.DataFrame({"time": dates, **named}), {}),
     ]
     for log, options in forms:
         assert answer(log, **options) == expected
+    series = pandas.Series(plain["gy"], index=dates, name="gy[deg/s]")
+    assert answer(series) == answer({"gy[deg/s]": plain["gy"]}, rate_hz=RATE_HZ)
     accel = selfcal.identify(readings(6), rate_hz=RATE_HZ, units={"gyro": "deg/s", "accel": "mg"})
     assert accel.axes["az"].bias_now.unit == "mg"
     assert selfcal.identify(recording, axes=["gx"]).recording.path == "bench 3"
@@ -104,12 +109,52 @@ def test_other_verbs_take_them(tmp_path: Path) -> None:
         ({"gx": np.ones(9), "gy": np.ones(8)}, {"rate_hz": 2.0, "units": "deg/s"}, "has 8 rows, 'gx' has 9"),
         ({}, {"rate_hz": 2.0}, "there are no columns"),
         ("a.csv", {"units": "deg/s"}, "by the names of its columns"),
+        ([[1.0, 2.0, 3.0], [1.0]], {"rate_hz": 2.0, "units": "deg/s"}, "rows of different lengths"),
+        ([], {"rate_hz": 2.0}, "no recording in an empty list"),
+        (np.ones((9, 3)), {"rate_hz": "fast", "units": "deg/s"}, "must be a number of Hz, not 'fast'"),
+        ({"gx": np.ones(9)}, {"rate_hz": 2.0, "units": {"gx": "deg/s"}, "columns": {"gy": "w"}}, "columns={'gy': 'w'}"),
     ],
 )
 def test_what_is_no_recording_is_one_line(data: Any, options: dict[str, Any], said: str) -> None:
     with pytest.raises(UserError) as caught:
         selfcal.identify(data, **options)
     assert said in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("words", [["rear", "front"], [3, 8, 5]])
+def test_rows_of_sensors_in_turn_are_told_apart(words: list[Any]) -> None:
+    """A line lists them, by the keyword to give."""
+    y = readings(1)[:1200, 0]
+    count = len(words)
+    t = np.repeat(np.arange(1200 // count) / RATE_HZ, count)
+    data = {"t[s]": t, "imu": np.array(words * (1200 // count)), "gx[deg/s]": y}
+    with pytest.raises(UserError, match=f"several sensors: give sources=.'imu:{words[0]}'. ") as caught:
+        selfcal.load(data)
+    assert "--" not in str(caught.value)
+    one = selfcal.load(data, sources=f"imu:{words[1]}")
+    assert np.array_equal(one.columns["gx"].values, y[1::count])
+
+
+@pytest.mark.parametrize("heading", ["temperature[degC]", "Temp (K)", "imu_temp[degC]"])
+def test_a_temperature_is_known_by_its_name_and_unit(heading: str) -> None:
+    recording = selfcal.load(
+        {"t[s]": np.arange(90.0), "gx[deg/s]": np.arange(90.0) % 7, heading: 300.0 + np.arange(90.0)}
+    )
+    assert recording.columns["temp"].values[4] == 304.0
+
+
+@pytest.mark.parametrize(
+    ("typed", "meant"),
+    [
+        ("give --unit wx=rad/s --unit wy=rad/s, or", "give units={'wx': 'rad/s', 'wy': 'rad/s'}, or"),
+        ("--scale 'ax=SIZE[g]', SIZE the g", "scale={'ax': (SIZE, 'g')}, SIZE the g"),
+        ("--skip-bad mends it; --no-time --rate HZ", "skip_bad=True mends it; no_time=True rate_hz=HZ"),
+        ("choose with --axis", "choose with axes=[...]"),
+        ("no -- option --of-ours", "no -- option --of-ours"),
+    ],
+)
+def test_options_are_keywords_in_python(typed: str, meant: str) -> None:
+    assert in_python(typed) == meant
 
 
 def test_missing_and_masked_samples() -> None:

@@ -12,6 +12,7 @@ import pytest
 from test_page import HOSTILE, Page
 
 from selfcal.base.errors import UserError
+from selfcal.batch.compare import show
 from selfcal.logs.recording import save
 from selfcal.show.comparison_page import page
 from selfcal.verbs.compare import compare
@@ -66,6 +67,16 @@ def test_without_a_change_it_states_so(made: tuple[dict[str, Any], str]) -> None
     assert "Nothing changed beyond what the recordings leave open" in page(quiet, {})
     missing = {**document, "axes": {"gx": {"error": "b.npz does not have it", "changes": []}}}
     assert "gx not compared: b.npz does not have it" in Page(page(missing, {})).text
+
+
+def test_the_terminal_tells_what_each_recording_shows(
+    made: tuple[dict[str, Any], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The step is in the second alone."""
+    show(made[0])
+    first, second = (line for line in capsys.readouterr().out.splitlines() if ".npz: " in line)
+    assert first == "monday.npz: no finding that matters"
+    assert second.endswith(".npz: step on gx")
 
 
 def test_it_is_not_written_over_a_recording(tmp_path: Path) -> None:

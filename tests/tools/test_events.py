@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -23,6 +24,7 @@ from selfcal.logs.recording import load, save
 from selfcal.show import table
 from selfcal.show.findings import show
 from selfcal.verbs.diagnose import diagnose
+from selfcal.verbs.identify import identify
 
 
 def member(axis: str, cause: str, net: float, time_s: float | None = None, **estimate: Any) -> Member:
@@ -130,11 +132,14 @@ def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
         "intervals": [[1199.5, 1200.8], [1300.0, 1302.25]],
         "form_also_possible": ["rate", "square"],
         "statistic": "jumps_of_the_bias",
+        "duration_s": interval(3.25, 0.0, "s"),
+        "angle_y_deg": interval(0.4, 0.0, "deg"),
         "measured": 12.32,
     }
     text = words.sizes(estimate)
     assert "0.0311 deg/s/degC" in text and "from 1199.5 s to 1200.8 s, 1300 s to 1302.25 s" in text
     assert "not to be told from its rate, its square" in text and "the bias jumps" in text
+    assert "duration 3.25 s" in text and "angle y 0.4 deg" in text
     assert not set(text) & set("[]'_") and "12.32" not in text
 
 
@@ -221,7 +226,30 @@ def test_small_findings_leave_an_axis_adequate(tmp_path: Path) -> None:
     assert [one.cause for one in document.findings] == ["missing_samples"] and not document.findings[0].material
     assert (axis.verdict, axis.small_findings, axis.causes) == ("adequate", 1, ["missing_samples"])
     assert [outcome(document, wanted).code for wanted in ("inadequate", "material", "missing_samples")] == [0, 0, 1]
-    assert words.small(document.findings).startswith("1 small finding: it does not change N by more than 0 %")
+    assert words.small(document.findings).startswith("1 small finding (missing samples): ")
+
+
+@pytest.mark.parametrize(("loud", "size_s", "seed"), [(5.0, 1.4, 1), (14.0, 0.4, 2), (4.5, 9.0, 3)])
+def test_time_that_is_left_out_has_a_row(
+    loud: float, size_s: float, seed: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One axis of three shaken for a while, which moves no number once it is left out: a row of `diagnose`, a line of
+    `identify`, each with the interval. Truth: the test's own, to the margin of 0.5 s."""
+    random = np.random.default_rng(seed)
+    values = 0.2 * random.standard_normal((3, 24_000))
+    values[1, 10_000 : 10_000 + round(40.0 * size_s)] *= loud
+    save(tmp_path / "log.npz", {f"g{axis}": ("deg/s", row) for axis, row in zip("xyz", values, strict=True)}, 40.0)
+    document = diagnose(tmp_path / "log.npz", axes=["gy"], decimate=1.0)
+    show(document)
+    table.show(identify(tmp_path / "log.npz", axes=["gy"], suspicion=False))
+    shown = capsys.readouterr().out
+    row = re.search(r"handling +motion on gy: from ([\d.]+) s", shown)
+    line = re.search(
+        r"\nmotion, left out.*: gy: ([\d.]+) to ([\d.]+) s\n|: motion, left out: ([\d.]+) to ([\d.]+) s\n", shown
+    )
+    assert row is not None and line is not None
+    times = [float(one) for one in (*row.groups(), *filter(None, line.groups()))]
+    assert times == pytest.approx([249.5, 249.5, 250.5 + size_s], abs=0.6)
 
 
 def axis_of(**checks: dict[str, Any]) -> dict[str, Any]:

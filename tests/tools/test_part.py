@@ -13,6 +13,7 @@ import pytest
 import yaml
 from test_cases_priors import at_rest, deviation, write
 
+import selfcal
 from selfcal.base.errors import UserError
 from selfcal.model.file import DEFAULT, Model, file_of, parts
 from selfcal.verbs.codegen import codegen
@@ -200,3 +201,13 @@ def test_own_priors_of_an_unknown_axis_are_refused(tmp_path: Path) -> None:
     tree["groups"]["gyro"]["own_priors"] = {"ax": {"N": {"law": "log_uniform", "min": 1e-4, "max": 1.0}}}
     with pytest.raises(UserError, match=r"groups.gyro.own_priors: unknown entry 'ax' \(known: gx, gy, gz\)"):
         Model.of_tree(tree, tmp_path / "own.yaml")
+
+
+def test_codegen_names_the_axes_without_a_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """gz is a copy of gx, which `part` refuses; the recording has no accelerometer."""
+    random = np.random.default_rng(31)
+    x, y = 0.03 * random.standard_normal((2, 900))
+    selfcal.part({"gx": x, "gy": y, "gz": 1.7 * x}, tmp_path / "own.yaml", rate_hz=5.0, units="deg/s")
+    capsys.readouterr()
+    selfcal.codegen(tmp_path / "own.yaml", tmp_path / "tables")
+    assert "own.yaml: wide priors, without a result in the file: gz\n" in capsys.readouterr().err

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from test_replay_can import COMMAND, demonstration
@@ -225,12 +226,63 @@ def test_demo_is_streamed_whole(tmp_path: Path) -> None:
     assert all(topic == f"/selfcal/node0/{one['axis']}" for topic, one in seen)
 
 
-@pytest.mark.parametrize("wanted", ["csv", "udp-json:1", "udp-json:h:0", "udp-json:h:7e4", "jsonl:a:1", "foxglove::9"])
+@pytest.mark.parametrize(
+    "wanted",
+    ["csv", "ros", "ros:0", "ros:a:1", "udp-json:1", "udp-json:h:0", "udp-json:h:7e4", "jsonl:a:1", "foxglove::9"],
+)
 def test_wrong_streams_are_one_line(wanted: str, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--stream"):
         check(wanted)
-    with pytest.raises(UserError, match="--stream jsonl and --json"):
-        monitor(read=tmp_path / "x.log", stream=["jsonl"], json="-")
+    for both in ({"stream": ["jsonl"], "json": "-"}, {"stream": ["ros:50", "jsonl"]}):
+        with pytest.raises(UserError, match="both for stdout"):
+            monitor(read=tmp_path / "x.log", **both)
+
+
+def test_ros_messages_are_those_of_its_definitions(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`rosbags` has the definitions of ROS 2: each message is written by them and read back. Truth: the reports' own
+    numbers; a reading's variance is N^2 times the rate, its bias' beside it."""
+    stores = pytest.importorskip("rosbags.typesys")
+    types = stores.get_typestore(stores.Stores.ROS2_HUMBLE)
+
+    def made(kind: str, told: Any) -> Any:
+        """The message of a type."""
+        if not isinstance(told, dict):
+            return told
+        fields = types.get_msgdef(kind).fields
+        assert set(told) == {name for name, _ in fields}
+        found = {}
+        for name, (_, of) in fields:
+            inner = told[name]
+            if name in ("status", "values"):
+                found[name] = [made(of[0][1], one) for one in inner]
+            elif isinstance(inner, list):
+                found[name] = np.array(inner)
+            else:
+                found[name] = made(of if isinstance(of, str) else "", inner)
+        return types.types[kind](**found)
+
+    monitor(read=frames(tmp_path / "in.log", lines(stream(37, 2))), stream=["ros:250"])
+    sent = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert {one["topic"] for one in sent} == {"/diagnostics", "/selfcal/node0/imu"}
+    for one in sent:
+        message = made(one["type"], one["msg"])
+        back = types.deserialize_cdr(types.serialize_cdr(message, one["type"]), one["type"])
+        assert back.header.stamp.sec == 1000
+        if one["topic"] == "/diagnostics":
+            assert back.status[0].hardware_id == "node0" and len(back.status[0].values) >= 4
+    first, last = (one["msg"] for one in (sent[1], sent[-1]))
+    assert first["linear_acceleration_covariance"][0] == first["orientation_covariance"][0] == -1.0
+    reports = {one.message: one.truth for one in stream(37, 2) if one.message in AXES}  # the last of each axis
+    for message, field, factor, axes in (
+        (last, "angular_velocity", np.pi / 180.0, ("GX", "GY", "GZ")),
+        (last, "linear_acceleration", 1.0, ("AX", "AY", "AZ")),
+    ):
+        for k, axis in enumerate(axes):
+            truth = reports[axis]
+            law = max(range(3), key=lambda h: truth[f"h{h}_probability"])
+            variance = (truth[f"h{law}_N_mean"] ** 2 * 250.0 + truth["bias_sd"] ** 2) * factor**2
+            assert message[f"{field}_covariance"][4 * k] == pytest.approx(variance, rel=1e-6)
+            assert message[field]["xyz"[k]] == pytest.approx(truth["bias_mean"] * factor, rel=1e-6)
 
 
 def test_a_taken_port_is_one_line(tmp_path: Path) -> None:

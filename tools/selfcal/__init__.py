@@ -45,7 +45,8 @@ def __getattr__(name: str) -> Any:
         globals()[name] = _plain(import_module(f"selfcal.verbs.{name}"), name)
         return globals()[name]
     if name in _OTHERS:
-        return getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
+        found = getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
+        return found if isinstance(found, type) else _in_python(found)
     if name == "_library32":
         globals()[name] = import_module(f"selfcal._library32{'_fma' if _fma() else ''}")
         return globals()[name]
@@ -79,12 +80,25 @@ def _plain(module: Any, name: str) -> Callable[..., Any]:
         for key, of in get_type_hints(get_args(hint)[0]).items():
             shown.append(Parameter(key, Parameter.KEYWORD_ONLY, default=None, annotation=of))
 
-    @wraps(verb)
-    def call(*arguments: Any, **options: Any) -> Any:
-        return verb(*arguments, **options)
-
+    call = _in_python(verb)
     call.__signature__ = signature(verb).replace(parameters=shown)  # type: ignore[attr-defined]
     call.__module__ = __name__
+    return call
+
+
+def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function whose errors name keywords, and no options of the command line."""
+
+    @wraps(function)
+    def call(*arguments: Any, **options: Any) -> Any:
+        from selfcal.base.errors import UserError, in_python
+
+        try:
+            return function(*arguments, **options)
+        except UserError as error:
+            error.args = (in_python(str(error)),)
+            raise
+
     return call
 
 

@@ -83,6 +83,41 @@ def called() -> str:
     return printable(shlex.quote(name))
 
 
+#: Keywords of options, by what they take: pairs, a list, a number; others take nothing.
+_KEYWORDS = {
+    **{"unit": ("units", "pairs"), "column": ("columns", "pairs"), "scale": ("scale", "pairs")},
+    **{"source": ("sources", "list"), "axis": ("axes", "list")},
+    **{"rate": ("rate_hz", "number"), "start": ("start_s", "number"), "end": ("end_s", "number")},
+    **{name: (name.replace("-", "_"), "number") for name in ("decimate", "dbc", "model", "json")},
+    **{name: (name.replace("-", "_"), "") for name in ("no-time", "skip-bad", "gate", "full-rate")},
+}
+_VALUE = r"'[^']*'|[A-Z\d][^ ,;]*|[^ ,;'-][^ ,;]*=[^ ,;]+"
+_TYPED = re.compile(rf"--(?P<name>[a-z-]+)(?P<more>(?: (?:{_VALUE})(?: --(?P=name)(?= ))?)*)")
+
+
+def in_python(text: str) -> str:
+    """`text` with the keyword of a function in place of each option: `--unit gx=rad/s` is `units={'gx': 'rad/s'}`."""
+
+    def keyword(match: re.Match[str]) -> str:
+        name, kind = _KEYWORDS.get(match["name"], ("", ""))
+        if not name:
+            return match[0]
+        given = [one.strip("'") for one in re.findall(_VALUE, match["more"])]
+        if kind == "pairs":
+            pairs = dict(one.partition("=")[::2] for one in given)
+            shown_as = "({0[0]}, {1!r})" if name == "scale" else "{2!r}"  # a size and its unit
+            told = (
+                f"{key!r}: " + shown_as.format(value.split("["), value.partition("[")[2].rstrip("]"), value)
+                for key, value in pairs.items()
+            )
+            return f"{name}={{{', '.join(told) or '...'}}}"
+        if kind == "list":
+            return f"{name}={given or '[...]'}"
+        return f"{name}={(given or ['...'])[0]}" if kind else f"{name}=True{match['more']}"
+
+    return _TYPED.sub(keyword, text)
+
+
 def first_line(error: BaseException) -> str:
     """The first line of an exception's text, its kind where it has none."""
     return short(str(error).split("\n")[0]) or type(error).__name__

@@ -126,7 +126,7 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """One line a change."""
+    """One line a change, then what each recording shows that matters."""
     console = console_of(to_stderr=to_stderr)
     headings = ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings")
     table = table_of(headings, "changes beyond what the recordings leave open")
@@ -150,5 +150,14 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     if not any(changes_of(axis) for axis in document["axes"].values()):
         which = [name for name in document["axes"] if name not in errors] if errors else []
         console.print(f"{', '.join(which)}{': ' if which else ''}nothing changed beyond what the recordings leave open")
+    for log, verdicts in document["verdicts"].items():
+        on: dict[str, list[str]] = {}
+        for name, one in verdicts.items():
+            for cause in one.get("causes", ()):
+                if cause in (*one["material"], "unexplained"):
+                    on.setdefault(cause.replace("_", " "), []).append(name)
+        told = "; ".join(f"{cause} on {' '.join(names)}" for cause, names in on.items())
+        line = f"{printable(Path(log).name)}: {told or 'no finding that matters'}"
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
     for name, error in errors.items():
         console.print(f"{name}: not compared: {printable(error)}", highlight=False, markup=False, soft_wrap=True)

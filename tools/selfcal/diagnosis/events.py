@@ -374,11 +374,12 @@ def _before_and_after(one: Diagnosed, unit: str, known: Identified | None) -> di
 
 def parted(findings: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
     """Those of a document that are told, and the small ones: these change no number by as much as matters, and are
-    named. What moves several axes and was not recorded is told in any case: the next record can have it."""
+    named. Told in any case: what moves several axes and was not recorded, and the time that is left out."""
     told: list[Mapping[str, Any]] = []
     small: list[Mapping[str, Any]] = []
     for one in findings:
-        (told if one["material"] or one["cause"] in (UNEXPLAINED, hidden.ID) else small).append(one)
+        in_any_case = one["cause"] in (UNEXPLAINED, hidden.ID) or "intervals" in one["estimate"]
+        (told if one["material"] or in_any_case else small).append(one)
     return told, small
 
 

@@ -52,7 +52,11 @@ FORMS = {
 FORM_NAMES = {"rate": "its rate", "square": "its square", "cube": "its cube", "lag": "a lag", "play": "a play"}
 #: What stands out, by the beginning of a statistic's name.
 STATISTICS = (
-    ("jumps_of_the_bias", "the bias jumps more than its drift does"),
+    ("jump", "the bias jumps more than its drift does"),
+    ("channel", "a recorded channel explains a part of the drift"),
+    ("turn_on", "the bias settles after power-on"),
+    ("drift_in_average", "the drift moves more than the noise of a mean"),
+    ("batch", "the part is unlike the batch of the model's priors"),
     ("coherence_with_", "the readings go together with a recorded channel"),
     ("innovation_largest_correlation", "the noise repeats itself after a while"),
     ("innovation_largest", "single readings are far off"),
@@ -106,11 +110,12 @@ def sizes(estimate: Mapping[str, Any]) -> str:
 
 
 def _size(key: str, value: Any) -> str:
-    label = LABELS.get(key, key.replace("_", " "))
+    unit = str(value.get("unit") or "1") if isinstance(value, Mapping) else "1"
+    label = LABELS.get(key, key.removesuffix(f"_{unit.lower()}").replace("_", " "))
     if isinstance(value, Mapping) and "median" in value:
         low, high = value.get("q05"), value.get("q95")
         half = math.nan if low is None or high is None else 0.5 * (high - low)
-        unit = "" if value.get("unit") in (None, "1") else f" {value['unit']}"
+        unit = "" if unit == "1" else f" {unit}"
         spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
         return f"{label} {rounded(value['median'], half)}{spread}{unit}"
     match key:
@@ -231,16 +236,10 @@ def _sure(coefficient: Mapping[str, Any] | None) -> bool:
 
 
 def small(findings: Sequence[Mapping[str, Any]]) -> str:
-    """One line on the findings that matter little: by how much they move a number at most."""
-    told: list[str] = []
-    for name in ("N", "K", "B"):
-        factors = [one[name] for finding in findings for one in finding["changes"].values()]
-        most = max((abs(one - 1.0) for one in factors if one is not None and math.isfinite(one)), default=0.0)
-        told.append(f"{name} by {'' if told else 'more than '}{100.0 * most:.0f} %")
-    count, none = f"{len(findings)} small findings", "none changes"
-    if len(findings) == 1:
-        count, none = "1 small finding", "it does not change"
-    return f"{count}: {none} {', '.join(told)}, or the bias by half of its interval"
+    """One line on the findings that matter little: they move no number by more than it is known."""
+    count, none = (f"{len(findings)} small findings", "none moves") if len(findings) > 1 else ("1 small finding", "not")
+    causes = ", ".join(dict.fromkeys(str(one["cause"]).replace("_", " ") for one in findings))
+    return f"{count} ({causes}): {none} N, K, B or the bias by more than half of its interval"
 
 
 def ratio(value: float) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from numbers import Real
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from selfcal.base.errors import UserError, short
 from selfcal.base.units import SENSORS
 from selfcal.logs.loaders.headings import split
 from selfcal.logs.loaders.table import Table, of_arrays
+from selfcal.logs.loaders.text_table import LOOKED_AT, in_turn
 from selfcal.logs.recorded import SIDE_UNITS
 
 #: Axes of an array by its columns.
@@ -24,17 +26,24 @@ _STAMP = "datetime64[ns]"
 
 def in_memory(data: object) -> bool:
     """Whether `data` is readings, and not the name of a file or a list of names."""
-    return isinstance(data, Mapping | np.ndarray) or (hasattr(data, "columns") and hasattr(data, "__getitem__"))
+    if isinstance(data, Sequence):
+        return len(data) > 0 and isinstance(data[0], Real | Sequence | np.ndarray) and not isinstance(data[0], str)
+    return isinstance(data, Mapping) or hasattr(data, "__array__") or _is_frame(data)
 
 
-def table_of(
+def _is_frame(data: object) -> bool:
+    return hasattr(data, "columns") and hasattr(data, "__getitem__")
+
+
+def tables_of(
     data: Any, units: Mapping[str, str] | str, known: Collection[str], rate_hz: float | None, sensors: Collection[str]
-) -> tuple[Table, dict[str, str]]:
-    """The table of readings in memory, and the units of its columns that `units` states.
+) -> tuple[list[Table], dict[str, str]]:
+    """The tables of readings in memory, one for each sensor whose rows take turns, and the units that `units` states.
 
-    `data`: an array [n], [n, 3] or [n, 6] of gx, gy, gz, ax, ay, az; a mapping of arrays [n] by heading, with `gyro`
-    and `accel` [n, 3]; a data frame, whose index has the time if it is one of dates. `units`: of all axes, or by name,
-    where `gyro` and `accel` are their axes. `known`: names that an option maps to a column. Raises UserError.
+    `data`: an array or a list [n], [n, 3] or [n, 6] of gx, gy, gz, ax, ay, az; a mapping of arrays [n] by heading, with
+    `gyro` and `accel` [n, 3]; a data frame or a series, whose index has the time if it is one of dates. `units`: of all
+    axes, or by name, where `gyro` and `accel` are their axes. `known`: names that an option maps to a column. Raises
+    UserError.
     """
     arrays: dict[str, NDArray[Any]] = {}
     for heading, array in _columns(data):
@@ -54,13 +63,18 @@ def table_of(
         )
     if rate_hz is None and {split(heading)[0] for heading in arrays} <= {*sensors, *SIDE_UNITS} and "t" not in known:
         raise UserError("arrays: no time column: give rate_hz=100.0, or a column 't[s]'")
-    return of_arrays("", arrays), stated
+    words = {key: one[:LOOKED_AT].astype(str).tolist() for key, one in arrays.items() if one.dtype.kind in "OUSiu"}
+    turns = in_turn([*words], [*words.values()])
+    rows = {f"{key}:{word}": arrays[key].astype(str) == word for key, word in turns} or {"": slice(None)}
+    return [of_arrays(source, {name: one[own] for name, one in arrays.items()}) for source, own in rows.items()], stated
 
 
 def _columns(data: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     """Headings and arrays [n]."""
-    if isinstance(data, np.ndarray):
-        yield from _axes("", data)
+    if hasattr(data, "to_frame") and not _is_frame(data):  # a series
+        data = data.to_frame(_COLUMNS[1][0] if data.name is None else data.name)
+    if not isinstance(data, Mapping) and not _is_frame(data):
+        yield from _axes("", _numbers("an array", data))
         return
     index = np.asarray(getattr(data, "index", ()))
     names = [*data] if isinstance(data, Mapping) else list(data.columns)
@@ -68,7 +82,7 @@ def _columns(data: Any) -> Iterator[tuple[str, NDArray[Any]]]:
         yield "t[ns]", np.asarray(data.index, _STAMP).astype(np.int64)
     for name in names:
         values = data[name]
-        array = values.filled(np.nan) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
+        array = _numbers(f"'{short(str(name))}'", values)
         if array.dtype.kind in "mM":  # dates, or times since a begin
             yield (
                 ("t[ns]" if str(name) == "t" else f"{name}[ns]"),
@@ -78,6 +92,17 @@ def _columns(data: Any) -> Iterator[tuple[str, NDArray[Any]]]:
             yield str(name), array
         else:
             yield from _axes(str(name), array)
+
+
+def _numbers(what: str, values: Any) -> NDArray[Any]:
+    """Values as an array, NaN where a mask hides them. Raises UserError."""
+    if isinstance(values, np.ma.MaskedArray):
+        return np.asarray(values.filled(np.nan))
+    dated = getattr(getattr(values, "dtype", None), "kind", "") == "M"  # with a zone too
+    try:
+        return np.asarray(values, _STAMP if dated else None)
+    except (ValueError, TypeError) as error:
+        raise UserError(f"arrays: {what}: rows of different lengths, or no numbers") from error
 
 
 def _axes(name: str, array: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:

@@ -91,7 +91,7 @@ class Recording:
 
     @cached_property
     def seen(self) -> dict[Any, Any]:
-        """What looks at it have found, which are dear (readings/): a recording does not change."""
+        """What is known of its readings, once they were looked at (readings/)."""
         return {}
 
     @property

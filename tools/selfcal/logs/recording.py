@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, note, short
+from selfcal.base.errors import UserError, note, short, shown
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ, reading
 from selfcal.base.options import Scale
 from selfcal.base.units import SENSORS
@@ -79,11 +79,13 @@ def load(
     """
     if isinstance(path, Recording):
         return path
-    rate = rate if rate_hz is None else rate_hz
-    columns, units, table = columns or {}, units or {}, None
+    rate = _rate(rate if rate_hz is None else rate_hz)
+    columns, units, tables = columns or {}, units or {}, None
     paths = list_of(path)
+    if not paths and not arrays.in_memory(path):
+        raise UserError("there is no recording in an empty list")
     if arrays.in_memory(path):
-        table, units = arrays.table_of(path, units, columns, rate, sensors)
+        tables, units = arrays.tables_of(path, units, columns, rate, sensors)
         paths = [Path("arrays")]
     elif isinstance(units, str):
         raise UserError(f"units={units!r}: of a file by the names of its columns, as units={{'gx': {units!r}}}")
@@ -100,7 +102,7 @@ def load(
     found = [
         part
         for one, header in zip(paths, headers, strict=True)
-        for part in _load(one, rate, header, skip_bad, sources, hints, table)
+        for part in _load(one, rate, header, skip_bad, sources, hints, tables)
     ]
     there = {text for header in headers for key in header.seen for text in (key, split(key)[0])}
     for name, wanted in columns.items():
@@ -112,11 +114,19 @@ def load(
     recording = replace(
         recording,
         notes=tuple(dict.fromkeys((*recording.notes, *_rates(recording)))),
-        options=() if table else _options(rate, columns, units, by_name, no_time, skip_bad, sources, dbc),
+        options=() if tables else _options(rate, columns, units, by_name, no_time, skip_bad, sources, dbc),
     )
     for text in recording.notes:
         note(f"{recording.path}: {text}")
     return recording
+
+
+def _rate(rate: Any) -> float | None:
+    """A stated rate, Hz. Raises UserError."""
+    try:
+        return None if rate is None else float(rate)
+    except (TypeError, ValueError) as error:
+        raise UserError(f"the rate must be a number of Hz, not {shown(rate)}") from error
 
 
 def _options(
@@ -175,14 +185,14 @@ def _load(
     skip_bad: bool,
     wanted: Sequence[str],
     hints: Hints,
-    table: Table | None = None,
+    there: Sequence[Table] | None = None,
 ) -> list[Recording]:
-    """The sensors of one file that are meant, or of a `table`, and the temperatures beside them, each by its own
-    clock."""
+    """The sensors of one file that are meant, or of the tables that are `there`, and the temperatures beside them, each
+    by its own clock."""
     with reading(path, "not a sound recording"):
-        form = format_of(path, frames="dbc" in hints) if table is None else None
-        if table is not None:
-            tables = [table]
+        form = format_of(path, frames="dbc" in hints) if there is None else None
+        if there is not None:
+            tables = [*there]
         elif form is None:
             tables = texts.read(path, header.knows_in, skip_bad)
         else:
@@ -195,10 +205,10 @@ def _load(
         header.seen = {key for table in tables for key in table.keys}
         parts = [part for table in tables for part in _parts(path, rate, header, table, several, skip_bad)]
         if not parts or (several and not any(part.axes for part in parts)):
-            there = ", ".join(f"{one.source}: {', '.join(one.keys)}" for one in tables)
+            listed = ", ".join(f"{one.source}: {', '.join(one.keys)}" for one in tables)
             why = next((f"; {one}" for table in tables for one in table.notes), "")
             raise UserError(
-                f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(there)}'; {NAME_YOURS}{why}"
+                f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(listed)}'; {NAME_YOURS}{why}"
             )
         if wanted and not any(part.source for part in parts):
             raise UserError(f"{path}: it has one source alone: leave --source out")

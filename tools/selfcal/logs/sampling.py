@@ -65,8 +65,8 @@ _ONES, _ONES_SHARE = 20, 0.7
 _AS_GOOD = 5
 
 #: Steps between stretches of samples, in usual steps; samples of a stretch and gaps of a rhythm at least; the share of
-#: the gaps that keep to a rhythm.
-_ASLEEP, _AWAKE, _RHYTHM = 20.0, 20, 0.9
+#: the gaps that keep to a rhythm, and gaps in a period of losses at most.
+_ASLEEP, _AWAKE, _RHYTHM, _OF_PATTERN = 20.0, 20, 0.9, 4
 #: Stamps come in bursts where so many steps are shorter than this share of the mean one.
 _SHORT_STEPS, _BURST = 0.3, 0.45
 #: Mean steps, times the samples of a burst, by which stamps may stray from a steady count; bursts' distances beyond
@@ -134,8 +134,9 @@ def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s
     usual = _usual(steps)
     if _in_batches(steps, usual):
         return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
-    if _even(time, usual):
-        return _on_grid(time, usual)
+    for dt in (_shortest(steps), usual):
+        if _even(time, dt):
+            return _on_grid(time, dt)
     mean = float(time[-1]) / steps.size
     if np.ptp(time - mean * np.arange(time.size)) < mean:  # a count that is steady has lost no sample
         return mean, np.zeros(time.size, np.int64)
@@ -175,6 +176,14 @@ def in_rhythm(rows: NDArray[np.int64]) -> bool:
     if runs.size < _AWAKE or np.median(runs) < 4:
         return False
     return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) >= _RHYTHM)
+
+
+def in_pattern(steps: NDArray[np.float64]) -> bool:
+    """Whether the steps of more than one interval, of those steps [n - 1], come again in periods of a few."""
+    rows = np.flatnonzero(steps > 1.5)
+    each = np.stack([np.diff(rows), steps[rows[1:]]]) if rows.size > _AWAKE else np.zeros((2, 0))
+    periods = range(1, 1 + min(_OF_PATTERN, each.shape[1] - 1))
+    return any(np.mean((each[:, k:] == each[:, :-k]).all(axis=0)) >= _RHYTHM for k in periods)
 
 
 def overlapping(time: NDArray[np.float64]) -> bool:
@@ -229,6 +238,14 @@ def _usual(steps: NDArray[np.float64]) -> float:
     positive = steps[steps > 0.0]
     usual = positive < 1.5 * np.median(positive)
     return float(np.median(positive if usual.all() else positive[usual], overwrite_input=True))
+
+
+def _shortest(steps: NDArray[np.float64]) -> float:
+    """The interval that makes whole numbers of all steps, of which a quarter or more is a single one."""
+    dt = float(np.quantile(steps, 0.25))
+    for _ in range(4):
+        dt = float(steps.sum() / np.rint(steps / dt).sum())
+    return dt
 
 
 def _even(time: NDArray[np.float64], dt: float) -> bool:
@@ -467,7 +484,9 @@ def followed_phase(
 def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: float | None) -> Found:
     steps = np.rint(np.diff(time) / lattice)
     whole = _unbroken(time, lattice)
-    if whole is not None and not (steps.min() >= 1.0 and _rather_lossy(steps, lattice, whole, rate)):
+    # A lattice that is no tick of a clock, but for this one, is the interval itself.
+    own = rate is None and steps.min() == 1.0 and not _is_tick(lattice)
+    if whole is not None and not (own or (steps.min() >= 1.0 and _rather_lossy(steps, lattice, whole, rate))):
         return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
     if whole is not None or _lossy(steps):
         return _on_every_step(time, lattice)
@@ -475,11 +494,14 @@ def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: flo
     head = time[:_HEAD]
     grid, scores = _scan(head, lattice, low, high)
     try:
-        return _scanned(time, lattice, grid, scores)
+        found = _scanned(time, lattice, grid, scores)
     except Ambiguous:
-        if steps.min() < 1.0 or np.mean(steps > 1.0) > 0.1 or _is_tick(lattice):
+        if not own or np.mean(steps > 1.0) > 0.1:
             raise
-        return _on_every_step(time, lattice)
+    else:
+        if not own:
+            return found
+    return _on_every_step(time, lattice)
 
 
 def _is_tick(lattice: float) -> bool:
@@ -490,16 +512,13 @@ def _is_tick(lattice: float) -> bool:
 def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate: float | None) -> bool:
     """Whether a grid of one lattice step that lost samples is likelier than the unbroken one of the interval `whole`.
 
-    Bayes: at an unknown share of losses B(m, n - m) for m gaps, and nearly pi^2/n^3 for one line of pixels. A lattice
-    that is no tick of a clock, but for this one, is the interval itself. A stated rate decides."""
+    Bayes: at an unknown share of losses B(m, n) for m lost ones, and nearly pi^2/n^3 for one line of pixels. A stated
+    rate decides."""
     if rate is not None:
         return abs(rate * lattice - 1.0) < abs(rate * whole - 1.0)
-    gaps, n = int(np.count_nonzero(steps > 1.0)), steps.size
-    if not 0 < gaps < 0.1 * n:
-        return False
-    lossy = betaln(gaps, n + 1 - gaps) - math.log(10.0)
+    lost, n = int(steps.sum()) - steps.size, steps.size
     pixels = 2.0 * math.log(math.pi) - 3.0 * math.log(n)
-    return lossy > pixels or not _is_tick(lattice)
+    return lost > 0 and float(betaln(lost, n)) - math.log(10.0) > pixels
 
 
 def _lossy(steps: NDArray[np.float64]) -> bool:
@@ -507,9 +526,12 @@ def _lossy(steps: NDArray[np.float64]) -> bool:
 
     Random times repeat a stamp half as often as they take neighbouring ones, or keep a distance; a grid does neither.
     Another rate on the lattice is a line in the spectrum of the steps that have a stamp, however many samples are lost.
-    Losses, one by one or in bursts, make no line."""
+    Losses, one by one or in bursts, make no line. Those in a pattern do; steps of another rate differ by one."""
     if steps.min() < 1.0:
         return False
+    spread = max(np.ptp(np.quantile(one, [1.0 - _RHYTHM, _RHYTHM])) for one in (steps, steps[1:] + steps[:-1]))
+    if spread >= 2.0 and steps.min() == 1.0 and in_pattern(steps):
+        return True
     head = np.cumsum(steps)
     head = head[: int(np.searchsorted(head, _PLACES))].astype(np.int64)
     if head.size < _ROWS_LEAST or head[-1] <= head.size:

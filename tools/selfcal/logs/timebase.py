@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import NoReturn
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import Ambiguous, common_step, in_rhythm, sampling, thinned_grid
+from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, sampling, thinned_grid
 
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
 #: median of two rows or more.
@@ -25,6 +26,8 @@ _OWN_SHARE, _OWN_NEAR = 0.6, 0.3
 _NO_GRID = 0.3
 #: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost.
 _NEARLY = 0.9
+#: Samples in a period of losses, and changes of the rate, that a line tells of, at most.
+_OF_LOSSES, _IN_WORDS = 100, 3
 #: The way on for stamps of no use.
 AS_THEY_COME = "--no-time --rate HZ takes the rows of one file as they come"
 
@@ -158,25 +161,38 @@ def remarks(clock: Clock) -> list[str]:
     rate, missing, off_grid = clock.rate_hz, clock.missing_before, clock.off_grid_s
     if off_grid is None or off_grid.size < 3:
         return []
-    gaps = np.flatnonzero(missing)
-    if gaps.size:
-        other = rate * missing.size / (missing.size + int(missing.sum()))
-        if not in_rhythm(gaps) or other < _NEARLY * rate:
-            return []
-        every = round(1.0 / (1.0 - other / rate))
-        other = float(f"{rate - rate / every:.6g}")
-        told = f"1 sample in {every} is missing, at regular intervals: a slower sensor's stamps are alike"
-        return [f"{told}: --rate {other:g} states that"]
-    steps = np.diff(clock.time_s + off_grid)
+    time = clock.time_s + off_grid
+    steps = np.diff(time)
     lattice = common_step(steps, 1e-9 / rate)
-    if _NEARLY < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:
-        other = float(f"{1.0 / lattice:.6g}")
-        told = f"stamps of {lattice:.4g} s: {other:g} Hz that loses 1 sample in {round(1.0 / (1.0 - rate * lattice))}"
-        return [f"{told} has the same: --rate {other:g} states that"]
+    gaps = np.flatnonzero(missing)
+    if in_rhythm(gaps) or in_pattern(np.add(missing, 1.0)):
+        lost, every, told = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
+        other = float(f"{rate - rate * lost / every:.6g}")
+        told = f"{told} {'are' if lost > 1 else 'is'} missing, at regular intervals"
+        alike = lattice * rate > _NEARLY and np.ptp(time - np.arange(time.size) / other) * other < 1.0
+        return [told + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
+    if changes := rate_changes(time):
+        after = ", ".join(f"{1.0 / one.after_s:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
+        return [f"the sampling rate changes: {1.0 / changes[0].before_s:.5g} Hz, {after}"]
+    if gaps.size:
+        return []
+    if 0.0 < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:
+        turns = np.rint(steps / lattice)
+        if turns.min() == 1.0 and (lattice * rate > _NEARLY or in_pattern(turns)):
+            other = float(f"{1.0 / lattice:.6g}")
+            told = f"stamps of {lattice:.4g} s: {other:g} Hz that loses {_losses(float(turns.mean()))[2]} has the same"
+            return [f"{told}: --rate {other:g} states that"]
     if np.ptp(off_grid) * rate <= 1.0 or float(np.diff(off_grid).std()) * rate <= _NO_GRID:
         return []
     told = f"the stamps lie on no grid: their mean rate, {rate:.4g} Hz, is taken; no lost sample shows"
     return [f"{told}: --rate HZ states another"]
+
+
+def _losses(step: float) -> tuple[int, int, str]:
+    """Samples lost, of how many, and the words, where the mean step is so many intervals."""
+    share = Fraction(1.0 - 1.0 / step).limit_denominator(_OF_LOSSES)
+    lost, every = share.numerator, share.denominator
+    return lost, every, f"{lost} sample{'s' * (lost > 1)} in {every}"
 
 
 def _ways(time: NDArray[np.float64]) -> str:

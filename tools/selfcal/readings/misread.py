@@ -10,16 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import uniform_filter1d
 from scipy.special import ndtr
 
 from selfcal.base.grid import counts_of_pieces, noise_of
 from selfcal.readings.budget import nats_of
-from selfcal.readings.lattice import Lattice, lattice_of
+from selfcal.readings.lattice import Lattice, lattice_of, step_of
 
 Array = NDArray[np.float64]
 
@@ -29,6 +30,10 @@ JUMP, JUMPS_LEAST, ALIKE, OFF = 12.0, 5, 0.9, 6.0
 LIKE_NOISE = 0.3
 #: Share of the readings that bytes of two readings are at most.
 TORN_MOST = 0.25
+#: Bits at least of a count that goes round; share of the readings below and above the codes that must all come.
+BITS_LEAST, INNER = 5, (0.1, 0.9)
+#: Noises of a reading in the circle of a count from which on each reading has its turn.
+WHOLE = 8.0
 #: Pieces of a record that have a level each, at most, and readings in one at least.
 PIECES, PIECE = 100, 64
 #: Values that are told apart at most. Points of a cell of half a value.
@@ -52,9 +57,16 @@ MISREAD = MappingProxyType(
         "unsigned": "a signed count is read as unsigned; undone here",
         "overflow": "the count runs over; undone here",
         "torn": "bytes of two readings are joined, read them at once; undone here",
+        "low_bits": "the upper bits of the count are lost; undone here",
+        "bit_set": "a bit of the count is 1 in every reading",
+        "bit_clear": "a bit of the count is 0 in every reading",
         "range_change": "the range of the part changes, the readings are right",
     }
 )
+
+
+#: Kinds that a limit of the part at zero looks like.
+ABOUT_ZERO = ("sign_lost", "truncated", "digits_lost")
 
 
 @dataclass(frozen=True)
@@ -74,6 +86,16 @@ def spans_of(values: Array, rate_hz: float) -> Misread | None:
     y = values[known]
     if y.size < PIECE:
         return None
+    found = _spans(y, lattice_of(y, rate_hz)) or _low_bits(y)
+    if found is None or found.undone is None:
+        return found
+    undone = values.copy()
+    undone[known] = found.undone
+    return replace(found, undone=undone)
+
+
+def _spans(y: Array, lattice: Lattice | None) -> Misread | None:
+    """The same of readings [n] that are all there, by jumps of one size."""
     steps = np.diff(y)
     size = np.abs(steps)
     # A quarter of the differences of normal noise is below 0.45 of its sd.
@@ -81,7 +103,6 @@ def spans_of(values: Array, rate_hz: float) -> Misread | None:
     far = size[size > JUMP * noise]
     if far.size < JUMPS_LEAST or not noise > 0.0:
         return None
-    lattice = lattice_of(y, rate_hz)
     span = float(np.median(far))
     alike = far[np.abs(far / span - 1.0) < OFF * noise / span]
     if not alike.size:  # the median lies between two that differ
@@ -110,10 +131,58 @@ def spans_of(values: Array, rate_hz: float) -> Misread | None:
         kind, span = "torn", upper
     if float(y[turns != own].std()) < LIKE_NOISE * noise:
         return None  # a word that the logger shows for lost ones has no noise
-    undone = values.copy()
-    undone[known] = y - span * (turns - own)
+    undone = y - span * (turns - own)
     nats = far.size * math.log(span / (2.0 * OFF * noise))
     return Misread(kind, float(np.mean(turns != own)), nats, undone)
+
+
+def _low_bits(y: Array) -> Misread | None:
+    """Readings [n] that are the low bits of a count alone: they fill 2^k codes from end to end, and lie nearer to a
+    level on the circle of these codes than on the line. Of noise that fills the circle no reading is known."""
+    step = step_of(y)[0]
+    bits = math.log2(float(np.ptp(y)) / step + 1.0) if step > 0.0 else 0.0
+    if bits < BITS_LEAST or abs(bits - round(bits)) * 2.0**bits > 0.5:
+        return None
+    span = step * 2.0 ** round(bits)
+    if min(int(np.count_nonzero(np.abs(y - end) < 0.5 * step)) for end in (y.min(), y.max())) < JUMPS_LEAST:
+        return None
+    turn = 2.0 * math.pi / span
+    level = np.unwrap(np.angle(uniform_filter1d(np.exp(1j * turn * y), PIECE, mode="nearest"))) / turn
+    off = y - level
+    off -= span * np.rint(off / span)
+    on_line = float((y - uniform_filter1d(y, PIECE, mode="nearest")).std())
+    nats = y.size * math.log(on_line / max(float(off.std()), LIKE_NOISE * step))
+    if nats < nats_of("misread"):
+        return None
+    turns = np.rint((level + off - y) / span)
+    turns -= float(np.median(turns))
+    kind = "overflow" if float(y.min()) < 0.0 else "low_bits"
+    middle = float(np.median(y + span * turns))
+    if kind == "low_bits" and min(middle, span - middle) < float(off.std()):  # the true ones are about zero
+        kind, turns = "unsigned", turns - float(np.rint(middle / span))
+    undone = y + span * turns if float(off.std()) * WHOLE < span else None
+    return Misread(kind, float(np.mean(turns != 0.0)), nats, undone)
+
+
+def stuck_bit_of(values: Array, lattice: Lattice | None) -> Misread | None:
+    """Readings [n], NaN where there are none, whose codes lack one bit: every other 2^k of them never comes.
+
+    Each time that the bits above it change, the bit itself is one or the other by chance."""
+    y = values[np.isfinite(values)]
+    if lattice is None or y.size < PIECE:
+        return None
+    code = np.rint(y / lattice.step).astype(np.int64)
+    low, high = (int(one) for one in np.quantile(code, INNER))
+    for k in range(1, max(2, int(math.log2(high - low + 1)) + 1)):
+        bit = (code >> k) & 1
+        if bit.min() < bit.max():
+            continue
+        inner = np.arange(low, high + 1)
+        inner = inner[((inner >> k) & 1) == bit[0]]
+        nats = math.log(2.0) * np.count_nonzero(np.diff(code >> (k + 1))) - math.log(64.0)
+        if np.isin(inner, code).mean() > ALIKE and nats > nats_of("misread"):
+            return Misread(f"bit_{'set' if bit[0] else 'clear'}", 0.5, nats)
+    return None
 
 
 def range_change_of(values: Array, lattice: Lattice | None) -> Misread | None:
@@ -235,4 +304,4 @@ def about_zero(values: Array, lattice: Lattice | None) -> Misread | None:
 
 def misread_of(values: Array, lattice: Lattice | None) -> Misread | None:
     """How readings [n], NaN where there are none, were misread; None where they were not."""
-    return range_change_of(values, lattice) or about_zero(values, lattice)
+    return range_change_of(values, lattice) or stuck_bit_of(values, lattice) or about_zero(values, lattice)

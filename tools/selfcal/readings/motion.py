@@ -87,7 +87,7 @@ ALIKE_LEAST, ALIKE = 2, 0.2
 CHANCE = 1e-5
 #: More than this share of a record is no exception.
 SHARE_MOST = 0.25
-#: Deviations beyond this count no more: the evidence of a stretch is certain long before.
+#: Deviations beyond this count no more: the evidence of a stretch is certain long before. No bias has such two levels.
 DEVIATION_MOST = 100.0
 
 
@@ -133,8 +133,8 @@ class Stretch:
 
 def moves_of(recording: Recording) -> dict[str, Moved]:
     """By axis when the sensor moved, s from the first row. Looked at once."""
-    if "motion" not in recording.seen:
-        moves: dict[str, Moved] = {}
+    seen: dict[str, Moved] = recording.seen.setdefault("motion", {})
+    if not seen:
         channels = {column for column, _ in SIDE_CHANNELS.values()}
         names = [name for name in recording.columns if name not in channels]
         energy = energy_of(recording, names)
@@ -145,11 +145,8 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         for k, name in enumerate(names):
             times = joined([_times(energy, one, recording) for one in found[name]])
             nats = sum(float(one.nats[k]) for one in found[name])
-            if times:
-                moves[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]))
-        recording.seen["motion"] = moves
-    known: dict[str, Moved] = recording.seen["motion"]
-    return known
+            seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]))
+    return {name: one for name, one in seen.items() if one.intervals}
 
 
 def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, float]:
@@ -469,7 +466,8 @@ def _loud_blocks(
             square = np.minimum(away[a:b][far[a:b]], DEVIATION_MOST) ** 2
             nats = 0.5 * float((square - 1.0 - np.log(square)).sum())
             found.append(((max(0, a * block - margin), min(y.size, b * block + margin)), nats))
-    return [] if len(found) >= ALIKE_LEAST and _alike(sizes[0][moving]) else found
+    two_levels = len(found) >= ALIKE_LEAST and _alike(sizes[0][moving])
+    return [] if two_levels and float(np.median(away[moving])) < DEVIATION_MOST else found
 
 
 def _alike(levels: Array) -> bool:

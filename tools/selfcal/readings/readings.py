@@ -24,9 +24,9 @@ from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import Uneven, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
-from selfcal.readings.lattice import Lattice, lattice_of
+from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import Recurring, recurring_of
-from selfcal.readings.misread import Misread, misread_of, spans_of
+from selfcal.readings.misread import ABOUT_ZERO, Misread, misread_of, spans_of
 from selfcal.readings.motion import Moved, loud, moves_of
 
 Array = NDArray[np.float64]
@@ -37,15 +37,17 @@ Rows = NDArray[np.int64]
 CLOCK_LEAST = 1e-3
 #: Pieces on either side of a change, and standard deviations of their slopes that it takes.
 SLOPES, SLOPES_LEAST = 10, 8.0
+#: Rows of a recording whose readings are kept once they were looked at, at most.
+KEPT_MOST = 1 << 22
 #: Longest common interval of two rates, s, and how far off it may be.
 COMMON_S, COMMON_OFF = 1.0, 3e-3
 #: Longest gap that motion is looked for across, s.
 GAP_MOST_S = 240.0
 #: ln of the probability, a record, of a run of equal readings that is no chance.
 LN_STUCK = -nats_of("stuck")
-#: Readings in a piece of the record that shows how common a code is, at least; longest runs that are counted; times
+#: Readings in a piece of the record that shows how common a code is, at least; nats of the runs that are counted; times
 #: that there are as many as chance makes, at least. Beyond so many steps in the noise chance is not well known.
-HELD_PIECE, HELD_MOST, HELD_TIMES, HELD_COARSEST = 64, 64, 1.5, 0.8
+HELD_PIECE, HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 64, 1.5, 0.8
 #: Samples on either side that make the level of one.
 AROUND = 32
 #: On a lattice coarser than the noise: the evidence in nats, pieces of a record that have a level each, and codes, at
@@ -53,8 +55,9 @@ AROUND = 32
 PILED_LEAST, PIECES, CODES_MOST = 30.0, 200, 40
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
-#: Two axes whose steps correlate this well are one, but for a factor, an offset and the rounding of numbers.
-SAME = 1.0 - 1e-7
+#: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
+#: of rounding to a lattice, over the variance of as many even steps.
+SAME, ROUNDING, LIKE = 1e-7, 1.4, 0.1
 #: Steps of EM at most, and the change of the noise at which it has settled.
 ITERATIONS, SETTLED = 200, 1e-6
 
@@ -193,8 +196,10 @@ def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
 
 
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
-    """The readings of an axis of an evened and thinned recording. Looked at once."""
-    key = axis, group.unit, group.range, group.stuck_limit
+    """The readings of an axis of an evened and thinned recording. Looked at once, unless that takes much memory."""
+    if recording.samples > KEPT_MOST:
+        return _readings_of(recording, axis, group)
+    key = (axis, group.unit, group.range, group.stuck_limit)
     if key not in recording.seen:
         recording.seen[key] = _readings_of(recording, axis, group)
     found: Readings = recording.seen[key]
@@ -219,7 +224,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     lattice = lattice_of(_known(sound), recording.rate_hz)
     if misread is None and (lattice is None or not lattice.carried):
         misread = misread_of(sound, lattice)
-        limited = _clipped(sound, lattice) if misread is not None and misread.kind != "range_change" else None
+        limited = _clipped(sound, lattice) if misread is not None and misread.kind in ABOUT_ZERO else None
         if limited is not None and abs(limited.limit) > float(np.nanstd(sound)):
             misread = None  # it ends at a limit of the part, and not at zero
     recurring = recurring_of(sound, recording.rate_hz) if misread is None else None
@@ -249,6 +254,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         working, drawn = _unclipped(sound, clipped, lattice)
     if moving.any():
         working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
+    stuck, moving = (mask if mask.any() else none for mask in (stuck, moving))  # one array for all
     lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
     counts = {"saturated": lost, "stuck": int((stuck | repeats).sum())}
     if recurring is not None:
@@ -457,29 +463,40 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
 def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]:
     """Repeats [n] in runs of equal readings of which there are more than the lattice makes, and the evidence in nats.
 
-    By chance a code of the share p of its piece of the record makes n (1 - p) p^k runs longer than k. A dependence of
-    neighbours raises every p alike: as much as the repeats that are single say."""
+    By chance a code of the share p of its piece of the record makes n (1 - p) p^k runs longer than k: a run is worth
+    -k ln p. A dependence of neighbours raises every p alike: as much as runs of two and of three readings say."""
     n, none = values.size, np.zeros(values.size, bool)
     size = max(HELD_PIECE, -(-n // PIECES))
-    longest = int(lengths.max(initial=0))
-    if longest < 3 or n < 2 * size:
+    if lengths.max(initial=0) < 3 or n < 2 * size:
         return none, 0.0
     piece = np.minimum(np.arange(n) // size, n // size - 1)
     _, code = np.unique(values, return_inverse=True)  # NaN are one code, and in no run
-    _, counts = np.unique(piece * np.int64(n) + code, return_counts=True)
-    p = counts / size
-    pairs, single = float((p * counts).sum()), float(np.count_nonzero(lengths == 2))
-    p = np.minimum(p * max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0)), 1.0 - 1.0 / n)
-    best, least = 0.0, 0
-    for length in range(3, min(longest, HELD_MOST) + 1):
-        expected = float((counts * (1.0 - p) * p ** (length - 1)).sum()) + 1.0
-        seen = float(np.count_nonzero(lengths >= length))
-        nats = seen * math.log(seen / expected) - seen + expected if seen > HELD_TIMES * expected else 0.0
-        if nats > best:
-            best, least = nats, length
+    _, cell, counts = np.unique(piece * np.int64(n) + code, return_inverse=True, return_counts=True)
+    long = lengths > 2
+    of_run = counts[cell[starts[long]]]
+    del piece, code, cell  # as long as the record
+    many, cells = np.unique(counts, return_counts=True)
+    readings, at = many * cells, np.searchsorted(many, of_run)
+    # Chance of the first repeat, and of each later one; those that are alone show both.
+    p = many / size
+    pairs, single = float((p * readings).sum()), float(np.count_nonzero(lengths == 2))
+    alike = max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0))
+    first = np.minimum(p * alike, 1.0 - 1.0 / n)
+    alone = float(np.count_nonzero(lengths == 3)) / max(float((readings * first * p * (1.0 - first) ** 2).sum()), 1.0)
+    later = np.minimum(p * max(alike, alone), 1.0 - 1.0 / n)
+    each, once = -np.log(later), -np.log(first)
+    worth = np.zeros(lengths.size)
+    worth[long] = (lengths[long] - 2) * each[at] + once[at]
+    best, least = 0.0, math.inf
+    for nats in range(HELD_NATS, 0, -1):
+        more = np.maximum(1.0, np.ceil((nats - once) / each))
+        expected = float((readings * (1.0 - first) * first * later**more).sum()) + 1.0
+        seen = float(np.count_nonzero(worth >= nats))
+        if seen > HELD_TIMES * expected:
+            best, least = max(best, seen * math.log(seen / expected) - seen + expected), nats
     if best < -LN_STUCK:
         return none, 0.0
-    held = np.repeat(lengths >= least, lengths)
+    held = np.repeat(worth >= least, lengths)
     held[starts] = False
     return held, best
 
@@ -513,16 +530,20 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
         chance = max(inside, (repeats + 0.5) / n, (twice + 0.5) / (repeats + 50.0), 0.01)
     least = min(limit, stated) if stated > 0 else limit
     stuck = lengths >= least
-    if not stuck.any():
-        noise = float(np.nanstd(np.diff(values))) / math.sqrt(2.0)
-        near = lattice is not None and (lattice.too_coarse or lattice.step > HELD_COARSEST * noise)
-        return (none, 0.0) if near else _many_runs(values, change, lengths)
     frozen = values[change[stuck]]
-    again = int((frozen == frozen[np.argmax(lengths[stuck])]).sum())
-    if again > 1 and 2 * int(lengths[stuck].sum()) > n:
+    if 2 * int(lengths[stuck].sum()) > n and int((frozen == frozen[np.argmax(lengths[stuck])]).sum()) > 1:
         return none, 0.0  # one reading most of the time: the noise at rest is below the lattice
-    nats = float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
-    return np.repeat(stuck, lengths), min(1e6, max(nats, -LN_STUCK))
+    long = np.repeat(stuck, lengths)
+    rest = np.where(long, np.nan, values) if long.any() else values
+    steps = np.diff(rest)
+    steps = steps[np.isfinite(steps)]
+    noise = float(steps.std()) / math.sqrt(2.0) if steps.size else 0.0
+    near = lattice is not None and (lattice.too_coarse or lattice.step > HELD_COARSEST * noise)
+    many, nats = (none, 0.0) if near else _many_runs(rest, *equal_runs(rest))
+    if not long.any():
+        return many, nats
+    nats += float((lengths[stuck] - 1).sum()) * -math.log(min(chance, 1.0 - 1e-12)) - math.log(n)
+    return long | many, min(1e6, max(nats, -LN_STUCK))
 
 
 # ----------------------------------------------------------------------------------------------------- clipped readings
@@ -723,7 +744,13 @@ def copied(recording: Recording, name: str, others: Sequence[str]) -> str:
             continue
         both = np.isfinite(own) & np.isfinite(theirs)
         a, b = own[both], theirs[both]
-        size = float(np.dot(a, a)) * float(np.dot(b, b))
-        if both.sum() >= PIECES and size > 0.0 and abs(float(np.dot(a, b))) >= SAME * math.sqrt(size):
+        if both.sum() < PIECES or not (a.any() and b.any()):
+            continue
+        factor = float(np.dot(a, b)) / float(np.dot(b, b))
+        left, size = float(np.mean((a - factor * b) ** 2)), float(np.mean(a**2))
+        if left < LIKE * size:
+            steps = (step_of(recording.columns[one].values)[0] for one in (name, other))
+            left -= ROUNDING / 6.0 * float(np.dot(np.square([*steps]), (1.0, factor**2)))
+        if left <= SAME * size:
             return f"its readings are those of {other}, but for a factor and an offset: which column is {name}?"
     return ""

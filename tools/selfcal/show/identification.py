@@ -165,9 +165,7 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
         case "quantization":
             return f"quantization: {100.0 * value:.2g} % of the readings are read as another code: a dead band?"
         case "motion" | "stuck":
-            times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in outcome["intervals"][:TIMES_MOST])
-            more = len(outcome["intervals"]) - TIMES_MOST
-            return f"{check}, left out: {times}{f' and {more} more' if more > 0 else ''}"
+            return f"{check}, left out: {_times(outcome['intervals'])}"
         case "channel":
             text = f"{outcome['column']} ({outcome['form']}) explains {nats} nats of it"
             return f"channel: {text}: N, K and the bias include that"
@@ -177,6 +175,13 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
         case "jump":
             return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {nats} nats: K includes that"
     return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
+
+
+def _times(intervals: Sequence[Sequence[float]]) -> str:
+    """The first few stretches, and how many more there are."""
+    times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in intervals[:TIMES_MOST])
+    more = len(intervals) - TIMES_MOST
+    return f"{times}{f' and {more} more' if more > 0 else ''}"
 
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
@@ -231,6 +236,9 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         for name, axis in axes.items()
     )
     kept += [f"kept out: {names}: {counts}" for counts, names in lost.items() if counts]
+    harmless = {name: axis["checks"].get("motion", {"passed": False}) for name, axis in axes.items()}
+    moved = _by_reason((_times(one["intervals"]), name) for name, one in harmless.items() if one["passed"])
+    kept += [f"motion, left out, N is the same with it: {names}: {times}" for times, names in moved.items()]
     without = _by_reason((axis["error"], name) for name, axis in document["axes"].items() if name not in axes)
     failed = [f"no result: {names}: {error}; choose axes with --axis" for error, names in without.items()]
     for name, axis in axes.items():

@@ -37,7 +37,7 @@ def monitor(
     ] = None,
     stream: Annotated[
         Sequence[str],
-        option("Reports for other programs: udp-json, jsonl, foxglove (repeat for more)", metavar="KIND[:HOST:PORT]"),
+        option("Reports for other programs: udp-json, jsonl, foxglove, ros:HZ (repeat)", metavar="KIND[:HOST:PORT]"),
     ] = (),
     duration: Annotated[float | None, option("Stop after this long; default: Ctrl-C", metavar="S")] = None,
     bitrate: Annotated[int | None, option("Of the CAN bus, if it needs one", metavar="BIT/S")] = None,
@@ -53,12 +53,11 @@ def monitor(
     that vanishes is waited for, unless `once`. `speed`: how many times as fast as it came a log is played; default:
     as fast as it is read. `log`: file for the raw frames as they arrive, damaged ones too; its suffix chooses
     python-can's format, or MCAP, which takes the reports too; an older one is not written over. `stream`: where each
-    report goes as it comes, `udp-json` or `foxglove` with `:HOST:PORT` or without, or `jsonl` on stdout. `bitrate` of
-    the CAN bus, bit/s, where the interface needs one. `json`: the last complete reports as a document
+    report goes as it comes, `udp-json` or `foxglove` with `:HOST:PORT` or without, or `jsonl` or `ros:HZ` on stdout.
+    `bitrate` of the CAN bus, bit/s, where the interface needs one. `json`: the last complete reports as a document
     `selfcal.identify/1` in telemetry's units, without checks, with the `node`; of several modules a document
-    `selfcal.modules/1` that holds one for each. `plot`: the
-    picture of the run; of several modules one each, whose name ends in the node. Raises UserError for what the user
-    can put right.
+    `selfcal.modules/1` that holds one for each. `plot`: the picture of the run; of several modules one each, whose name
+    ends in the node. Raises UserError for what the user can put right.
     """
     from rich.console import Console
 
@@ -73,7 +72,7 @@ def monitor(
     from selfcal.wire.live import Contact, View, patient
     from selfcal.wire.monitor import Outcome, Run
     from selfcal.wire.streams import check as check_stream
-    from selfcal.wire.streams import open_streams
+    from selfcal.wire.streams import LINES, open_streams
 
     if (channel is None) == (read is None):
         raise UserError(
@@ -93,8 +92,9 @@ def monitor(
         check_picture(plot)
     for kind in stream:
         check_stream(kind)
-    if "jsonl" in stream and str(json) == "-":
-        raise UserError("--stream jsonl and --json - are both for stdout: give --json a file")
+    on_stdout = [kind for kind in (wanted.split(":")[0] for wanted in stream) if kind in LINES]
+    if len([*on_stdout, *([json] if str(json) == "-" else [])]) > 1:
+        raise UserError(f"--stream {on_stdout[0]} and another one, or --json -, are both for stdout: give one alone")
     check_writable(json, plot)
     name = str(read if channel is None else channel)
     models = KnownModels(model, start)

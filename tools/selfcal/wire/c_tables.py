@@ -71,6 +71,9 @@ def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
         yield model.left_out
     if model.hidden_input is not None:
         yield f"{model.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"
+    measured = {name for name, one in model.simulate.get("axes", {}).items() if "hypothesis" in one}
+    if measured and (others := [one.name for one in tables.axes if one.name not in measured]):
+        yield f"{model.path}: wide priors, without a result in the file: {', '.join(others)}"
     if model.gate is not None and gate_table(model, tables) is None:
         yield f"{model.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
     if tables.handling.outlier_sd and tables.block == 1:

@@ -1,4 +1,5 @@
-"""Reports of modules for other programs, as they come: JSON by UDP, by lines, by Foxglove's websocket, in MCAP files.
+"""Reports of modules for other programs, as they come: JSON by UDP, by lines, by Foxglove's websocket, in MCAP files;
+messages of ROS 2 by lines.
 
 Each report is one JSON object. PlotJuggler takes the form of UDP and lines: its curves are node0/gx/bias/mean and so
 on, and `timestamp` is the host's clock when the report came, s since 1970. Foxglove and MCAP have a topic an axis,
@@ -14,25 +15,29 @@ import select
 import socket
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
 
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, install
+from selfcal.base.limits import MOST_RATE_HZ
 from selfcal.base.output import finite
 from selfcal.base.units import parameter_unit
 from selfcal.logs.framelog import FRAMES
 from selfcal.wire.dbc_file import PLACE_NAMES, Names
 from selfcal.wire.frames import AXES, AxisReport, axis_unit
 from selfcal.wire.live import told_of
+from selfcal.wire.ros_messages import diagnostics, imu
 
 if TYPE_CHECKING:
     import can
 
 #: Default ports of the programs: PlotJuggler's UDP server, Foxglove's websocket.
 PORTS = {"udp-json": 9870, "foxglove": 8765}
-KINDS = (*PORTS, "jsonl")
+#: Kinds that go to stdout; `ros` takes the rate of the readings, Hz.
+LINES = ("jsonl", "ros")
+KINDS = (*PORTS, *LINES)
 HOST = "127.0.0.1"
 #: Statistics of a parameter in a report.
 TOLD = ("mean", "median", "sd", "q05", "q95")
@@ -121,7 +126,14 @@ class _Lines:
     """A line each on stdout, at once. It waits for a reader, but no longer than until a signal asks for the end."""
 
     def send(self, report: Mapping[str, Any], at_s: float) -> None:
-        line = line_of(report, at_s)
+        for line in self.lines(report, at_s):
+            self._print(line)
+
+    def lines(self, report: Mapping[str, Any], at_s: float) -> Iterator[str]:
+        """Those of a report."""
+        yield line_of(report, at_s)
+
+    def _print(self, line: str) -> None:
         try:
             stdout = sys.stdout.fileno()
         except OSError:  # a program's own stdout is no file
@@ -137,6 +149,24 @@ class _Lines:
 
     def close(self) -> None:
         sys.stdout.flush()
+
+
+class _Ros(_Lines):
+    """Messages of ROS 2, a line each: its topic, its type and its fields."""
+
+    def __init__(self, rate_hz: int) -> None:
+        self._rate_hz = rate_hz
+        self._known: dict[int, dict[str, Mapping[str, Any]]] = {}
+
+    def lines(self, report: Mapping[str, Any], at_s: float) -> Iterator[str]:
+        """The status of the axis, and the node's Imu."""
+        of_node = self._known.setdefault(report["node"], {})
+        of_node[report["axis"]] = report
+        for topic_of, kind, told in (
+            ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", diagnostics(report, at_s)),
+            (f"/selfcal/node{report['node']}/imu", "sensor_msgs/msg/Imu", imu(of_node, self._rate_hz, at_s)),
+        ):
+            yield json.dumps({"topic": topic_of, "type": kind, "msg": told}, allow_nan=False)
 
 
 class _Foxglove:
@@ -170,10 +200,15 @@ class _Foxglove:
 
 
 def check(wanted: str) -> tuple[str, str, int]:
-    """Kind, host and port of an option `KIND[:HOST:PORT]`. Raises UserError."""
+    """Kind, host and port of an option `KIND[:HOST:PORT]`; of `ros:HZ` the rate in place of a port. Raises
+    UserError."""
     kind, *where = wanted.split(":")
     if kind not in KINDS:
         raise UserError(f"--stream {wanted}: there is no such stream ({', '.join(KINDS)})")
+    if kind == "ros":
+        if len(where) != 1 or not where[0].isdecimal() or not 0 < int(where[0]) <= MOST_RATE_HZ:
+            raise UserError(f"--stream {wanted}: write ros:HZ, the rate of the readings that the covariances are of")
+        return kind, "", int(where[0])
     if not where:
         return kind, HOST, PORTS.get(kind, 0)
     if kind == "jsonl" or len(where) != 2 or not where[0] or not where[1].isdecimal() or not 0 < int(where[1]) < 65536:
@@ -186,8 +221,8 @@ def open_streams(wanted: Sequence[str], stack: ExitStack) -> list[Stream]:
     sinks: list[Stream] = []
     for stream in wanted:
         kind, host, port = check(stream)
-        if kind == "jsonl":
-            sinks.append(_Lines())
+        if kind in LINES:
+            sinks.append(_Lines() if kind == "jsonl" else _Ros(port))
         else:
             sinks.append(_Udp(host, port) if kind == "udp-json" else _Foxglove(host, port))
         stack.callback(sinks[-1].close)

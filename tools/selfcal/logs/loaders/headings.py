@@ -215,6 +215,12 @@ def sides_of(keys: Iterable[str]) -> Sensor | None:
 
 
 def _native(keys: Sequence[str], taken: Mapping[str, str]) -> dict[str, Meaning]:
+    """The time and the temperature of a table whose axes need no form."""
+    warm = {} if "temp" in taken.values() else _temperature(FORMS[-1], _free(FORMS[-1], keys, taken), "")
+    return warm | _native_time(keys, taken)
+
+
+def _native_time(keys: Sequence[str], taken: Mapping[str, str]) -> dict[str, Meaning]:
     """The time column of a table whose axes need no form."""
     names = [taken.get(key, split(key)[0]) for key in keys]
     times = [key for key, name in zip(keys, names, strict=True) if name.lower() in TIMES and key not in taken]

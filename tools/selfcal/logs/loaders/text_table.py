@@ -87,7 +87,7 @@ _SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 _RATE = re.compile(r"(?:sampl\w+|update|output|data)[ _]?rate\W{1,4}(\d+(?:\.\d+)?) ?Hz", re.ASCII | re.IGNORECASE)
 
 #: Rows in which the sensors that take turns are looked for, so many sensors at most, and their names.
-_LOOKED_AT, _MOST_NUMBERED, _WORD = 1000, 16, re.compile(r"\w[\w ./:-]{0,59}")
+LOOKED_AT, _MOST_NUMBERED, _WORD = 1000, 16, re.compile(r"\w[\w ./:-]{0,59}")
 #: Turns of a sensor at least, its rows in one turn at most, and how many times as many another may have.
 _TURNS, _LONGEST_TURN, _SELDOM = 5, 64, 8
 
@@ -171,16 +171,8 @@ class TextReader:
 
     def in_turn(self) -> list[tuple[str, str]]:
         """The column by which the rows of several sensors take turns, and its cell for each of them; none of one."""
-        rows = [cells for line in self._batch[:_LOOKED_AT] if len(cells := self._cells(line)) == len(self.keys)]
-        numbering = number_of(self.keys)
-        for place, key in enumerate(self.keys):
-            cells = [row[place].strip(_QUOTED) for row in rows]
-            found = list(dict.fromkeys(cells))
-            if not 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 or not all(map(_WORD.fullmatch, found)):
-                continue
-            if key == numbering or not (any(map(_ROW.fullmatch, found)) or _keeps(cells)):
-                return [(key, cell) for cell in found]
-        return []
+        rows = [cells for line in self._batch[:LOOKED_AT] if len(cells := self._cells(line)) == len(self.keys)]
+        return in_turn(self.keys, [[row[place].strip(_QUOTED) for row in rows] for place in range(len(self.keys))])
 
     def only(self, key: str, cell: str) -> None:
         """Read only the rows that have this cell in a column."""
@@ -484,6 +476,19 @@ class TextReader:
             days += _DAY_S
         self._day = (second if math.isnan(first) else first, second, days)
         return second + days - self._day[0]
+
+
+def in_turn(keys: Sequence[str], columns: Sequence[Sequence[str]]) -> list[tuple[str, str]]:
+    """The column by which the rows of several sensors take turns, and its cell for each of them; none of one.
+    `columns`: the cells of the first LOOKED_AT rows."""
+    numbering = number_of(keys)
+    for key, cells in zip(keys, columns, strict=True):
+        found = list(dict.fromkeys(cells))
+        if not 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 or not all(map(_WORD.fullmatch, found)):
+            continue
+        if key == numbering or not (any(map(_ROW.fullmatch, found)) or _keeps(cells)):
+            return [(key, cell) for cell in found]
+    return []
 
 
 def _keeps(cells: Sequence[str]) -> bool:
