@@ -40,7 +40,7 @@ POSITIONS = {6: FLATS, 12: TWELVE, 24: TWENTY_FOUR}
 
 @dataclass
 class Part:
-    """The truth: numbers of the model in tools/selfcal/tumble, in SI units; laws by kind, `lsb` 0 for none."""
+    """The truth: numbers of the model in tools/selfcal/calibration, in SI units; laws by kind, `lsb` 0 for none."""
 
     bias: Array
     scale: Array
@@ -90,9 +90,7 @@ def matrices(part: Part) -> tuple[Array, Array]:
     """T K of the accelerometers and of the gyros."""
     T, U = np.eye(3), np.eye(3)
     T[0, 1], T[0, 2], T[1, 2] = part.angles
-    for (row, column), value in zip(
-        ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)), part.gyro_angles, strict=True
-    ):
+    for (row, column), value in zip(((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1)), part.gyro_angles, strict=True):
         U[row, column] = value
     return T * part.scale, U * part.gyro_scale
 
@@ -151,12 +149,18 @@ def tumbled(
         s = fine**3 * (10.0 - 15.0 * fine + 6.0 * fine**2)
         window = np.sin(math.pi * fine) ** 3
         tremor = sum(
-            math.radians(1.5) * random.standard_normal(3)[None, :] * np.sin(2 * math.pi * (hz * fine * n * dt + phase))[:, None]
+            math.radians(1.5)
+            * random.standard_normal(3)[None, :]
+            * np.sin(2 * math.pi * (hz * fine * n * dt + phase))[:, None]
             for hz, phase in zip((1.3, 4.1, 8.7), random.random(3), strict=True)
         )
         # The target lies in the body frame of the start.
         phi = _to(_tilted(positions[k + 1], tilt, random), R)
-        way = Rotation.from_matrix(R) * Rotation.from_rotvec(s[:, None] * phi) * Rotation.from_rotvec(window[:, None] * tremor)
+        way = (
+            Rotation.from_matrix(R)
+            * Rotation.from_rotvec(s[:, None] * phi)
+            * Rotation.from_rotvec(window[:, None] * tremor)
+        )
         matrices_of = way.as_matrix()
         rate = (way[:-1].inv() * way[1:]).as_rotvec() * rate_hz * finer
         middle = matrices_of[:-1]
@@ -218,6 +222,7 @@ def model_of(part: Part) -> Model:
     tree["hypotheses"] = {part.law: 1}
     tree["simulate"]["axes"] = {}
     for kind, (group, unit) in enumerate((("accel", "m/s^2"), ("gyro", "rad/s"))):
+
         def about(value: float) -> dict[str, Any]:
             return {"law": "log_normal", "median": value, "sd": 0.02}
 

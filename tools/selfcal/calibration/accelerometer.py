@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from selfcal.base.errors import UserError
-from selfcal.tumble.earth import Place
-from selfcal.tumble.fit import FALSE_ALARM, Fit, Problem, fit
-from selfcal.tumble.noise import drift
-from selfcal.tumble.rests import ACCEL, Rest, Tumble
+from selfcal.calibration.earth import Place
+from selfcal.calibration.fit import FALSE_ALARM, Fit, Problem, drift_share, fit
+from selfcal.calibration.noise import drift
+from selfcal.calibration.rests import ACCEL, Rest, Tumble
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -120,8 +120,14 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
         )
     warmth = warmth_of(tumble)
     reference_s = float(tumble.end_s.max())
-    problem, mean, prior = _problem(tumble, place, warmth, reference_s)
-    return Accelerometer(fit(problem, mean, mean, prior), tumble, place, warmth, reference_s)
+
+    def fit_of(known: Tumble) -> Fit:
+        problem, mean, prior = _problem(known, place, warmth, reference_s)
+        return fit(problem, mean, mean, prior)
+
+    if any(tumble.noise[name].wide for name in ACCEL):
+        tumble = tumble.with_drift(ACCEL, drift_share(lambda share: fit_of(tumble.with_drift(ACCEL, share))))
+    return Accelerometer(fit_of(tumble), tumble, place, warmth, reference_s)
 
 
 def causes(found: Accelerometer) -> list[tuple[str, float]]:

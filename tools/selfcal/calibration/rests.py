@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, runs
 from selfcal.base.units import factor
+from selfcal.calibration.noise import LONG_S, Noise, measured, of_model, of_rest, rounding
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
 from selfcal.readings.rest import PIECE_S, rest_of
-from selfcal.tumble.noise import LONG_S, Noise, measured, of_model, of_rest, rounding
 
 Array = NDArray[np.float64]
 
@@ -71,12 +71,16 @@ class Tumble:
     turns: tuple[Turn, ...]
     noise: dict[str, Noise]
     left_out: tuple[str, ...] = ()
-    notes: tuple[str, ...] = field(default=())
+    notes: tuple[str, ...] = ()
 
     @property
     def has_gyro(self) -> bool:
         """The logs have three gyros."""
         return GYRO[0] in self.noise
+
+    def with_drift(self, names: Sequence[str], share: float) -> Tumble:
+        """With this share of the wide drift of axes."""
+        return replace(self, noise={**self.noise, **{name: self.noise[name].scaled(share) for name in names}})
 
     @property
     def begin_s(self) -> Array:
@@ -110,8 +114,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
         raise UserError(f"more than {MOST} rests: choose a stretch with --start and --end")
     ranges = {name: _range(model, name) if part_stated else math.inf for name in axes}
     typical = {
-        name: float(np.median([np.nanstd(log.own[name][rows]) for log in logs for rows in log.rests] or [0.0]))
-        for name in axes
+        name: _median([float(np.nanstd(log.own[name][rows])) for log in logs for rows in log.rests]) for name in axes
     }
     rests: list[Rest] = []
     turns: list[Turn] = []
@@ -158,22 +161,27 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
 def _noise(logs: Sequence[_Log], name: str, model: Model, *, part_stated: bool) -> Noise:
     """White noise and drift of an axis: of the part's own model, of a long rest, or of a prior about the noise that the
     rests show."""
-    pieces, longest = [], (0.0, None)
+    pieces = []
+    longest: tuple[float, Recording, slice] | None = None
     for log in logs:
         size = max(1, round(PIECE_S * log.recording.rate_hz))
         pieces += [block_means(log.own[name][rows], size) for rows in log.rests]
         for rows in log.rests:
             seconds = (rows.stop - rows.start) / log.recording.rate_hz
-            if seconds > longest[0]:
-                longest = (seconds, (log.recording, rows))
+            if seconds >= LONG_S and (longest is None or seconds > longest[0]):
+                longest = seconds, log.recording, rows
     white = measured(pieces, PIECE_S)
-    if not part_stated and longest[1] is not None and longest[0] >= LONG_S:
-        recording, rows = longest[1]
+    if not part_stated and longest is not None:
+        _, recording, rows = longest
         kept = np.zeros(recording.samples, bool)
         kept[rows] = True
         if (found := of_rest(recording.with_rows(kept), name, model, UNITS[name])) is not None:
             return found
     return of_model(model, name, UNITS[name], None if white is None else math.sqrt(white))
+
+
+def _median(values: Sequence[float]) -> float:
+    return float(np.median(values)) if values else 0.0
 
 
 def _begins(recordings: Sequence[Recording]) -> tuple[list[float], list[str]]:
@@ -254,7 +262,7 @@ def _turn(log: _Log, begin: int, end: int, rest: int, ranges: dict[str, float]) 
 
 
 def _flat(part: Array, values: Array) -> bool:
-    """Whether readings of a turn [n] stop at the record's extreme: they are equal there, the readings beside far off."""
+    """Whether readings of a turn [n] stop at the record's extreme: equal there, and the readings beside far off."""
     step = step_of(values[np.isfinite(values)])[0]
     for extreme in (float(np.nanmax(values)), float(np.nanmin(values))):
         for first, behind in runs(part == extreme):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,11 +41,18 @@ class Term:
 
 @dataclass(frozen=True)
 class Noise:
-    """An axis: mean square of N, and the terms of its drift; unit^2 s and unit^2/s or unit^2. `words`: the source."""
+    """An axis: mean square of N, and the terms of its drift; unit^2 s and unit^2/s or unit^2. `words`: the source.
+    `wide`: the terms are those of a prior that spans decades: residuals may show that they are less."""
 
     white: float
     terms: tuple[Term, ...]
     words: str
+    wide: bool = False
+
+    def scaled(self, share: float) -> Noise:
+        """With this share of the drift's variance, if its prior is wide."""
+        terms = tuple(Term(share * one.square, one.alpha) for one in self.terms)
+        return replace(self, terms=terms) if self.wide else self
 
 
 def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Array:
@@ -108,12 +115,12 @@ def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
     size = factor(group.unit, unit)
     priors, words = group.priors, f"{model.name}"
     if not known(group):
-        words = f"not known: the prior of {model.name} (a rest of {LONG_S / 60.0:.0f} min or --model would narrow it)"
+        words = f"not known: the prior of {model.name}, weighed by the residuals"
         priors = laid(priors, N / size) if N is not None else priors
     middle = {key: (mean_square(one), one.median) for key, one in priors.items() if key != "bias"}
     terms = of_laws(model.laws, model.hypotheses, dict.fromkeys(model.laws, middle))
     white = size**2 * middle["N"][0] if N is None else N**2
-    return Noise(white, tuple(Term(size**2 * one.square, one.alpha) for one in terms), words)
+    return Noise(white, tuple(Term(size**2 * one.square, one.alpha) for one in terms), words, not known(group))
 
 
 def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise | None:
@@ -132,7 +139,9 @@ def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise |
     terms = of_laws(model.laws, result.probability, values)
     white = sum(share * values[law]["N"][0] for law, share in result.probability.items())
     return Noise(
-        size * white, tuple(Term(size * one.square, one.alpha) for one in terms), f"{recording.duration_s:.0f} s at rest"
+        size * white,
+        tuple(Term(size * one.square, one.alpha) for one in terms),
+        f"{recording.duration_s:.0f} s at rest",
     )
 
 
