@@ -148,12 +148,10 @@ def tumbled(
         fine = np.arange(n * finer + 1) / (n * finer)
         s = fine**3 * (10.0 - 15.0 * fine + 6.0 * fine**2)
         window = np.sin(math.pi * fine) ** 3
-        tremor = sum(
-            math.radians(1.5)
-            * random.standard_normal(3)[None, :]
-            * np.sin(2 * math.pi * (hz * fine * n * dt + phase))[:, None]
-            for hz, phase in zip((1.3, 4.1, 8.7), random.random(3), strict=True)
-        )
+        tremor = np.zeros((fine.size, 3))
+        for hz, size in ((1.3, 1.5), (4.1, 0.3), (8.7, 0.05)):
+            swing = np.sin(2.0 * math.pi * (hz * fine * n * dt + random.random()))
+            tremor += math.radians(size) * random.standard_normal(3) * swing[:, None]
         # The target lies in the body frame of the start.
         phi = _to(_tilted(positions[k + 1], tilt, random), R)
         way = (

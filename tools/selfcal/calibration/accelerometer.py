@@ -131,8 +131,7 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
 
 
 def causes(found: Accelerometer) -> list[tuple[str, float]]:
-    """Causes of residuals beyond their sd with the probability of each by chance, corrected for their number; the
-    surest first. None where the residuals are as they should be."""
+    """Causes of residuals beyond their sd, as `Fit.surest` has them: a square, hysteresis, each rest by itself."""
     tumble, one = found.tumble, found.fit
     a = np.array([rest.accel for rest in tumble.rests])
     count = len(a)
@@ -140,16 +139,15 @@ def causes(found: Accelerometer) -> list[tuple[str, float]]:
     w = u @ found.matrix / found.place.gravity
     before = np.vstack([np.zeros(3), a[:-1]])
     tried = [
-        ("a square of the scale: the axes are not linear", one.gain(w * a**2)),
-        ("hysteresis: the bias depends on the position before", one.gain(w * before)),
+        ("a square of the scale: the axes are not linear", w * a**2),
+        ("hysteresis: the bias depends on the position before", w * before),
     ]
     for k, rest in enumerate(tumble.rests):
         where = f"the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s"
         moved = chi2.sf(_halves(found, rest), 3) * count < FALSE_ALARM
         said = f"the mount moved within {where}" if moved else f"{where} was none, or its mount was not still"
-        tried.append((said, one.gain(np.eye(count)[:, [k]])))
-    certain = [(said, min(1.0, p * len(tried))) for said, (p, _) in tried]
-    return sorted((one for one in certain if one[1] < FALSE_ALARM), key=lambda one: one[1])
+        tried.append((said, np.eye(count)[:, [k]]))
+    return one.surest(tried)
 
 
 def _halves(found: Accelerometer, rest: Rest) -> float:

@@ -201,10 +201,9 @@ def _turns(gyro: Gyroscope) -> list[str]:
     named = []
     if not known[gyroscope.G].all():
         named.append("rests with other sides up: four or more, not all in one plane")
-    angles = {column: known[gyroscope.ANGLE][k] for k, (_, column) in reversed(list(enumerate(gyroscope.PLACES)))}
     for k, axis in enumerate(AXES):
         own = [known[gyroscope.ANGLE][n] for n, (_, column) in enumerate(gyroscope.PLACES) if column == k]
-        if not (known[gyroscope.SCALE][k] and all(own) and angles[k]):
+        if not (known[gyroscope.SCALE][k] and all(own)):
             named.append(f"turns of 60 to 120 deg about {axis}, with {axis} level, from two sides")
     return named
 

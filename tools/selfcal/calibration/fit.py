@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +18,17 @@ Mask = NDArray[np.bool_]
 #: Residuals [m], their derivatives [m, n] and their covariance [m, m] at parameters [n].
 Problem = Callable[[Array], tuple[Array, Array, Array]]
 
-#: Iterations at most, and the last step, in posterior sd.
-ITERATIONS, SETTLED = 50, 1e-5
+#: Iterations and halvings of a step at most. A step below `NEAR`, in posterior sd, is taken as it is, and the last one
+#: is below `SETTLED`.
+ITERATIONS, HALVINGS, NEAR, SETTLED = 50, 8, 0.3, 1e-4
+UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
 #: A parameter is identified if the data leave this share of its prior variance at most.
 IDENTIFIED = 0.1
 #: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
 FALSE_ALARM = 0.005
 #: Shares of a drift's mean square under a wide prior that are weighed: three decades of its deviation.
-SHARES = 10.0 ** -np.arange(0.0, 6.5, 0.75)
+#: A fit that is only weighed settles earlier.
+SHARES, ROUGHLY = 10.0 ** -np.arange(0.0, 6.5, 0.75), 0.1
 #: Residuals beyond the parameters that a check takes at least.
 FREE_LEAST = 0.5
 
@@ -45,13 +48,18 @@ class Fit:
     pulled: float
 
     @property
+    def squares(self) -> float:
+        """Sum of squares of the residuals and the prior."""
+        return float(self.white @ self.white) + self.pulled
+
+    @property
     def evidence(self) -> float:
         """ln of the likelihood under the prior, but for a constant (Laplace)."""
         factor = np.linalg.cholesky(self.prior)
         seen = self.columns @ factor
         size = float(np.linalg.slogdet(np.eye(factor.shape[0]) + seen.T @ seen)[1])
         noise = 2.0 * float(np.log(np.diag(self.root)).sum())
-        return -0.5 * (float(self.white @ self.white) + self.pulled + noise + size)
+        return -0.5 * (self.squares + noise + size)
 
     @property
     def left(self) -> Array:
@@ -80,46 +88,66 @@ class Fit:
         """rms of the residuals in their own sd; NaN where too few are left to say."""
         return math.sqrt(float(self.white @ self.white) / self.free) if self.free > FREE_LEAST else math.nan
 
-    def gain(self, columns: Array) -> tuple[float, Array]:
-        """Probability by chance of what further columns [m, k] of the residuals explain, and their coefficients [k]."""
+    def gain(self, columns: Array) -> tuple[float, float]:
+        """What further columns [m, k] of the residuals explain of the sum of squares, and its probability by chance."""
         more = solve_triangular(self.root, columns, lower=True)
         apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
         normal = more.T @ apart
         values, vectors = np.linalg.eigh(normal)
         kept = values > 1e-9 * max(float(values.max(initial=0.0)), float(np.trace(more.T @ more)))
         inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-        c: Array = inverse @ (apart.T @ self.white)
-        return float(chi2.sf(c @ normal @ c, max(int(kept.sum()), 1))), -c
+        c = inverse @ (apart.T @ self.white)
+        explained = float(c @ normal @ c)
+        return explained, float(chi2.sf(explained, max(int(kept.sum()), 1)))
+
+    def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
+        """Of causes, each in words and by its columns, those that explain more than chance, the surest first; with
+        their probability by chance, corrected for the number of causes."""
+        found = [(said, *self.gain(columns)) for said, columns in tried]
+        certain = [(p * len(tried), -explained, said) for said, explained, p in found]
+        return [(said, min(1.0, p)) for p, _, said in sorted(certain) if p < FALSE_ALARM]
 
 
-def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
+def fit(
+    problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None, settled: float = SETTLED
+) -> Fit:
     """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
-    stay at their mean, as if their prior variance were 0. Raises UserError where no step settles."""
+    stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
+    `settled`: the last step, in posterior sd. Raises UserError where none settles."""
     free = np.ones(start.size, bool) if held is None else ~held
     theta = np.where(free, start, mean)
     block = np.ix_(free, free)
     unit = np.sqrt(np.diag(prior))[free]
     inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
-    for _ in range(ITERATIONS):
+
+    def at(theta: Array) -> Fit:
         r, J, R = problem(theta)
-        if not (np.isfinite(r).all() and np.isfinite(J).all() and np.isfinite(R).all()):
-            break
-        root = np.linalg.cholesky(R)
-        white, columns = (solve_triangular(root, one, lower=True) for one in (r, J))
-        own = columns[:, free] * unit
-        covariance = np.linalg.inv(own.T @ own + inverse)
-        step = -covariance @ (own.T @ white + inverse @ ((theta - mean)[free] / unit))
-        theta = theta.copy()
-        theta[free] += step * unit
-        if float(np.max(np.abs(step) / np.sqrt(np.diag(covariance)))) < SETTLED:
-            r, J, R = problem(theta)
-            root = np.linalg.cholesky(R)
-            white, columns = (solve_triangular(root, one, lower=True) for one in (r, J))
-            whole = np.zeros(prior.shape)
-            whole[block] = covariance * np.outer(unit, unit)
-            apart = (theta - mean)[free] / unit
-            return Fit(theta, whole, prior, white, columns * free, np.asarray(root), float(apart @ inverse @ apart))
-    raise UserError("the fit does not settle: are the logs of one part, and its axes in the units of their headings?")
+        if not all(np.isfinite(one).all() for one in (r, J, R)):
+            raise UserError(UNSETTLED)
+        root = np.asarray(np.linalg.cholesky(R))
+        white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
+        own, apart = columns[:, free] * unit, (theta - mean)[free] / unit
+        whole = np.zeros(prior.shape)
+        whole[block] = np.linalg.inv(own.T @ own + inverse) * np.outer(unit, unit)
+        return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart))
+
+    found = at(theta)
+    for _ in range(ITERATIONS):
+        apart = (found.theta - mean)[free] / unit
+        pull = found.columns[:, free].T @ found.white + inverse @ apart / unit
+        step = np.zeros(theta.size)
+        step[free] = -found.covariance[block] @ pull
+        far = float(np.max(np.abs(step[free]) / np.sqrt(np.diag(found.covariance)[free])))
+        following = at(found.theta + step)
+        for _ in range(HALVINGS if far > NEAR else 0):
+            if following.squares < found.squares:
+                break
+            step *= 0.5
+            following = at(found.theta + step)
+        found = following
+        if far < settled:
+            return found
+    raise UserError(UNSETTLED)
 
 
 def drift_share(fit_at: Callable[[float], Fit]) -> float:

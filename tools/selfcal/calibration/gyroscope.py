@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import Accelerometer, matrix_of
-from selfcal.calibration.fit import FALSE_ALARM, Fit, Mask, drift_share, fit
+from selfcal.calibration.fit import ROUGHLY, SETTLED, Fit, Mask, drift_share, fit
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import ACCEL, GYRO, Turn
 
@@ -116,7 +116,7 @@ def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
         near: list[Array] = []
 
         def fit_at(share: float) -> Fit:
-            found = _calibrate(replace(accel, tumble=accel.tumble.with_drift(GYRO, share)), held, near).fit
+            found = _calibrate(replace(accel, tumble=accel.tumble.with_drift(GYRO, share)), held, near, ROUGHLY).fit
             near[:] = [found.theta]
             return found
 
@@ -125,7 +125,7 @@ def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
     return _calibrate(accel, held, [])
 
 
-def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array]) -> Gyroscope:
+def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array], settled: float = SETTLED) -> Gyroscope:
     """The same with the drift as it is; from the parameters `near`, if there are any."""
     problem = _Problem(accel)
     of_accel, thermal = problem.of_accel, THERMAL_SD if accel.warmth.size else 0.0
@@ -140,7 +140,7 @@ def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array]) -> Gy
     start = mean.copy()
     start[of_accel:][BIAS] = problem.y.mean(axis=0)
     keep = None if held is None else np.concatenate([np.zeros(of_accel, bool), held])
-    found = fit(problem, near[0] if near else start, mean, prior, keep)
+    found = fit(problem, near[0] if near else start, mean, prior, keep, settled)
     return Gyroscope(found, of_accel, problem.turns, tuple(_causes(found, accel, problem.turns)))
 
 
@@ -282,16 +282,14 @@ def _across(u: Array) -> Array:
 
 
 def _causes(found: Fit, accel: Accelerometer, turns: tuple[Turn, ...]) -> list[tuple[str, float]]:
-    """Rests and turns whose residuals are beyond their sd, as `accelerometer.causes` has them."""
-    rests = accel.tumble.rests
-    size = found.white.size
-    tried = []
-    for k, rest in enumerate(rests):
-        p, _ = found.gain(np.eye(size)[:, 3 * k : 3 * k + 3])
-        tried.append((f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", p))
+    """Causes of residuals beyond their sd, as `Fit.surest` has them: each rest and each turn by itself."""
+    rests, one = accel.tumble.rests, np.eye(found.white.size)
+    tried = [
+        (f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", one[:, 3 * k : 3 * k + 3])
+        for k, rest in enumerate(rests)
+    ]
     for k, turn in enumerate(turns):
         first = 3 * len(rests) + 2 * k
-        p, _ = found.gain(np.eye(size)[:, first : first + 2])
-        tried.append((f"the turn at {rests[turn.first].at_s[1]:.6g} s does not end where its rates lead", p))
-    certain = [(said, min(1.0, p * len(tried))) for said, p in tried]
-    return sorted((one for one in certain if one[1] < FALSE_ALARM), key=lambda one: one[1])
+        said = f"the turn at {rests[turn.first].at_s[1]:.6g} s does not end where its rates lead"
+        tried.append((said, one[:, first : first + 2]))
+    return found.surest(tried)
