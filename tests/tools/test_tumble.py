@@ -136,9 +136,9 @@ def test_derivatives_of_the_turns(twelve: tuple[Recording, Truth]) -> None:
         step[k] = 1e-5
         slope = (problem(theta + step)[0] - problem(theta - step)[0]) / 2e-5
         # Left out: G f moves with the accelerometers' numbers, by G of 3e-4; the basis across u turns, times the
-        # residual, 1e-3. The sum of rotations is right to
+        # residual, 1e-3. The derivatives are sums over samples, right to
         # (w dt)^2.
-        tolerance = 0.01 if k < problem.of_accel else 1e-3
+        tolerance = 0.01 if k < problem.of_accel else 5e-3
         assert np.abs(slope - J[:, k]).max() < tolerance * max(float(np.abs(J[:, k]).max()), 1e-3), k
 
 
@@ -157,18 +157,16 @@ def test_intervals_hold_the_truth() -> None:
 def test_coverage(positions: int) -> None:
     """The long run."""
     held, known = covered(200, positions, 62)
-    used = known == 200
+    used = known > 0
     share = held[used].sum() / known[used].sum()
-    print(
-        f"\n{positions} positions: pooled {share:.3f}, least {held[used].min():.0f}, most {held[used].max():.0f} of 200"
-    )
-    print(f"accelerometers {held[:9][used[:9]]}, gyros {held[9:][used[9:]]}")
-    assert used[:6].all() and used[9:21].all()
-    assert held[used].min() >= 165
+    print(f"\n{positions} positions: pooled {share:.3f}, {held[used].min():.0f} to {held[used].max():.0f} of 200")
+    print(f"accelerometers {held[:9]} of {known[:9]}, gyros {held[9:]} of {known[9:]}")
+    assert (known[:6] > 190).all() and (known[9:21] > 190).all()
+    assert (held[used] >= 165 - (200 - known[used])).all()
     if positions == 6:  # the unknown angles stand in the intervals of the scales: they hold more than they say
         assert share > 0.88
     else:
-        assert used.all()
+        assert (known == 200).all()
         assert 0.88 <= share <= 0.92 and held.max() <= 192
 
 
@@ -214,13 +212,12 @@ def test_two_rests_have_no_answer() -> None:
 
 
 def test_three_rests_in_a_plane_identify_little() -> None:
-    """Five unknowns act in three equations: no scale and no angle has a number, nor has the axis that never moved."""
+    """Five unknowns act in three equations: nothing has a number."""
     random = np.random.default_rng(10)
     recording, _ = tumbled(draw_part(random), random, [FLATS[0], FLATS[1], EDGES[4]])
     document = selfcal.tumble(recording, gravity=G0)
-    for group in ("scale", "misalignment"):
+    for group in ("bias", "scale", "misalignment"):
         assert not any(of(document, "accelerometer", group).values())
-    assert not of(document, "accelerometer", "bias")["ax"]
     with pytest.raises(UserError, match="not identified: rest the part with"):
         selfcal.tumble(recording, gravity=G0, export=("px4", "never.params"))
     assert not Path("never.params").exists()

@@ -27,6 +27,8 @@ BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
 BIAS, SCALE, ANGLE, GRAVITY, THERMAL = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 2))
+#: A parameter beyond so many sd of its prior is none of an accelerometer.
+REACH = 10.0
 #: Rests without which there is no answer.
 FEWEST = 3
 
@@ -127,7 +129,15 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
 
     if any(tumble.noise[name].wide for name in ACCEL):
         tumble = tumble.with_drift(ACCEL, drift_share(lambda share: fit_of(tumble.with_drift(ACCEL, share))))
-    return Accelerometer(fit_of(tumble), tumble, place, warmth, reference_s)
+    found = Accelerometer(fit_of(tumble), tumble, place, warmth, reference_s)
+    apart = found.fit.theta[: THERMAL.start] - np.repeat([0.0, 1.0, 0.0], [3, 3, 4])
+    if np.abs(apart[:9] / np.sqrt(np.diag(found.fit.prior)[:9])).max() > REACH:
+        bias, scale = (", ".join(f"{one:.3g}" for one in found.fit.theta[part]) for part in (BIAS, SCALE))
+        raise UserError(
+            f"the accelerometers would have biases of {bias} m/s^2 and scales of {scale}: are the readings in the unit "
+            "of their headings, and did the part rest?"
+        )
+    return found
 
 
 def causes(found: Accelerometer) -> list[tuple[str, float]]:

@@ -165,7 +165,7 @@ def _positions(accel: Accelerometer) -> list[str]:
     seconds = float(np.median([one.seconds for one in rests]))
     white = max(accel.tumble.noise[name].white for name in ACCEL) / seconds
     noise = white + max(np.diag(accel.fit.root @ accel.fit.root.T).mean(), 0.0)
-    covariance, named = fit.covariance.copy(), []
+    covariance, named = fit.widened(), []
     inverse = np.linalg.inv(accel.matrix)
     candidates = [np.array(c, float) for c in np.ndindex(3, 3, 3) if 1 <= sum(abs(one - 1) for one in c) <= 2]
     for _ in range(MOST_NAMED):

@@ -22,8 +22,8 @@ Problem = Callable[[Array], tuple[Array, Array, Array]]
 #: is below `SETTLED`.
 ITERATIONS, HALVINGS, NEAR, SETTLED = 50, 8, 0.3, 1e-4
 UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
-#: A parameter is identified if the data leave this share of its prior variance at most.
-IDENTIFIED = 0.1
+#: A parameter is identified if the data leave this share of its prior variance at most, with priors so much wider.
+IDENTIFIED, WIDER = 0.2, 8.0
 #: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
 FALSE_ALARM = 0.005
 #: Shares of a drift's mean square under a wide prior that are weighed: three decades of its deviation.
@@ -61,10 +61,17 @@ class Fit:
         noise = 2.0 * float(np.log(np.diag(self.root)).sum())
         return -0.5 * (self.squares + noise + size)
 
+    def widened(self) -> Array:
+        """The covariance [n, n] were every prior WIDER times as wide: no parameter is known by another's prior."""
+        factor = np.linalg.cholesky(self.prior)
+        seen = self.columns @ factor
+        found: Array = factor @ np.linalg.inv(seen.T @ seen + np.eye(factor.shape[0]) / WIDER**2) @ factor.T
+        return found
+
     @property
     def left(self) -> Array:
-        """Share of each prior variance that the data leave [n]."""
-        left: Array = np.diag(self.covariance) / np.maximum(np.diag(self.prior), 1e-300)
+        """Share of each prior variance that the data alone leave [n]."""
+        left: Array = np.diag(self.widened()) / np.diag(self.prior)
         return left
 
     @property
