@@ -26,16 +26,18 @@ import selfcal
 from selfcal.base.errors import UserError
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
-from selfcal.calibration.document import OF_ACCEL, OF_GYRO, document_of
+from selfcal.calibration.document import OF_ACCEL, OF_GYRO
 from selfcal.calibration.earth import gravity_at, place
 from selfcal.calibration.export import FORMS
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.noise import Noise, Term, drift
+from selfcal.calibration.plan import plan_of
 from selfcal.calibration.rests import tumble_of
+from selfcal.calibration.show import show
 from selfcal.logs.recording import Recording
 from selfcal.model.file import DEFAULT, Model
 
-from conftest import run
+from conftest import ROOT, run
 
 Array = NDArray[np.float64]
 #: Latitude of the simulated desk, degrees.
@@ -589,6 +591,63 @@ def test_beside_other_methods() -> None:
             assert all(middle["selfcal"] < 1.25 * value for value in middle.values())
 
 
+def printed_in(page: str, command: str) -> list[str]:
+    """Words of the output below a command of a page, without its numbers, and the numbers."""
+    lines = page.splitlines()
+    at = next(k for k, line in enumerate(lines) if line.strip().startswith(f".venv/bin/selfcal {command}")) + 1
+    end = next(k for k in range(at, len(lines)) if lines[k] and lines[k][0] != " ")
+    return words_of("\n".join(lines[at:end]))
+
+
+def words_of(text: str) -> list[str]:
+    return re.sub("─+", "─", text).split()
+
+
+def assert_alike(said: list[str], printed: list[str]) -> None:
+    """Words exactly, numbers to 2 %: other compilers round otherwise."""
+    assert len(said) == len(printed)
+    for a, b in zip(said, printed, strict=True):
+        try:
+            assert math.isclose(float(a), float(b), rel_tol=0.02, abs_tol=0.01), (a, b)
+        except ValueError:
+            assert a == b
+
+
+def test_the_page_is_as_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """tools/TUMBLE.md: its log is this one, and so are the numbers that the text calls its truth."""
+    random = np.random.default_rng(620)
+    part = draw_part(random)
+    more = {"rest_s": 45.0, "turn_s": 3.0, "rate_hz": 50.0, "gravity": gravity_at(47.0, 400.0), "latitude_deg": 47.0}
+    recording, _ = tumbled(part, random, TWELVE, **more, name="desk.csv")
+    page = (ROOT / "tools" / "TUMBLE.md").read_text(encoding="utf-8")
+    show(selfcal.tumble(recording, latitude=47.0, height=400.0))
+    assert_alike(printed_in(page, "tumble desk.csv"), words_of(capsys.readouterr().out))
+    truth = [1e6 * (part.scale[0] - 1.0), 1e3 * part.angles[1], math.degrees(part.G[2, 0]), 1e3 * part.gyro_angles[5]]
+    told = re.findall(r"[−-]?[\d.]+(?= ppm, angle| mrad, G|\s+deg/s/g, angle| mrad\.)", page.split("Its truth:")[1])
+    assert [float(one.replace("−", "-")) for one in told[:4]] == pytest.approx(truth, rel=5e-3)
+
+
+def test_a_plan_reaches_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
+    """Parts of the model, rested as planned: their intervals are as wide as the plan has them, and it is the shortest."""
+    random = np.random.default_rng(70)
+    part = draw_part(random, law="random_walk")
+    document = plan_of(model_of(part), ["scale within 30 ppm", "angle within 0.1 mrad"])
+    row = next(one for one in document["rows"] if one["rests"] == 12)
+    assert row["rest_s"] is not None and row["reached"]["scale"] <= 3e-5 and row["reached"]["angle"] <= 1e-4
+    recording, _ = tumbled(part, random, TWELVE, rest_s=row["rest_s"] + 4.0, turn_s=4.0, latitude_deg=LATITUDE)
+    accel, _ = calibrated(recording, part, gyros=False)
+    half = 1.6449 * np.sqrt(np.diag(accel.fit.covariance))
+    # The rests come out a second shorter or longer than planned: pieces of 1 s, and what is cut beside a turn.
+    assert half[3:6].max() == pytest.approx(row["reached"]["scale"], rel=0.3)
+    assert half[6:9].max() == pytest.approx(row["reached"]["angle"], rel=0.3)
+    tighter = plan_of(model_of(part), ["scale within 30 ppm", "angle within 0.07 mrad"])
+    assert tighter["rows"][1]["rest_s"] is None or tighter["rows"][1]["rest_s"] > row["rest_s"]
+    with pytest.raises(UserError, match="a scale is in ppm or %"):
+        plan_of(model_of(part), ["scale within 3 mg"])
+    with pytest.raises(UserError, match="takes one of accelerometer bias, scale"):
+        plan_of(model_of(part), ["K within 20 %"])
+
+
 def test_formats_are_those_of_the_help() -> None:
-    assert set(FORMS) == {"yaml", "c", "kalibr", "px4", "ardupilot"}
-    assert document_of.__doc__
+    shown = run("tumble", "--help").stdout
+    assert all(name in shown for name in FORMS)

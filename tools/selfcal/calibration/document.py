@@ -50,7 +50,7 @@ def document_of(
         "schema": SCHEMA,
         "recordings": [recording_entry(one) for one in recordings],
         "gravity": {"value": place.gravity, "sd": place.sd, "unit": "m/s^2", "source": place.words},
-        "earth_rate": "vertical part subtracted" if place.vertical is not None else "unknown: in the intervals",
+        "earth_rate_known": place.vertical is not None,
         "bias_at_s": accel.reference_s,
         "noise": {
             name: {"N": math.sqrt(one.white), "unit": _density(name), "drift": one.words}

@@ -49,6 +49,10 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         drift = dict.fromkeys(one["drift"] for name, one in document["noise"].items() if name[0] == sensor[0])
         line("")
         line(f"{sensor}; drift of the bias: {'; '.join(drift)}")
+        if sensor == "gyroscope" and not document["earth_rate_known"]:
+            line("the Earth's rate is in the intervals of bias and g-sensitivity: --latitude would take it off")
+        if "bias_at_degC" in found:
+            line(f"bias at {found['bias_at_degC']:.4g} degC")
         table = Table(box=box.SIMPLE_HEAD)
         for heading in ("", "", "median", "5 %", "95 %", "unit"):
             table.add_column(heading, no_wrap=True, justify="right" if heading in ("median", "5 %", "95 %") else "left")
