@@ -85,6 +85,11 @@ def covered(count: int, positions: int, seed: int, *, part_known: bool = True) -
     return held, known
 
 
+def without_gyros(recording: Recording) -> Recording:
+    """The accelerometers alone: where a test is of them, the turns cost most of the time."""
+    return replace(recording, columns={name: one for name, one in recording.columns.items() if name[0] != "g"})
+
+
 @pytest.fixture(scope="module")
 def twelve() -> tuple[Recording, Truth]:
     """A log of the default twelve positions."""
@@ -149,10 +154,10 @@ def test_derivatives_of_the_turns(twelve: tuple[Recording, Truth]) -> None:
 
 def test_intervals_hold_the_truth() -> None:
     """A thin slice of the long run: pooled, no fewer than chance leaves of 90 % once in 1000 runs."""
-    held, known = covered(6, 12, 5)
-    assert known.sum() == 180
-    # The intervals of one calibration share its noise: some 60 of 180 are independent.
-    assert held.sum() / known.sum() > binom.ppf(1e-3, 60, 0.9) / 60
+    held, known = covered(4, 12, 5)
+    assert known.sum() == 120
+    # The intervals of one calibration share its noise: some 40 of 120 are independent.
+    assert held.sum() / known.sum() > binom.ppf(1e-3, 40, 0.9) / 40
 
 
 @pytest.mark.parametrize("positions", [6, 12, 24])
@@ -201,7 +206,7 @@ def test_six_flats_have_no_angles(tmp_path: Path) -> None:
 def test_edges_without_a_plane_leave_its_angle() -> None:
     random = np.random.default_rng(8)
     recording, _ = tumbled(draw_part(random), random, FLATS + FOUR_EDGES, latitude_deg=LATITUDE, tilt=0.0)
-    document = selfcal.tumble(recording, latitude=LATITUDE)
+    document = selfcal.tumble(without_gyros(recording), latitude=LATITUDE)
     assert of(document, "accelerometer", "misalignment") == {"xy": True, "xz": True, "yz": False}
     assert "".join(re.findall("[xyz]", document["accelerometer"]["would_mend"][0])) == "yz"
 
@@ -333,7 +338,7 @@ def test_a_clipped_axis_is_left_out_and_named() -> None:
     random = np.random.default_rng(24)
     part = replace(draw_part(random, limit=9.5), bias=np.zeros(3))
     recording, _ = tumbled(part, random, POSITIONS[24], latitude_deg=LATITUDE, rest_s=12.0)
-    document = selfcal.tumble(recording, gravity=G0)
+    document = selfcal.tumble(without_gyros(recording), gravity=G0)
     clipped = [one for one in document["notes"] if "is clipped" in one]
     assert len(clipped) == 6 and len(document["rests"]) == 18
 
@@ -360,7 +365,7 @@ def test_a_turn_that_clips_is_left_out_and_named() -> None:
 
 def test_a_wrong_gravity_goes_into_the_scales_alone(twelve: tuple[Recording, Truth]) -> None:
     """0.1 % of gravity is 0.1 % of every scale, and no residual shows it."""
-    right, wrong = (selfcal.tumble(twelve[0], gravity=g)["accelerometer"] for g in (G0, 1.001 * G0))
+    right, wrong = (selfcal.tumble(without_gyros(twelve[0]), gravity=g)["accelerometer"] for g in (G0, 1.001 * G0))
     for name in ("ax", "ay", "az"):
         ratio = wrong["scale"][name]["median"] / right["scale"][name]["median"]
         assert ratio == pytest.approx(1.001, abs=1e-5)
@@ -374,7 +379,7 @@ def test_clean_logs_are_adequate() -> None:
     for seed in range(6):
         random = np.random.default_rng([30, seed])
         recording, _ = tumbled(draw_part(random), random, TWELVE, latitude_deg=LATITUDE, rest_s=10.0, finer=4)
-        fired += selfcal.tumble(recording, gravity=G0, latitude=LATITUDE)["accelerometer"]["adequate"] is False
+        fired += selfcal.tumble(without_gyros(recording), gravity=G0)["accelerometer"]["adequate"] is False
     assert fired <= 1
 
 
@@ -497,7 +502,7 @@ def test_a_diagonal_by_its_formula(form: str, off: str, scale: str, gyro: str, t
     random = np.random.default_rng(40)
     for angles in (0.0, 0.02):
         part = replace(draw_part(random), angles=np.full(3, angles), G=np.zeros((3, 3)))
-        recording, truth = tumbled(part, random, TWELVE, latitude_deg=LATITUDE)
+        recording, truth = tumbled(part, random, TWELVE, latitude_deg=LATITUDE, rate_hz=50.0)
         text = exported(form, recording, tmp_path)
         number = dict(line.removeprefix("param set ").split() for line in text.splitlines() if line[0] != "#")
         b, k, g = (np.array([float(number[one.format(axis)]) for axis in "XYZ"]) for one in (off, scale, gyro))
@@ -572,8 +577,8 @@ def test_beside_other_methods() -> None:
         for k in range(6):
             own = np.random.default_rng([51, positions, k])
             part = draw_part(own, K=(1e-4, 3e-6))
-            recording, truth = tumbled(part, own, POSITIONS[positions], latitude_deg=LATITUDE, finer=4)
-            accel, _ = calibrated(recording, part, gyros=False)
+            recording, truth = tumbled(part, own, POSITIONS[positions], rate_hz=50.0, finer=2)
+            accel, _ = calibrated(without_gyros(recording), part, gyros=False)
             a = np.array([one.accel for one in accel.tumble.rests])
             raw, _ = raw_of(part, truth, f, np.zeros_like(f))
             methods = {"selfcal": (accel.matrix, accel.fit.theta[:3]), "ArduPilot": ardupilot(a, G0)}
@@ -628,7 +633,7 @@ def test_the_page_is_as_printed(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_a_plan_reaches_what_it_says(capsys: pytest.CaptureFixture[str]) -> None:
-    """Parts of the model, rested as planned: their intervals are as wide as the plan has them, and it is the shortest."""
+    """Parts of the model, rested as planned: their intervals are as wide as the plan has them."""
     random = np.random.default_rng(70)
     part = draw_part(random, law="random_walk")
     document = plan_of(model_of(part), ["scale within 30 ppm", "angle within 0.1 mrad"])

@@ -77,7 +77,7 @@ def document_of(
         else {
             **_entries(gyro.fit, gyro.of_accel, OF_GYRO),
             **_thermal(accel, gyro.fit, gyro.of_accel + gyroscope.THERMAL.start, GYRO, "deg/s/degC", math.degrees(1.0)),
-            **_adequacy(gyro.fit, list(gyro.causes)),
+            **_adequacy(gyro.fit, gyroscope.causes(gyro, tumble.rests)),
             "would_mend": _turns(gyro),
         },
         "notes": notes,

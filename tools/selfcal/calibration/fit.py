@@ -95,24 +95,26 @@ class Fit:
         """rms of the residuals in their own sd; NaN where too few are left to say."""
         return math.sqrt(float(self.white @ self.white) / self.free) if self.free > FREE_LEAST else math.nan
 
-    def gain(self, columns: Array) -> tuple[float, float]:
-        """What further columns [m, k] of the residuals explain of the sum of squares, and its probability by chance."""
-        more = solve_triangular(self.root, columns, lower=True)
-        apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
-        normal = more.T @ apart
-        values, vectors = np.linalg.eigh(normal)
-        kept = values > 1e-9 * max(float(values.max(initial=0.0)), float(np.trace(more.T @ more)))
-        inverse = (vectors[:, kept] / values[kept]) @ vectors[:, kept].T
-        c = inverse @ (apart.T @ self.white)
-        explained = float(c @ normal @ c)
-        return explained, float(chi2.sf(explained, max(int(kept.sum()), 1)))
-
     def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
-        """Of causes, each in words and by its columns, those that explain more than chance, the surest first; with
-        their probability by chance, corrected for the number of causes."""
-        found = [(said, *self.gain(columns)) for said, columns in tried]
-        certain = [(p * len(tried), -explained, said) for said, explained, p in found]
-        return [(said, min(1.0, p)) for p, _, said in sorted(certain) if p < FALSE_ALARM]
+        """Of causes, each in words and by its columns [m, k] of the residuals, those that explain more than chance, the
+        surest first; with their probability by chance, corrected for the number of causes."""
+        more = solve_triangular(self.root, np.hstack([columns for _, columns in tried]), lower=True)
+        apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
+        found, first = [], 0
+        for said, columns in tried:
+            own = slice(first, first + columns.shape[1])
+            first = own.stop
+            explained, count = _explained(more[:, own].T @ apart[:, own], apart[:, own].T @ self.white)
+            found.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
+        return [(said, min(1.0, p)) for p, _, said in sorted(found) if p < FALSE_ALARM]
+
+
+def _explained(normal: Array, pull: Array) -> tuple[float, int]:
+    """The sum of squares that columns with normal equations [k, k] and right sides [k] take, and how many count."""
+    values, vectors = np.linalg.eigh(normal)
+    kept = values > 1e-9 * max(float(values.max()), 1e-300)
+    along = vectors[:, kept].T @ pull
+    return float((along**2 / values[kept]).sum()), max(int(kept.sum()), 1)
 
 
 def fit(

@@ -13,6 +13,7 @@ two level parts of the Earth's rate in its first rest. Residuals: three of each 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -23,7 +24,7 @@ from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import Accelerometer, matrix_of
 from selfcal.calibration.fit import ROUGHLY, SETTLED, Fit, Mask, drift_share, fit
 from selfcal.calibration.noise import drift
-from selfcal.calibration.rests import ACCEL, GYRO, Turn
+from selfcal.calibration.rests import ACCEL, GYRO, Rest, Turn
 
 Array = NDArray[np.float64]
 
@@ -54,13 +55,11 @@ PLACES = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 
 @dataclass(frozen=True)
 class Gyroscope:
-    """The answer: its fit, of which the first `of_accel` parameters are the accelerometers', the turns that it is of,
-    and the causes of residuals beyond their sd."""
+    """The answer: its fit, of which the first `of_accel` parameters are the accelerometers', and the turns."""
 
     fit: Fit
     of_accel: int
     turns: tuple[Turn, ...]
-    causes: tuple[tuple[str, float], ...]
 
     @property
     def theta(self) -> Array:
@@ -141,7 +140,7 @@ def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array], settl
     start[of_accel:][BIAS] = problem.y.mean(axis=0)
     keep = None if held is None else np.concatenate([np.zeros(of_accel, bool), held])
     found = fit(problem, near[0] if near else start, mean, prior, keep, settled)
-    return Gyroscope(found, of_accel, problem.turns, tuple(_causes(found, accel, problem.turns)))
+    return Gyroscope(found, of_accel, problem.turns)
 
 
 @dataclass(frozen=True)
@@ -281,15 +280,15 @@ def _across(u: Array) -> Array:
     return found
 
 
-def _causes(found: Fit, accel: Accelerometer, turns: tuple[Turn, ...]) -> list[tuple[str, float]]:
+def causes(gyro: Gyroscope, rests: Sequence[Rest]) -> list[tuple[str, float]]:
     """Causes of residuals beyond their sd, as `Fit.surest` has them: each rest and each turn by itself."""
-    rests, one = accel.tumble.rests, np.eye(found.white.size)
+    one = np.eye(gyro.fit.white.size)
     tried = [
         (f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", one[:, 3 * k : 3 * k + 3])
         for k, rest in enumerate(rests)
     ]
-    for k, turn in enumerate(turns):
+    for k, turn in enumerate(gyro.turns):
         first = 3 * len(rests) + 2 * k
         said = f"the turn at {rests[turn.first].at_s[1]:.6g} s does not end where its rates lead"
         tried.append((said, one[:, first : first + 2]))
-    return found.surest(tried)
+    return gyro.fit.surest(tried)
