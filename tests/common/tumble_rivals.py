@@ -8,6 +8,7 @@ external equipments", ICRA 2014 (IMU-TK); PX4, accelerometer_calibration.cpp; Ar
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,29 +63,28 @@ def ardupilot(a: Array, gravity: float) -> tuple[Array, Array]:
     return matrix(p), -p[:3]
 
 
-def imu_tk_gyro(turns: Sequence[tuple[Array, float, Array, Array]], bias: Array) -> Array:
-    """T K [3, 3] of the gyros: Runge-Kutta over turns (rates [n, 3], dt, directions before and behind), and the
-    squares of the differences of directions, each turn alike. The bias is that of the first rest."""
+def imu_tk_gyro(turns: Sequence[tuple[Array, Array, Array]], dt: float, bias: Array) -> Array:
+    """T K [3, 3] of the gyros: Runge-Kutta over turns (rates [n, 3], directions before and behind), and the squares of
+    the differences of directions, each turn alike. The bias is that of the first rest; their model has no G."""
+    length = max(len(rates) for rates, _, _ in turns)
+    w = np.zeros((length, len(turns), 3))
+    for k, (rates, _, _) in enumerate(turns):  # all turns at once: those that are over stand still
+        w[: len(rates), k] = rates - bias
+    before, behind = (np.array([one[k] for one in turns]) for k in (1, 2))
 
     def matrix(p: Array) -> Array:
-        T = np.array([[1.0, -p[0], p[1]], [p[2], 1.0, -p[3]], [-p[4], p[5], 1.0]])
+        T = np.array([[1.0, p[0], p[1]], [p[2], 1.0, p[3]], [p[4], p[5], 1.0]])
         return np.asarray(T * p[6:])
 
     def residuals(p: Array) -> Array:
-        M, found = matrix(p), []
-        for rates, dt, before, behind in turns:
-            w = (rates - bias) @ M.T
-            u = before
-            for k in range(len(w) - 1):
-                w0, w1 = w[k], w[k + 1]
-                middle = 0.5 * (w0 + w1)
-                k1 = np.cross(u, w0)
-                k2 = np.cross(u + 0.5 * dt * k1, middle)
-                k3 = np.cross(u + 0.5 * dt * k2, middle)
-                k4 = np.cross(u + dt * k3, w1)
-                u = u + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
-            found.append(behind - u)
-        return np.concatenate(found)
+        rate, u = w @ matrix(p).T, before
+        for w0, w1 in pairwise(rate):
+            middle = 0.5 * (w0 + w1)
+            k1 = np.cross(u, w0)
+            k2 = np.cross(u + 0.5 * dt * k1, middle)
+            k3 = np.cross(u + 0.5 * dt * k2, middle)
+            k4 = np.cross(u + dt * k3, w1)
+            u = u + dt / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
+        return np.asarray((behind - u).ravel())
 
-    start = np.array([0.0] * 6 + [1.0] * 3)
-    return matrix(least_squares(residuals, start, xtol=1e-10, ftol=1e-10).x)
+    return matrix(least_squares(residuals, np.array([0.0] * 6 + [1.0] * 3), xtol=1e-9, ftol=1e-9).x)
