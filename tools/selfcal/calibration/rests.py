@@ -25,7 +25,7 @@ UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
 #: Seconds that are cut off a rest beside a motion: its first and last movement is below the noise of a piece.
 SETTLE_S = PIECE_S
 #: Shortest rest, s, and rests at most: the fit is dense.
-LEAST_S, MOST = 3.0, 200
+LEAST_S, MOST = 2.0, 200
 #: Readings at the extreme in a row that a turn clips at, and steps of the lattice to the readings beside them at least.
 FLAT, STEEP = 3, 3.0
 #: Assumed time between two logs without stamps of one clock, s.

@@ -73,6 +73,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         else:
             said = "as the noise has it" if found["adequate"] else "NOT adequate"
             line(f"residuals: {found['residual_ratio']:.2f} of their sd, {said}")
+        if found["adequate"] is False and not found["findings"]:
+            line("  no single rest or turn, no square and no hysteresis explains it")
         for one in found["findings"][:3]:
             line(f"  {one['cause']} (by chance {one['p']:.1g})")
     for text in document["notes"]:
