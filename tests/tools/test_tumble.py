@@ -557,6 +557,28 @@ def test_wrong_options_have_one_line(options: list[str], said: str, tmp_path: Pa
     assert done.returncode == 2 and said in done.stderr and done.stderr.count("\n") == 1
 
 
+def test_hostile_logs_have_one_line(tmp_path: Path) -> None:
+    """Sides in turn without any noise; in another unit; one rest; a handful of rows."""
+    random = np.random.default_rng(80)
+    rows = np.repeat(np.array(FLATS, float), 550, axis=0)
+    shaken_rows = np.arange(len(rows)) % 550 > 500
+    rows[shaken_rows] += random.standard_normal((int(shaken_rows.sum()), 3))
+    noisy = rows + 1e-3 * random.standard_normal(rows.shape)
+    for values, said in (
+        (G0 * rows, "no noise"),
+        (3.0 * noisy, "in the units? of their headings"),
+        (G0 * noisy[:400], "1 rests found"),
+        (G0 * noisy[:20], "0 rests found"),
+        (np.zeros((600, 3)), "1 rests found"),
+    ):
+        log = tmp_path / "log.csv"
+        lines = [f"{k / 50:.2f},{a:.17g},{b:.17g},{c:.17g}" for k, (a, b, c) in enumerate(values)]
+        log.write_text("t[s],ax[m/s^2],ay[m/s^2],az[m/s^2]\n" + "\n".join(lines) + "\n")
+        with pytest.raises(UserError, match=said):
+            selfcal.tumble(log, json=tmp_path / "never.json")
+        assert not (tmp_path / "never.json").exists()
+
+
 def test_a_log_without_accelerometers_has_one_line(tmp_path: Path) -> None:
     log = tmp_path / "log.csv"
     log.write_text("t[s],gx[deg/s]\n" + "".join(f"{k / 10},{k % 3}\n" for k in range(100)))

@@ -22,6 +22,7 @@ Problem = Callable[[Array], tuple[Array, Array, Array]]
 #: is below `SETTLED`.
 ITERATIONS, HALVINGS, NEAR, SETTLED = 50, 8, 0.3, 1e-4
 UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
+NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
 #: A parameter is identified if the data leave this share of its prior variance at most, with priors so much wider.
 IDENTIFIED, WIDER = 0.2, 8.0
 #: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
@@ -133,11 +134,16 @@ def fit(
         r, J, R = problem(theta)
         if not all(np.isfinite(one).all() for one in (r, J, R)):
             raise UserError(UNSETTLED)
-        root = np.asarray(np.linalg.cholesky(R))
-        white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
-        own, apart = columns[:, free] * unit, (theta - mean)[free] / unit
+        apart = (theta - mean)[free] / unit
+        try:
+            root = np.asarray(np.linalg.cholesky(R))
+            white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
+            own = columns[:, free] * unit
+            covariance = np.linalg.inv(own.T @ own + inverse)
+        except np.linalg.LinAlgError:
+            raise UserError(NO_NOISE) from None
         whole = np.zeros(prior.shape)
-        whole[block] = np.linalg.inv(own.T @ own + inverse) * np.outer(unit, unit)
+        whole[block] = covariance * np.outer(unit, unit)
         return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart))
 
     found = at(theta)
