@@ -1,5 +1,5 @@
 /* The calibration from rests, through its public header: a part without noise, and hostile input. Its numbers under
- * noise and drift are compared with the host's in tests/lib/test_tumble.py. */
+ * noise and drift are compared with the host's in tests/lib/test_tumble_host.py. */
 #include <math.h>
 #include <string.h>
 
