@@ -31,6 +31,7 @@ STAGES = (
     "bank",
     "likelihood",
     "adequacy",
+    "calibration",
     "diagnosis",
     "wire",
     "show",

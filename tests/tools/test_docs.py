@@ -37,7 +37,7 @@ DOCUMENTS = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "host_sim/README.md", "port/README.md", "tests/README.md"),
     *("tests/ACCURACY.md", "tests/COST.md"),
     *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "lib/EVALUATION.md"),
-    *("tools/README.md", "tools/MODEL.md", "tools/LOGS.md", "tools/OTHERS.md"),
+    *("tools/README.md", "tools/MODEL.md", "tools/TUMBLE.md", "tools/LOGS.md", "tools/OTHERS.md"),
 )
 WALKTHROUGH = ROOT / "tools" / "README.md"
 TOUR = ROOT / "README.md"
@@ -55,6 +55,7 @@ UNTRIED = {
     "replay tests/data": "QEMU; test_firmware.py",
     "fleet ": "recordings of the reader's own; test_batch_priors.py, test_fleet.py",
     "plan ": "a model of the reader's own; test_plan.py",
+    "tumble ": "a log that is drawn; test_tumble.py compares the output",
     "rivals ": "minutes; test_rivals.py",
     "worth": "minutes; test_worth.py",
     "navigate": "minutes; test_navigate.py",

@@ -14,6 +14,7 @@ from selfcal.base.grid import MEDIAN_SD, runs
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
+from selfcal.readings.lattice import step_of
 
 #: Length of a piece, s, and its samples at least.
 PIECE_S, PIECE_LEAST = 1.0, 4
@@ -33,21 +34,26 @@ MOST_LISTED = 4
 
 @dataclass(frozen=True)
 class Rest:
-    """Stretches of motion, and the longest one of rest, s of the recording; none where the recording is too short."""
+    """Stretches of motion and of rest, s of the recording; none where the recording is too short."""
 
     moved: tuple[tuple[float, float], ...]
-    longest: tuple[float, float] | None
+    still: tuple[tuple[float, float], ...]
+
+    @property
+    def longest(self) -> tuple[float, float] | None:
+        """The longest stretch of rest."""
+        return max(self.still, key=lambda run: run[1] - run[0], default=None)
 
 
 def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
     """When the sensor moved, by the scatter within pieces of 1 s and the jumps between their means, each against those
-    of the recording's quietest fifth. An axis alone counts."""
+    of the recording's quietest fifth. An axis alone counts. A change by one step of its lattice is no motion."""
     piece = max(PIECE_LEAST, round(PIECE_S * recording.rate_hz))
     at = recording.clock.place
     index = (at - at[0]) // piece
     count = int(index[-1]) + 1 if (at[-1] - at[0] + 1) % piece == 0 else int(index[-1])
     if not FEWEST <= count <= recording.samples:
-        return Rest((), None)
+        return Rest((), ())
     kept = index < count
     used = np.bincount(index[kept], minlength=count)
     whole = used == piece
@@ -57,11 +63,12 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.bincount(index[kept], values, minlength=count) / used
             square = np.bincount(index[kept], (values - mean[index[kept]]) ** 2, minlength=count)
-        moving |= whole & (square > _loudest(square[whole], piece))
+        lattice = step_of(values[np.isfinite(values)])[0]
+        moving |= whole & (square > max(_loudest(square[whole], piece), piece * (0.5 * LOUD_MARGIN * lattice) ** 2))
         step = np.abs(np.diff(mean))
         known = np.isfinite(step)
         usual = float(np.quantile(step[known], 0.5)) if known.any() else 0.0
-        jumps = np.flatnonzero(known & (step > JUMP_SD * max(usual, 1e-300) / MEDIAN_SD))
+        jumps = np.flatnonzero(known & (step > max(JUMP_SD * usual / MEDIAN_SD, lattice)))
         moving[jumps] = moving[jumps + 1] = True
     length_s = piece / recording.rate_hz
     start = recording.start_s
@@ -69,7 +76,7 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
     def times(mask: NDArray[np.bool_]) -> list[tuple[float, float]]:
         return [(start + a * length_s, start + b * length_s) for a, b in runs(mask)]
 
-    return Rest(tuple(times(moving)), max(times(~moving), key=lambda run: run[1] - run[0], default=None))
+    return Rest(tuple(times(moving)), tuple(times(~moving)))
 
 
 def _loudest(square: NDArray[np.float64], piece: int) -> float:

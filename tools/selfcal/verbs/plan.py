@@ -28,6 +28,9 @@ def plan(
             metavar="WISH",
         ),
     ],
+    tumble: Annotated[
+        bool, option("Plan `selfcal tumble`: wishes as 'scale within 100 ppm', 'angle within 0.2 mrad'")
+    ] = False,
     axis: Annotated[
         str | None, option("Axis of the part; default: the first that `simulate` states", metavar="NAME")
     ] = None,
@@ -45,6 +48,8 @@ def plan(
     `model`: a model file, or a recording, of which the part is made as `part` makes it; `start_s`, `end_s` and the
     other options are the recording's. `axis`: the first that the `simulate` entry states, else the first of all. A wish
     of a parameter is of the records whose law has it. `plot`: a picture of what is reached over the length.
+    `tumble`: how many rests of which length `selfcal tumble` takes: document `selfcal.plan_tumble/1`; wishes are those
+    of `calibration/plan.py`.
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
     it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
     prior's sd.
@@ -75,10 +80,19 @@ def plan(
         loaded = Model.load(model)
     if loaded.half_life_s:
         raise UserError(f"{loaded.path}: plan takes no half_life_s: leave it out of the model")
-    name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
-    group = loaded.group_of(name)
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
+    if tumble:
+        from selfcal.calibration.plan import plan_of
+
+        if plot is not None or axis is not None:
+            raise UserError("--tumble plans all axes together, and has no picture: leave --axis and --plot out")
+        answer = plan_of(loaded, want)
+        if json is not None:
+            write_json(answer, json)
+        return answer
+    name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
+    group = loaded.group_of(name)
     columns = {one.name: one for one in loaded.regressors}
     sizes = {key: (coefficient_unit(group.unit, one.unit), one.sd.get(group.name, 1.0)) for key, one in columns.items()}
     wishes = [Wish.of(text, group.unit, sizes) for text in want]
@@ -128,7 +142,9 @@ def plan(
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     """Print how long for each wish."""
-    from selfcal.batch.plan import show as table
-
+    if given.get("tumble"):
+        from selfcal.calibration.plan import show as table
+    else:
+        from selfcal.batch.plan import show as table
     table(document, to_stderr=to_stderr(given))
     return 0

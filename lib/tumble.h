@@ -1,0 +1,111 @@
+/* The whole calibration from rests in several positions: accelerometers' bias, scale and misalignment, gyros' bias and
+ * g-sensitivity, each with its standard deviation under the part's own noise and drift.
+ *
+ * A program that does not name these functions does not link them. No heap; the caller owns the memory:
+ * SELFCAL_TUMBLE_MAX rests of 32 bytes, selfcal_tumble_work_t and selfcal_tumble_t, 6 KB together for 24 rests.
+ *
+ *     static selfcal_tumble_rest_t rests[SELFCAL_TUMBLE_MAX];
+ *     static selfcal_tumble_work_t work;
+ *     static selfcal_tumble_t found;
+ *     // at each rest, as the gate finds it: the mean of 10 s or more, and its time
+ *     rests[count] = (selfcal_tumble_rest_t){{ax, ay, az, gx, gy, gz}, begin_s, end_s};
+ *     // at the end, at rest and not between samples: it runs to its end
+ *     if (selfcal_tumble(&found, &part, rests, count, &work) == SELFCAL_TUMBLE_OK) {
+ *         selfcal_tumble_apply(&found, reading, corrected);
+ *     }
+ *
+ * Model:  f = T K (a - b),  |f| = gravity at rest;  T unit upper triangular (z keeps its axis), K diagonal.
+ *         y = b + G f + the Earth's rate at rest.
+ * A rest is a mean: N^2 / length, and the drift since the end of the last rest, where the bias is to be known. The fit
+ * is Gauss-Newton on |f| - gravity, weighted by the inverse of that covariance. Its priors, in sd: bias 0.98 m/s^2 and
+ * 10 deg/s, scale 2 %, angle 20 mrad, g-sensitivity 0.1 deg/s/g. A parameter is identified if the data, with priors
+ * eight times as wide, leave 0.2 of its prior variance at most. Six flats identify bias and scale; an edge in each
+ * plane adds the angles. A wrong gravity goes into the scales: no rest shows it.
+ *
+ * Units: m/s^2, rad/s, s, rad, rad/s per m/s^2. The arithmetic is in selfcal_wide_t: weights of a drift that is large
+ * against the noise lose float's digits. Results are right to 1e-4 of their standard deviation.
+ * Cortex-M4F: 5.8 KB of flash beside the software doubles, 1.4 KB of stack; 6 million instructions of 12 rests, 20 of
+ * 24, 70 with a Gauss-Markov drift. It fits a Cortex-M0 too.
+ * The gyros' scale and misalignment take the turns between the rests: `selfcal tumble` on the host. */
+#ifndef SELFCAL_TUMBLE_H
+#define SELFCAL_TUMBLE_H
+
+#include <stdbool.h>
+#include <stdint.h>
+
+#include "selfcal.h"
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* Rests of one calibration at most. 4 MAX^2 + 140 MAX bytes of work and rests, about. */
+#ifndef SELFCAL_TUMBLE_MAX
+#define SELFCAL_TUMBLE_MAX 24
+#endif
+
+enum { SELFCAL_TUMBLE_ACCEL = 9, SELFCAL_TUMBLE_GYRO = 4 };
+
+/* Why there is no result. */
+typedef enum {
+    SELFCAL_TUMBLE_OK = 0,
+    SELFCAL_TUMBLE_BAD_ARGUMENT, /* a NULL, or more rests than SELFCAL_TUMBLE_MAX */
+    SELFCAL_TUMBLE_TOO_FEW,      /* fewer than three rests */
+    SELFCAL_TUMBLE_BAD_PART,     /* gravity, a noise or a drift that is none */
+    SELFCAL_TUMBLE_BAD_REST,     /* a mean that is no number, or times that are not in order */
+    SELFCAL_TUMBLE_NOTHING,      /* no parameter is identified: equal positions */
+    SELFCAL_TUMBLE_UNSETTLED /* the fit does not settle, or 10 sd off its priors: readings of another unit, no rests */
+} selfcal_tumble_status_t;
+
+/* Noise and drift of an axis: white density N, walk density K, Gauss-Markov deviation and bandwidth (0: none). */
+typedef struct {
+    float N, K, sigma_m, alpha;
+} selfcal_tumble_noise_t;
+
+/* The part and the place. `vertical`: the Earth's rate times the sine of the latitude; `level`: times its cosine over
+ * sqrt(2), which stands in the intervals. Without a latitude 0 and 4.2e-5 rad/s, and G has an error of 5e-6. */
+typedef struct {
+    selfcal_tumble_noise_t noise[6]; /* ax, ay, az, gx, gy, gz */
+    float gravity, vertical, level;
+} selfcal_tumble_part_t;
+
+/* Means of a rest from `begin_s` to `end_s`, in order ax, ay, az, gx, gy, gz. Rests are in order of time. */
+typedef struct {
+    float mean[6];
+    float begin_s, end_s;
+} selfcal_tumble_rest_t;
+
+/* The result. Order of accelerometer parameters: bias x y z, scale less 1 x y z, angles xy xz yz; of a gyro's: bias, G
+ * of x y z. Covariances are lower triangles by rows. Values that are not identified are NAN in `accel` and `gyro`.
+ * `bias` and `matrix` are what selfcal_tumble_apply() takes: there a parameter that is not identified has its
+ * likeliest value, near 0 error. */
+typedef struct {
+    selfcal_wide_t accel[SELFCAL_TUMBLE_ACCEL], gyro[3][SELFCAL_TUMBLE_GYRO];
+    float accel_covariance[45], gyro_covariance[3][10];
+    float bias[3], matrix[3][3], gyro_bias[3], G[3][3];
+    float ratio; /* rms of |f| - gravity in its own sd; NAN without a rest to spare. Above 2: a rest was none */
+    uint16_t accel_identified, gyro_identified; /* a bit for each parameter; gyros 4 bits each */
+} selfcal_tumble_t;
+
+/* Not for users. */
+typedef struct {
+    selfcal_wide_t factor[SELFCAL_TUMBLE_MAX * (SELFCAL_TUMBLE_MAX + 1) / 2];
+    selfcal_wide_t column[SELFCAL_TUMBLE_ACCEL][SELFCAL_TUMBLE_MAX], residual[SELFCAL_TUMBLE_MAX];
+} selfcal_tumble_work_t;
+
+/* Calibrate by `count` rests. Any other status than OK leaves no number in `found`: all are NAN, no bit is set. */
+selfcal_tumble_status_t selfcal_tumble(selfcal_tumble_t *found, const selfcal_tumble_part_t *part,
+                                       const selfcal_tumble_rest_t rests[], uint8_t count, selfcal_tumble_work_t *work);
+
+/* Standard deviation of an accelerometer parameter, 0 to 8, or of parameter `k` of a gyro; NAN if not identified. */
+float selfcal_tumble_accel_sd(const selfcal_tumble_t *found, uint8_t k);
+float selfcal_tumble_gyro_sd(const selfcal_tumble_t *found, uint8_t axis, uint8_t k);
+
+/* Correct one reading of six axes. */
+void selfcal_tumble_apply(const selfcal_tumble_t *found, const float reading[6], float corrected[6]);
+
+#ifdef __cplusplus
+}
+#endif
+
+#endif

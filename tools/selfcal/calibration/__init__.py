@@ -1,0 +1,1 @@
+"""The whole calibration from rests in several positions: scale, misalignment, bias, g-sensitivity."""

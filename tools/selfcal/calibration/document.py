@@ -1,0 +1,226 @@
+"""The document `selfcal.tumble/1`: parameters with their intervals, what is not identified, and what would mend it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.adequacy.document import recording_entry
+from selfcal.bank.result import HALF_90
+from selfcal.calibration import accelerometer, gyroscope
+from selfcal.calibration.accelerometer import Accelerometer
+from selfcal.calibration.fit import FALSE_ALARM, IDENTIFIED, Fit
+from selfcal.calibration.gyroscope import Gyroscope
+from selfcal.calibration.rests import ACCEL, GYRO, Tumble
+from selfcal.logs.recording import Recording
+
+Array = NDArray[np.float64]
+
+SCHEMA = "selfcal.tumble/1"
+AXES = ("x", "y", "z")
+#: Names of parameters in the order of the fit: group, name, unit.
+OF_ACCEL = (
+    *(("bias", name, "m/s^2") for name in ACCEL),
+    *(("scale", name, "1") for name in ACCEL),
+    *(("misalignment", AXES[row] + AXES[column], "rad") for row, column in accelerometer.PLACES),
+)
+OF_GYRO = (
+    *(("bias", name, "deg/s") for name in GYRO),
+    *(("g_sensitivity", row + column, "deg/s/g") for row in AXES for column in AXES),
+    *(("scale", name, "1") for name in GYRO),
+    *(("misalignment", AXES[row] + AXES[column], "rad") for row, column in gyroscope.PLACES),
+)
+#: A turn that ends within this angle of where it began, and is longer than that angle, tells little, rad.
+SAME_SIDE, TURNED = math.radians(15.0), math.radians(30.0)
+#: Positions that would mend a calibration: at most so many are named.
+MOST_NAMED = 4
+
+
+def document_of(
+    recordings: Sequence[Recording], tumble: Tumble, accel: Accelerometer, gyro: Gyroscope | None
+) -> dict[str, Any]:
+    """The whole answer, in SI units and degrees."""
+    place = accel.place
+    notes = [*tumble.notes, *(f"{one}: left out" for one in tumble.left_out), *_told_of_turns(accel)]
+    return {
+        "schema": SCHEMA,
+        "recordings": [recording_entry(one) for one in recordings],
+        "gravity": {"value": place.gravity, "sd": place.sd, "unit": "m/s^2", "source": place.words},
+        "earth_rate_known": place.vertical is not None,
+        "bias_at_s": accel.reference_s,
+        "noise": {
+            name: {"N": math.sqrt(one.white), "unit": _density(name), "drift": one.words}
+            for name, one in tumble.noise.items()
+        },
+        "rests": _rests(accel),
+        "turns": [
+            {
+                "start_s": tumble.rests[one.first].at_s[1],
+                "end_s": tumble.rests[one.first + 1].at_s[0],
+                "log": tumble.rests[one.first].log,
+                "left_out": one.reason or None,
+            }
+            for one in tumble.turns
+        ],
+        "accelerometer": {
+            **_entries(accel.fit, 0, OF_ACCEL),
+            **_thermal(accel, accel.fit, accelerometer.THERMAL.start, ACCEL, "m/s^2/degC", 1.0),
+            **_adequacy(accel.fit, accelerometer.causes(accel)),
+            "would_mend": _positions(accel),
+        },
+        "gyroscope": None
+        if gyro is None
+        else {
+            **_entries(gyro.fit, gyro.of_accel, OF_GYRO),
+            **_thermal(accel, gyro.fit, gyro.of_accel + gyroscope.THERMAL.start, GYRO, "deg/s/degC", math.degrees(1.0)),
+            **_adequacy(gyro.fit, gyroscope.causes(gyro, tumble.rests)),
+            "would_mend": _turns(gyro),
+        },
+        "notes": notes,
+    }
+
+
+def _density(name: str) -> str:
+    return "m/s^2/sqrt(Hz)" if name in ACCEL else "rad/s/sqrt(Hz)"
+
+
+def _entry(fit: Fit, at: int, unit: str, size: float) -> dict[str, Any]:
+    """A parameter; no number of one that is not identified."""
+    known = bool(fit.identified[at])
+    value, sd = size * float(fit.theta[at]), size * math.sqrt(float(fit.covariance[at, at]))
+    ends = (value - HALF_90 * sd, value + HALF_90 * sd)
+    numbers = {"median": value, "sd": sd, "q05": ends[0], "q95": ends[1]}
+    return {**(numbers if known else dict.fromkeys(numbers)), "unit": unit, "identified": known}
+
+
+def _entries(fit: Fit, start: int, names: Sequence[tuple[str, str, str]]) -> dict[str, dict[str, Any]]:
+    """Parameters from `start` on by group and name."""
+    found: dict[str, dict[str, Any]] = {}
+    for k, (group, name, unit) in enumerate(names):
+        size = math.degrees(1.0) if unit.startswith("deg/s") else 1.0
+        found.setdefault(group, {})[name] = _entry(fit, start + k, unit, size)
+    return found
+
+
+def _thermal(
+    accel: Accelerometer, fit: Fit, start: int, names: Sequence[str], unit: str, size: float
+) -> dict[str, Any]:
+    """Temperature coefficients, where the logs have a temperature."""
+    if not accel.warmth.size:
+        return {}
+    mean = float(np.mean([one.temp for one in accel.tumble.rests]))
+    entries = {name: _entry(fit, start + k, unit, size) for k, name in enumerate(names)}
+    return {"temperature": entries, "bias_at_degC": mean}
+
+
+def _adequacy(fit: Fit, causes: Sequence[tuple[str, float]]) -> dict[str, Any]:
+    """Whether the residuals are as large as their sd says; None where too few are left to say."""
+    checked = math.isfinite(fit.excess)
+    fits = None if not checked else not causes and fit.excess >= FALSE_ALARM
+    return {
+        "adequate": fits,
+        "residual_ratio": fit.ratio if checked else None,
+        "findings": [{"cause": said, "p": p} for said, p in causes if checked],
+    }
+
+
+def _rests(accel: Accelerometer) -> list[dict[str, Any]]:
+    """Rests with the side that is up, and the residual of |f| with its sd."""
+    tumble, fit = accel.tumble, accel.fit
+    a = np.array([one.accel for one in tumble.rests])
+    warm = accel.warmth if accel.warmth.size else np.zeros(len(a))
+    f = accel.force(a, warm)
+    size = np.linalg.norm(f, axis=1)
+    residual = size - accel.place.gravity * (1.0 + fit.theta[accelerometer.GRAVITY])
+    sd = np.sqrt(np.diag(fit.root @ fit.root.T))
+    return [
+        {
+            "log": one.log,
+            "start_s": one.at_s[0],
+            "end_s": one.at_s[1],
+            "up": (f[k] / size[k]).tolist(),
+            "residual": float(residual[k]),
+            "sd": float(sd[k]),
+            "unit": "m/s^2",
+        }
+        for k, one in enumerate(tumble.rests)
+    ]
+
+
+def side_of(up: Array) -> str:
+    """The side that is up in words: `+x`, `-y -z`."""
+    return " ".join(f"{'+' if up[k] > 0 else '-'}{AXES[k]}" for k in range(3) if abs(up[k]) > 0.4 * np.abs(up).max())
+
+
+def _positions(accel: Accelerometer) -> list[str]:
+    """Further rests by which every parameter would be identified, one after another that tells most."""
+    fit, place, own = accel.fit, accel.place, slice(0, len(OF_ACCEL))
+    if fit.identified[own].all():
+        return []
+    rests = accel.tumble.rests
+    seconds = float(np.median([one.seconds for one in rests]))
+    white = max(accel.tumble.noise[name].white for name in ACCEL) / seconds
+    noise = white + max(np.diag(accel.fit.root @ accel.fit.root.T).mean(), 0.0)
+    covariance, named = fit.widened(), []
+    inverse = np.linalg.inv(accel.matrix)
+    candidates = [np.array(c, float) for c in np.ndindex(3, 3, 3) if 1 <= sum(abs(one - 1) for one in c) <= 2]
+    for _ in range(MOST_NAMED):
+        best, gained = None, 0.0
+        weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
+        for c in candidates:
+            up = (c - 1.0) / np.linalg.norm(c - 1.0)
+            x = inverse @ (up * place.gravity)
+            v = x * fit.theta[accelerometer.SCALE]
+            row = np.zeros(fit.theta.size)
+            row[accelerometer.BIAS] = -(up @ accel.matrix)
+            row[accelerometer.SCALE] = up @ (accel.matrix / fit.theta[accelerometer.SCALE]) * x
+            row[accelerometer.ANGLE] = [up[i] * v[j] for i, j in accelerometer.PLACES]
+            row[accelerometer.GRAVITY] = -place.gravity
+            moved = covariance @ row
+            less = moved**2 / (float(row @ moved) + noise)
+            share = float((less[own] / np.diag(fit.prior)[own])[weak].sum())
+            if share > gained * 1.001:
+                best, gained, update = up, share, (row, moved)
+        if best is None:
+            break
+        named.append(f"{side_of(best)} up")
+        row, moved = update
+        covariance -= np.outer(moved, moved) / (float(row @ moved) + noise)
+        if (np.diag(covariance)[own] <= IDENTIFIED * np.diag(fit.prior)[own]).all():
+            break
+    return named
+
+
+def _turns(gyro: Gyroscope) -> list[str]:
+    """Further rests and turns by which every parameter would be identified."""
+    known = gyro.fit.identified[gyro.of_accel :]
+    named = []
+    if not known[gyroscope.G].all():
+        named.append("rests with other sides up: four or more, not all in one plane")
+    for k, axis in enumerate(AXES):
+        own = [known[gyroscope.ANGLE][n] for n, (_, column) in enumerate(gyroscope.PLACES) if column == k]
+        if not (known[gyroscope.SCALE][k] and all(own)):
+            named.append(f"turns of 60 to 120 deg about {axis}, with {axis} level, from two sides")
+    return named
+
+
+def _told_of_turns(accel: Accelerometer) -> list[str]:
+    """Turns that are left out, and those that tell little."""
+    tumble, told = accel.tumble, []
+    a = np.array([one.accel for one in tumble.rests])
+    f = accel.force(a, accel.warmth if accel.warmth.size else np.zeros(len(a)))
+    u = f / np.linalg.norm(f, axis=1)[:, None]
+    for one in tumble.turns:
+        where = f"turn of {tumble.rests[one.first].at_s[1]:.6g} to {tumble.rests[one.first + 1].at_s[0]:.6g} s"
+        if one.reason:
+            told.append(f"{where}: {one.reason}: left out")
+            continue
+        way = float(np.linalg.norm(one.gyro - tumble.rests[one.first].gyro, axis=1).sum()) * one.dt
+        apart = math.acos(float(np.clip(u[one.first] @ u[one.first + 1], -1.0, 1.0)))
+        if way > TURNED and apart < SAME_SIDE:
+            told.append(f"{where}: {math.degrees(way):.0f} deg, and the same side is up: it tells little")
+    return told

@@ -1,0 +1,173 @@
+"""Gauss-Newton with correlated noise and a normal prior, and what the information identifies."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.stats import chi2
+
+from selfcal.base.errors import UserError
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+#: Residuals [m], their derivatives [m, n] and their covariance [m, m] at parameters [n].
+Problem = Callable[[Array], tuple[Array, Array, Array]]
+
+#: Iterations and halvings of a step at most. A step below `NEAR`, in posterior sd, is taken as it is, and the last one
+#: is below `SETTLED`.
+ITERATIONS, HALVINGS, NEAR, SETTLED = 50, 8, 0.3, 1e-4
+UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
+NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
+#: A parameter is identified if the data leave this share of its prior variance at most, with priors so much wider.
+IDENTIFIED, WIDER = 0.2, 8.0
+#: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
+FALSE_ALARM = 0.005
+#: Shares of a drift's mean square under a wide prior that are weighed: three decades of its deviation.
+#: A fit that is only weighed settles earlier.
+SHARES, ROUGHLY = 10.0 ** -np.arange(0.0, 6.5, 0.75), 0.1
+#: Residuals beyond the parameters that a check takes at least.
+FREE_LEAST = 0.5
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
+    `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
+    makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares."""
+
+    theta: Array
+    covariance: Array
+    prior: Array
+    white: Array
+    columns: Array
+    root: Array
+    pulled: float
+
+    @property
+    def squares(self) -> float:
+        """Sum of squares of the residuals and the prior."""
+        return float(self.white @ self.white) + self.pulled
+
+    @property
+    def evidence(self) -> float:
+        """ln of the likelihood under the prior, but for a constant (Laplace)."""
+        factor = np.linalg.cholesky(self.prior)
+        seen = self.columns @ factor
+        size = float(np.linalg.slogdet(np.eye(factor.shape[0]) + seen.T @ seen)[1])
+        noise = 2.0 * float(np.log(np.diag(self.root)).sum())
+        return -0.5 * (self.squares + noise + size)
+
+    def widened(self) -> Array:
+        """The covariance [n, n] were every prior WIDER times as wide: no parameter is known by another's prior."""
+        factor = np.linalg.cholesky(self.prior)
+        seen = self.columns @ factor
+        found: Array = factor @ np.linalg.inv(seen.T @ seen + np.eye(factor.shape[0]) / WIDER**2) @ factor.T
+        return found
+
+    @property
+    def left(self) -> Array:
+        """Share of each prior variance that the data alone leave [n]."""
+        left: Array = np.diag(self.widened()) / np.diag(self.prior)
+        return left
+
+    @property
+    def identified(self) -> Mask:
+        """[n]."""
+        found: Mask = self.left <= IDENTIFIED
+        return found
+
+    @property
+    def free(self) -> float:
+        """Residuals less the parameters that they settle."""
+        return self.white.size - float(np.trace(self.columns @ self.covariance @ self.columns.T))
+
+    @property
+    def excess(self) -> float:
+        """Probability that residuals are as large as these by chance; NaN where too few are left to say."""
+        return float(chi2.sf(self.white @ self.white, self.free)) if self.free > FREE_LEAST else math.nan
+
+    @property
+    def ratio(self) -> float:
+        """rms of the residuals in their own sd; NaN where too few are left to say."""
+        return math.sqrt(float(self.white @ self.white) / self.free) if self.free > FREE_LEAST else math.nan
+
+    def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
+        """Of causes, each in words and by its columns [m, k] of the residuals, those that explain more than chance, the
+        surest first; with their probability by chance, corrected for the number of causes."""
+        more = solve_triangular(self.root, np.hstack([columns for _, columns in tried]), lower=True)
+        apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
+        found, first = [], 0
+        for said, columns in tried:
+            own = slice(first, first + columns.shape[1])
+            first = own.stop
+            explained, count = _explained(more[:, own].T @ apart[:, own], apart[:, own].T @ self.white)
+            found.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
+        return [(said, min(1.0, p)) for p, _, said in sorted(found) if p < FALSE_ALARM]
+
+
+def _explained(normal: Array, pull: Array) -> tuple[float, int]:
+    """The sum of squares that columns with normal equations [k, k] and right sides [k] take, and how many count."""
+    values, vectors = np.linalg.eigh(normal)
+    kept = values > 1e-9 * max(float(values.max()), 1e-300)
+    along = vectors[:, kept].T @ pull
+    return float((along**2 / values[kept]).sum()), max(int(kept.sum()), 1)
+
+
+def fit(
+    problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None, settled: float = SETTLED
+) -> Fit:
+    """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
+    stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
+    `settled`: the last step, in posterior sd. Raises UserError where none settles."""
+    free = np.ones(start.size, bool) if held is None else ~held
+    theta = np.where(free, start, mean)
+    block = np.ix_(free, free)
+    unit = np.sqrt(np.diag(prior))[free]
+    inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
+
+    def at(theta: Array) -> Fit:
+        r, J, R = problem(theta)
+        if not all(np.isfinite(one).all() for one in (r, J, R)):
+            raise UserError(UNSETTLED)
+        apart = (theta - mean)[free] / unit
+        try:
+            root = np.asarray(np.linalg.cholesky(R))
+            white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
+            own = columns[:, free] * unit
+            covariance = np.linalg.inv(own.T @ own + inverse)
+        except np.linalg.LinAlgError:
+            raise UserError(NO_NOISE) from None
+        whole = np.zeros(prior.shape)
+        whole[block] = covariance * np.outer(unit, unit)
+        return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart))
+
+    found = at(theta)
+    for _ in range(ITERATIONS):
+        apart = (found.theta - mean)[free] / unit
+        pull = found.columns[:, free].T @ found.white + inverse @ apart / unit
+        step = np.zeros(theta.size)
+        step[free] = -found.covariance[block] @ pull
+        far = float(np.max(np.abs(step[free]) / np.sqrt(np.diag(found.covariance)[free])))
+        following = at(found.theta + step)
+        for _ in range(HALVINGS if far > NEAR else 0):
+            if following.squares < found.squares:
+                break
+            step *= 0.5
+            following = at(found.theta + step)
+        found = following
+        if far < settled:
+            return found
+    raise UserError(UNSETTLED)
+
+
+def drift_share(fit_at: Callable[[float], Fit]) -> float:
+    """Posterior mean of the share of a drift's prior variance that residuals support, log-uniform before. `fit_at`: the
+    fit at a share."""
+    evidence = np.array([fit_at(float(one)).evidence for one in SHARES])
+    weight = np.exp(evidence - evidence.max())
+    return float(weight @ SHARES / weight.sum())

@@ -1,0 +1,294 @@
+"""Gyros: w = T K (y - b - c (temp - reference) - G f), T [3, 3] with a unit diagonal in the accelerometers' frame.
+
+A rest shows y = b + c (temp - reference) + G f + the Earth's rate. A turn carries gravity's direction u from the rest
+before to the rest behind it: with the rotation Q of the integrated rate, Q^T u is the direction there. A small rotation
+d of Q in the frame of its end moves Q^T u by (Q^T u) x d, and d is the sum over the samples of the rotation from each
+to the end, times the error of its rate. So one pass of the integral has every derivative.
+
+Parameters: the accelerometers' own, b x y z [rad/s], G by rows [rad/s/g], K x y z, T xy xz yx yz zx zy [rad],
+the vertical rate of the Earth that no latitude states [rad/s], c x y z [rad/s/degC], and for each chain of turns the
+two level parts of the Earth's rate in its first rest. Residuals: three of each rest, then two of each turn.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.base.units import STANDARD_GRAVITY
+from selfcal.calibration import accelerometer
+from selfcal.calibration.accelerometer import Accelerometer, matrix_of
+from selfcal.calibration.fit import ROUGHLY, SETTLED, Fit, Mask, drift_share, fit
+from selfcal.calibration.noise import drift
+from selfcal.calibration.rests import ACCEL, GYRO, Rest, Turn
+
+Array = NDArray[np.float64]
+
+#: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); scale; angle, rad; temperature
+#: coefficient, rad/s/degC (0.05 deg/s/degC).
+BIAS_SD, G_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = (
+    math.radians(10.0),
+    math.radians(0.1),
+    0.02,
+    0.02,
+    math.radians(0.05),
+)
+#: sd of a parameter that the logs do not have.
+NONE = 1e-12
+#: Where the parameters are, behind the accelerometers'.
+BIAS, G, SCALE, ANGLE, VERTICAL, THERMAL, LEVEL = (
+    slice(0, 3),
+    slice(3, 12),
+    slice(12, 15),
+    slice(15, 21),
+    21,
+    slice(22, 25),
+    25,
+)
+#: Row and column of each angle.
+PLACES = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
+
+
+@dataclass(frozen=True)
+class Gyroscope:
+    """The answer: its fit, of which the first `of_accel` parameters are the accelerometers', and the turns."""
+
+    fit: Fit
+    of_accel: int
+    turns: tuple[Turn, ...]
+
+    @property
+    def theta(self) -> Array:
+        """The gyros' own parameters."""
+        return self.fit.theta[self.of_accel :]
+
+
+def gyro_matrix(theta: Array) -> Array:
+    """T K [3, 3] of the gyros' own parameters."""
+    T = np.eye(3)
+    for (row, column), value in zip(PLACES, theta[ANGLE], strict=True):
+        T[row, column] = value
+    return T * theta[SCALE]
+
+
+def cross(v: Array) -> Array:
+    """The matrices [..., 3, 3] of v x of vectors [..., 3]."""
+    x, y, z = v[..., 0], v[..., 1], v[..., 2]
+    o = np.zeros_like(x)
+    return np.stack([np.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
+
+
+def rotations(v: Array) -> Array:
+    """The rotations [n, 3, 3] by vectors [n, 3], rad (Rodrigues)."""
+    angle = np.linalg.norm(v, axis=-1)[..., None, None]
+    S = cross(v)
+    small = np.maximum(angle, 1e-12)
+    half = np.sin(0.5 * small) / small
+    found: Array = np.eye(3) + np.sin(small) / small * S + 2.0 * half**2 * (S @ S)
+    return found
+
+
+def products_to_end(R: Array) -> Array:
+    """R[k] R[k + 1] ... R[n - 1] of each k [n, 3, 3], by doubling."""
+    found, step = R.copy(), 1
+    while step < len(found):
+        found[:-step] = found[:-step] @ found[step:]
+        step *= 2
+    return found
+
+
+def turned(rate: Array, dt: float) -> tuple[Array, Array]:
+    """The rotation Q [3, 3] of rates [n, 3] from the first sample to the last, by the trapezoid rule and the
+    first term of coning (Miller 1983); and the rotation from the end back to each sample [n, 3, 3]."""
+    step = 0.5 * dt * (rate[:-1] + rate[1:]) + dt**2 / 12.0 * np.cross(rate[:-1], rate[1:])
+    to_end = np.concatenate([products_to_end(rotations(step)), np.eye(3)[None]])
+    return to_end[0], np.swapaxes(to_end, 1, 2)
+
+
+def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
+    """The gyros by the rests, and by the turns that are not left out. `held`: own parameters that stay at 0 error."""
+    if any(accel.tumble.noise[name].wide for name in GYRO):
+        near: list[Array] = []
+
+        def fit_at(share: float) -> Fit:
+            found = _calibrate(replace(accel, tumble=accel.tumble.with_drift(GYRO, share)), held, near, ROUGHLY).fit
+            near[:] = [found.theta]
+            return found
+
+        accel = replace(accel, tumble=accel.tumble.with_drift(GYRO, drift_share(fit_at)))
+        return _calibrate(accel, held, near)
+    return _calibrate(accel, held, [])
+
+
+def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array], settled: float = SETTLED) -> Gyroscope:
+    """The same with the drift as it is; from the parameters `near`, if there are any."""
+    problem = _Problem(accel)
+    of_accel, thermal = problem.of_accel, THERMAL_SD if accel.warmth.size else 0.0
+    sd = np.repeat(
+        [BIAS_SD, G_SD, SCALE_SD, ANGLE_SD, accel.place.vertical_sd, thermal, accel.place.level_sd],
+        [3, 9, 3, 6, 1, 3, 2 * (int(problem.chain[-1]) + 1)],
+    )
+    prior = np.diag(np.concatenate([np.zeros(of_accel), np.maximum(sd, NONE) ** 2]))
+    prior[:of_accel, :of_accel] = accel.fit.covariance
+    mean = np.concatenate([accel.fit.theta, np.zeros(sd.size)])
+    mean[of_accel:][SCALE] = 1.0
+    start = mean.copy()
+    start[of_accel:][BIAS] = problem.y.mean(axis=0)
+    keep = None if held is None else np.concatenate([np.zeros(of_accel, bool), held])
+    found = fit(problem, near[0] if near else start, mean, prior, keep, settled)
+    return Gyroscope(found, of_accel, problem.turns)
+
+
+@dataclass(frozen=True)
+class _Directions:
+    """Of the rests: directions `u` [n, 3], forces `f` [n, 3] in g, and the derivatives of `u` to the accelerometers'
+    parameters [n, 3, k] and to their readings [n, 3, 3]. `matrix`: T K of the accelerometers."""
+
+    u: Array
+    f: Array
+    to_accel: Array
+    to_reading: Array
+    matrix: Array
+
+
+class _Problem:
+    """Residuals of rests and turns, their derivatives and their covariance, at parameters."""
+
+    def __init__(self, accel: Accelerometer) -> None:
+        tumble = accel.tumble
+        rests = tumble.rests
+        self.accel, self.count, self.of_accel = accel, len(rests), accel.fit.theta.size
+        self.turns = tuple(one for one in tumble.turns if not one.reason)
+        self.behind = {one.first + 1: k for k, one in enumerate(self.turns)}  # turn that leads to a rest
+        self.chain = np.cumsum([k not in self.behind for k in range(self.count)]) - 1
+        self.a, self.y = (np.array([getattr(one, name) for one in rests]) for name in ("accel", "gyro"))
+        self.warm = accel.warmth if accel.warmth.size else np.zeros(self.count)
+        self.temp = float(np.mean([one.temp for one in rests])) if accel.warmth.size else math.nan
+        begin = np.concatenate([tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
+        end = np.concatenate([tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])
+        self.slow = [drift(tumble.noise[name], begin, end, accel.reference_s) for name in GYRO]
+        self.white = np.array([tumble.noise[name].white for name in GYRO])
+        self.of_rests = [self.white / one.seconds + one.rounded[3:] for one in rests]
+        self.of_accel_means = [
+            accelerometer.means_covariance(tumble, k, name, accel.reference_s) for k, name in enumerate(ACCEL)
+        ]
+
+    def __call__(self, theta: Array) -> tuple[Array, Array, Array]:
+        count, own = self.count, theta[self.of_accel :]
+        at = self._directions(theta)
+        size = 3 * count + 2 * len(self.turns)
+        r, J = np.zeros(size), np.zeros((size, theta.size))
+        # Noise enters by the means of the gyros over rests and turns, by those of the accelerometers, and within turns.
+        by_gyro, by_accel = np.zeros((size, count + len(self.turns), 3)), np.zeros((size, count, 3))
+        R = np.zeros((size, size))
+        level = np.zeros((3, 2))  # the level directions of the chain's first rest, in the frame of this one
+        earth = (self.accel.place.vertical or 0.0) + own[VERTICAL]
+        for k in range(count):
+            of_level = self.of_accel + LEVEL + 2 * int(self.chain[k]) + np.arange(2)
+            if k in self.behind:
+                n = self.behind[k]
+                rows = slice(3 * count + 2 * n, 3 * count + 2 * n + 2)
+                way = _Way(self.turns[n], own, theta, at, self.temp)
+                level = way.Q.T @ level
+                r[rows] = way.residual - way.slope @ level @ theta[of_level] * way.seconds
+                J[rows, : self.of_accel] = way.basis @ (way.Q.T @ at.to_accel[k - 1] - at.to_accel[k])
+                J[rows, self.of_accel : self.of_accel + LEVEL] = way.derivatives
+                J[rows, of_level] = -way.slope @ level * way.seconds
+                by_gyro[rows, count + n] = way.to_bias
+                by_accel[rows, k - 1] = way.basis @ way.Q.T @ at.to_reading[k - 1]
+                by_accel[rows, k] = -way.basis @ at.to_reading[k]
+                R[rows, rows] = way.white(self.white)
+            else:
+                level = _across(at.u[k]).T
+            rows = slice(3 * k, 3 * k + 3)
+            drawn = own[BIAS] + own[THERMAL] * self.warm[k] + own[G].reshape(3, 3) @ at.f[k]
+            r[rows] = self.y[k] - drawn - earth * at.u[k] - level @ theta[of_level]
+            of = J[rows, self.of_accel :]
+            of[:, BIAS], of[:, THERMAL] = -np.eye(3), -np.eye(3) * self.warm[k]
+            of[:, G], of[:, VERTICAL] = -np.kron(np.eye(3), at.f[k]), -at.u[k]
+            J[rows, of_level] = -level
+            by_gyro[rows, k] = np.eye(3)
+            R[rows, rows] = np.diag(self.of_rests[k])
+        for j in range(3):
+            R += by_gyro[:, :, j] @ self.slow[j] @ by_gyro[:, :, j].T
+            R += by_accel[:, :, j] @ self.of_accel_means[j] @ by_accel[:, :, j].T
+        return r, J, R
+
+    def _directions(self, theta: Array) -> _Directions:
+        A, scale = matrix_of(theta), theta[accelerometer.SCALE]
+        x = self.a - theta[accelerometer.BIAS] - self.warm[:, None] * accelerometer.thermal_of(theta)
+        force = x @ A.T
+        size = np.linalg.norm(force, axis=1)
+        u = force / size[:, None]
+        flat = (np.eye(3) - u[:, :, None] * u[:, None, :]) / size[:, None, None]
+        to_reading = flat @ A
+        to = np.zeros((self.count, 3, self.of_accel))
+        to[:, :, accelerometer.BIAS] = -to_reading
+        to[:, :, accelerometer.SCALE] = flat @ (A / scale * x[:, None, :])
+        for k, (row, column) in enumerate(accelerometer.PLACES):
+            to[:, :, accelerometer.ANGLE.start + k] = flat[:, :, row] * (x * scale)[:, [column]]
+        if self.accel.warmth.size:
+            to[:, :, accelerometer.THERMAL] = -to_reading * self.warm[:, None, None]
+        return _Directions(u, force / STANDARD_GRAVITY, to, to_reading, A)
+
+
+class _Way:
+    """A turn: its rotation `Q`, the residual [2] of the direction behind it in a `basis` [2, 3] across that direction,
+    the `slope` [2, 3] of the residual to a rotation of the end, and its derivatives to the gyros' own parameters."""
+
+    def __init__(self, turn: Turn, own: Array, theta: Array, at: _Directions, temp: float) -> None:
+        warm = 0.0 if math.isnan(temp) else turn.temp - temp
+        offset = theta[accelerometer.BIAS] + warm * accelerometer.thermal_of(theta)
+        force = (turn.accel - offset) @ at.matrix.T / STANDARD_GRAVITY
+        clean = turn.gyro - own[BIAS] - own[THERMAL] * warm - force @ own[G].reshape(3, 3).T
+        self.matrix, self.dt = gyro_matrix(own), turn.dt
+        self.Q, back = turned(clean @ self.matrix.T, turn.dt)
+        weight = np.full(len(clean), turn.dt)
+        weight[[0, -1]] *= 0.5
+        self.seconds = float(weight.sum())
+        predicted = self.Q.T @ at.u[turn.first]
+        self.basis = _across(at.u[turn.first + 1])
+        self.residual = self.basis @ (predicted - at.u[turn.first + 1])
+        self.slope = self.basis @ cross(predicted)
+        self.P = weight[:, None, None] * back  # rotation of the end by the rate at each sample
+        self.to_bias = self.slope @ self.P.sum(axis=0) @ self.matrix
+        found = np.zeros((2, LEVEL))
+        found[:, BIAS], found[:, THERMAL] = -self.to_bias, -self.to_bias * warm
+        found[:, G] = -self.slope @ np.einsum("kij,jl,km->ilm", self.P, self.matrix, force).reshape(3, 9)
+        by_matrix = np.einsum("kij,kl->ijl", self.P, clean)  # to each entry of T K
+        T = self.matrix / own[SCALE]
+        for j in range(3):
+            found[:, SCALE.start + j] = self.slope @ by_matrix[:, :, j] @ T[:, j]
+        for j, (row, column) in enumerate(PLACES):
+            found[:, ANGLE.start + j] = self.slope @ by_matrix[:, row, column] * own[SCALE][column]
+        self.derivatives = found
+
+    def white(self, density: Array) -> Array:
+        """Covariance [2, 2] of the residual by white noise within the turn, N^2 of each gyro [3]."""
+        noisy = self.slope @ self.P @ self.matrix
+        found: Array = np.einsum("kij,j,klj->il", noisy, density / self.dt, noisy)
+        return found
+
+
+def _across(u: Array) -> Array:
+    """Two directions [2, 3] across a direction [3]."""
+    found: Array = np.linalg.svd(u[None, :])[2][1:]
+    return found
+
+
+def causes(gyro: Gyroscope, rests: Sequence[Rest]) -> list[tuple[str, float]]:
+    """Causes of residuals beyond their sd, as `Fit.surest` has them: each rest and each turn by itself."""
+    one = np.eye(gyro.fit.white.size)
+    tried = [
+        (f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", one[:, 3 * k : 3 * k + 3])
+        for k, rest in enumerate(rests)
+    ]
+    for k, turn in enumerate(gyro.turns):
+        first = 3 * len(rests) + 2 * k
+        said = f"the turn at {rests[turn.first].at_s[1]:.6g} s does not end where its rates lead"
+        tried.append((said, one[:, first : first + 2]))
+    return gyro.fit.surest(tried)

@@ -1,0 +1,161 @@
+"""White noise and drift of an axis, and the covariance of its means over intervals.
+
+A mean over [a, e] has the white variance N^2 / (e - a), and the drift's since the reference time T, at which the bias
+is to be known. T lies behind every interval. A walk moves by K^2 |t - T| from there; of a stationary Gauss-Markov drift
+it is what m(t) - m(T) moves by.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from selfcal.adequacy.identify import identify_axis
+from selfcal.bank.priors import known, laid
+from selfcal.bank.result import Estimate
+from selfcal.base.errors import UserError
+from selfcal.base.units import factor
+from selfcal.logs.recording import Recording
+from selfcal.model.file import Model, Prior
+from selfcal.model.laws import Law
+
+Array = NDArray[np.float64]
+
+#: A rest of so many seconds identifies the law of the part.
+LONG_S = 1200.0
+#: Differences of piece means that measure N: fewer leave it to the model.
+FEWEST = 30
+
+
+@dataclass(frozen=True)
+class Term:
+    """A term of the drift with its probability in it: `square` is K^2 of a walk (`alpha` 0), or sigma_m^2."""
+
+    square: float
+    alpha: float = 0.0
+
+
+@dataclass(frozen=True)
+class Noise:
+    """An axis: mean square of N, and the terms of its drift; unit^2 s and unit^2/s or unit^2. `words`: the source.
+    `wide`: the terms are those of a prior that spans decades: residuals may show that they are less."""
+
+    white: float
+    terms: tuple[Term, ...]
+    words: str
+    wide: bool = False
+
+    def scaled(self, share: float) -> Noise:
+        """With this share of the drift's variance, if its prior is wide."""
+        terms = tuple(Term(share * one.square, one.alpha) for one in self.terms)
+        return replace(self, terms=terms) if self.wide else self
+
+
+def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Array:
+    """Covariance [n, n] of the drift's means over n intervals apart from each other, all before the reference time."""
+    length, middle = end_s - begin_s, 0.5 * (begin_s + end_s)
+    back, apart = reference_s - middle, np.abs(middle[:, None] - middle[None, :])
+    same = np.eye(length.size, dtype=bool)
+    found = np.zeros((length.size, length.size))
+    for term in noise.terms:
+        if term.alpha == 0.0:
+            walk = np.minimum(back[:, None], back[None, :])
+            walk[same] = reference_s - end_s + length / 3.0
+            found += term.square * walk
+            continue
+        x = term.alpha * length
+        mean = np.where(x > 1e-6, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0)
+        own = np.where(x > 1e-3, 2.0 * (x + np.expm1(-x)) / np.maximum(x, 1e-3) ** 2, 1.0 - x / 3.0)
+        half = 0.5 * length
+        gap = np.maximum(apart - half[:, None] - half[None, :], 0.0)
+        between = np.exp(-term.alpha * gap) * mean[:, None] * mean[None, :]
+        between[same] = own
+        to_end = np.exp(-term.alpha * (back - half)) * mean
+        found += term.square * (between - to_end[:, None] - to_end[None, :] + 1.0)
+    return found
+
+
+def mean_square(prior: Prior) -> float:
+    """Of a parameter under its prior."""
+    if prior.law == "log_normal":
+        return prior.median**2 * math.exp(2.0 * prior.sd**2)
+    low, high = prior.min, prior.max
+    if prior.law == "log_uniform":
+        return (high**2 - low**2) / (2.0 * math.log(high / low))
+    return (high**3 - low**3) / (3.0 * (high - low))
+
+
+def of_laws(
+    laws: Mapping[str, Law], probability: Mapping[str, float], values: Mapping[str, Mapping[str, tuple[float, float]]]
+) -> tuple[Term, ...]:
+    """Terms of a mixture of laws. `values`: by law and parameter the mean square and the median. An oscillation counts
+    as a Gauss-Markov drift of its period."""
+    total, found = sum(probability.values()), []
+    for name, share in probability.items():
+        law, own = laws[name], values[name]
+        if len(law.parameters) < 2 or not share > 0.0:
+            continue
+        square = own[law.parameters[1]][0]
+        second = own[law.second][1] if law.second else 1.0
+        for term in law.terms:
+            size = share / total * square * (term.deviation * (second if term.by_ratio else 1.0)) ** 2
+            bandwidth = term.bandwidth * (1.0 if term.stated else second)
+            found.append(Term(size) if term.kind == "walk" else Term(size, bandwidth))
+    return tuple(found)
+
+
+def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
+    """The noise of an axis in `unit` by a model file. Where the file does not know the part's N, and `N`, in `unit`, is
+    measured, the drift's priors are laid about it."""
+    group = model.group_of(axis)
+    size = factor(group.unit, unit)
+    priors, words = group.priors, f"{model.name}"
+    if not known(group):
+        words = f"not known: the prior of {model.name}, weighed by the residuals"
+        priors = laid(priors, N / size) if N is not None else priors
+    middle = {key: (mean_square(one), one.median) for key, one in priors.items() if key != "bias"}
+    terms = of_laws(model.laws, model.hypotheses, dict.fromkeys(model.laws, middle))
+    white = size**2 * middle["N"][0] if N is None else N**2
+    return Noise(white, tuple(Term(size**2 * one.square, one.alpha) for one in terms), words, not known(group))
+
+
+def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise | None:
+    """What `identify` finds of an axis in a long rest, in `unit`; None where it has no answer."""
+    try:
+        found = identify_axis(recording, axis, model, "library", None)
+    except UserError:
+        return None
+    size = factor(found.unit, unit) ** 2
+    result = found.result
+
+    def both(one: Estimate) -> tuple[float, float]:
+        return one.mean**2 + one.sd**2, one.median
+
+    values = {law: {key: both(one) for key, one in own.items()} for law, own in result.parameters.items()}
+    terms = of_laws(model.laws, result.probability, values)
+    white = sum(share * values[law]["N"][0] for law, share in result.probability.items())
+    return Noise(
+        size * white,
+        tuple(Term(size * one.square, one.alpha) for one in terms),
+        f"{recording.duration_s:.0f} s at rest",
+    )
+
+
+def measured(pieces: Sequence[Array], piece_s: float) -> float | None:
+    """N^2 by the differences of neighbouring means of `piece_s` s within rests [k] each; None of too few."""
+    steps = np.concatenate([np.diff(one) for one in pieces]) if pieces else np.zeros(0)
+    steps = steps[np.isfinite(steps)]
+    return float(np.mean(steps**2)) * 0.5 * piece_s if steps.size >= FEWEST else None
+
+
+def rounding(step: float, noise: float) -> float:
+    """Variance of the mean of readings rounded to a lattice with noise of a sd too small to dither it: harmonics of
+    the sawtooth (Widrow and Kollar, "Quantization Noise", 2008, chapter 4)."""
+    if step <= 0.0:
+        return 0.0
+    k = np.arange(1, 20)
+    return float((step**2 / (2.0 * math.pi**2 * k**2) * np.exp(-((2.0 * math.pi * k * noise / step) ** 2))).sum())

@@ -1,0 +1,101 @@
+"""What `selfcal tumble` prints and draws."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich import box
+from rich.table import Table
+
+from selfcal.base.errors import printable
+from selfcal.base.output import console_of, plotter, save_picture
+from selfcal.base.units import STANDARD_GRAVITY
+from selfcal.calibration.document import side_of
+
+#: By group of parameters, in data sheets' units: word, unit, factor, and what is taken off before.
+SHEET = {
+    ("accelerometer", "bias"): ("bias", "ug", 1e6 / STANDARD_GRAVITY, 0.0),
+    ("accelerometer", "scale"): ("scale - 1", "ppm", 1e6, 1.0),
+    ("accelerometer", "misalignment"): ("angle", "mrad", 1e3, 0.0),
+    ("accelerometer", "temperature"): ("bias over temperature", "ug/degC", 1e6 / STANDARD_GRAVITY, 0.0),
+    ("gyroscope", "bias"): ("bias", "deg/s", 1.0, 0.0),
+    ("gyroscope", "g_sensitivity"): ("g-sensitivity", "deg/s/g", 1.0, 0.0),
+    ("gyroscope", "scale"): ("scale - 1", "ppm", 1e6, 1.0),
+    ("gyroscope", "misalignment"): ("angle", "mrad", 1e3, 0.0),
+    ("gyroscope", "temperature"): ("bias over temperature", "deg/s/degC", 1.0, 0.0),
+}
+
+
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
+    """The tables of both sensors, what is not identified, and what the residuals say."""
+    console = console_of(to_stderr=to_stderr)
+
+    def line(text: str) -> None:
+        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
+
+    turns = [one for one in document["turns"] if one["left_out"] is None]
+    line(f"{len(document['rests'])} rests, {len(turns)} turns")
+    gravity = document["gravity"]
+    line(f"gravity {gravity['value']:.6g} m/s^2 ({gravity['source']}); scales take its error, which no rest shows")
+    for sensor in ("accelerometer", "gyroscope"):
+        found = document[sensor]
+        if found is None:
+            line("gyroscope: the logs have no gx, gy, gz")
+            continue
+        drift = dict.fromkeys(one["drift"] for name, one in document["noise"].items() if name[0] == sensor[0])
+        line("")
+        line(f"{sensor}; drift of the bias: {'; '.join(drift)}")
+        if sensor == "gyroscope" and not document["earth_rate_known"]:
+            line("the Earth's rate is in the intervals of bias and g-sensitivity: --latitude would take it off")
+        if "bias_at_degC" in found:
+            line(f"bias at {found['bias_at_degC']:.4g} degC")
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading in ("", "", "median", "5 %", "95 %", "unit"):
+            table.add_column(heading, no_wrap=True, justify="right" if heading in ("median", "5 %", "95 %") else "left")
+        for group in (key for of, key in SHEET if of == sensor and key in found):
+            word, unit, size, zero = SHEET[sensor, group]
+            for name, one in found[group].items():
+                if one["identified"]:
+                    digits = max(0, 1 - math.floor(math.log10(max(size * one["sd"], 1e-12))))
+                    cells = [f"{size * (one[at] - zero):.{digits}f}" for at in ("median", "q05", "q95")]
+                    table.add_row(word, name, *cells, unit)
+                else:
+                    table.add_row(word, name, "not identified", "", "", unit)
+        console.print(table)
+        if found["would_mend"]:
+            line(f"what is not identified takes: {'; '.join(found['would_mend'])}")
+        if found["adequate"] is None:
+            line("residuals: no rest is left over to check the model with")
+        else:
+            said = "as the noise has it" if found["adequate"] else "NOT adequate"
+            line(f"residuals: {found['residual_ratio']:.2f} of their sd, {said}")
+        if found["adequate"] is False and not found["findings"]:
+            line("  no single rest or turn, no square and no hysteresis explains it")
+        for one in found["findings"][:3]:
+            line(f"  {one['cause']} (by chance {one['p']:.1g})")
+    for text in document["notes"]:
+        line(f"note: {text}")
+
+
+def plot(document: Mapping[str, Any], path: Path | str) -> None:
+    """Save the residuals of |f| by rest, with the sd of each."""
+    figure, axes = plotter().subplots(figsize=(8.0, 4.2), layout="constrained")
+    rests = document["rests"]
+    micro = 1e6 / STANDARD_GRAVITY
+    at = np.arange(len(rests))
+    residual, sd = (micro * np.array([one[key] for one in rests]) for key in ("residual", "sd"))
+    axes.axhline(0.0, color="0.6", linewidth=0.8)
+    axes.errorbar(at, residual, 1.645 * sd, fmt="o", markersize=4, capsize=3, linewidth=1)
+    axes.set_xticks(at, [side_of(np.array(one["up"])) for one in rests], rotation=60, fontsize=8)
+    axes.set_xlabel("side that is up, rest by rest")
+    axes.set_ylabel("|f| - g, ug")
+    axes.set_title(
+        f"{printable(Path(document['recordings'][0]['path']).name)}: residuals, bars hold 90 % of the noise",
+        fontsize=10,
+        parse_math=False,
+    )
+    save_picture(figure, path, 150)

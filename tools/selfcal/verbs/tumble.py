@@ -1,0 +1,96 @@
+"""Scale, misalignment, bias and g-sensitivity of a part that rests in several positions."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Unpack
+
+from selfcal.base.errors import UserError
+from selfcal.base.options import argument, option
+from selfcal.logs.loaders import READ, Reading
+from selfcal.verbs._shared import End, Json, ModelFile, Start, to_stderr
+
+if TYPE_CHECKING:
+    from selfcal.logs.recording import Data
+
+#: Logs at most: a log a position.
+MOST_LOGS = 200
+
+
+def tumble(
+    logs: Annotated[
+        Data,
+        argument(f"One log with turns, or a log a position: {READ}", "LOG...", kind=list[Path]),
+    ],
+    *,
+    model: ModelFile = None,
+    latitude: Annotated[
+        float | None, option("Where it rested, degrees north: gravity, Earth's rate", metavar="DEG")
+    ] = None,
+    height: Annotated[float | None, option("Height above the sea, m", metavar="M")] = None,
+    gravity: Annotated[float | None, option("Gravity there, m/s^2, instead of the latitude's", metavar="G")] = None,
+    output: Annotated[
+        Path | str | None, option("Write the calibration as YAML", "-o", "--output", metavar="CALIBRATION.yaml")
+    ] = None,
+    export: Annotated[
+        tuple[str, Path | str] | None,
+        option("Write it for yaml, c, kalibr, px4 or ardupilot", metavar="FORMAT FILE", kind=tuple[str, Path]),
+    ] = None,
+    plot: Annotated[Path | str | None, option("Save the residuals (.png .pdf .svg)", metavar="FILE")] = None,
+    json: Json = None,
+    start_s: Start = None,
+    end_s: End = None,
+    **reading: Unpack[Reading],
+) -> dict[str, Any]:
+    """Calibrate the accelerometers and gyros of a part by its rests in several positions and the turns between them.
+
+    `logs`: one recording, or a sequence of one a position, in order of time. `model`: the part's own model file: its
+    law, noise and range; without one the law is of a rest of 20 min in the log, else the default model's prior.
+    `latitude`, `height`, `gravity`: see `calibration/earth.py`. `output`: the YAML file; `export`: a format of
+    `calibration/export.py` and its file; `plot`: a picture of the residuals. `start_s`, `end_s`: the stretch to look
+    at, s.
+    Returns the document `selfcal.tumble/1` and writes it to `json`. Raises UserError for what the user can put right:
+    fewer than three rests, a place that is none, logs that are not of accelerometers.
+    """
+    from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.calibration import accelerometer, gyroscope
+    from selfcal.calibration.document import document_of
+    from selfcal.calibration.earth import place
+    from selfcal.calibration.export import FORMS, write
+    from selfcal.calibration.rests import tumble_of
+    from selfcal.calibration.show import plot as picture
+    from selfcal.logs.recording import list_of, load
+    from selfcal.model.file import Model
+
+    each = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
+    if not 1 <= len(each) <= MOST_LOGS:
+        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST_LOGS} at most")
+    files = [path for log in each for path in list_of(log)]
+    check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
+    if plot is not None:
+        check_picture(plot)
+    if export is not None and export[0] not in FORMS:
+        raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
+    where = place(latitude, height, gravity)
+    loaded = Model.load(model)
+    recordings = [load(log, sensors=loaded.sensors, **reading).between(start_s, end_s) for log in each]
+    found = tumble_of(recordings, loaded, part_stated=model is not None)
+    accel = accelerometer.calibrate(found, where)
+    gyro = gyroscope.calibrate(accel) if found.has_gyro else None
+    document = document_of(recordings, found, accel, gyro)
+    for form, file in ((("yaml", output),) if output is not None else ()) + ((export,) if export is not None else ()):
+        write(form, file, accel, gyro, document)
+    if plot is not None:
+        picture(document, plot)
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+    """Print the calibration."""
+    from selfcal.calibration.show import show as tables
+
+    tables(document, to_stderr=to_stderr(given))
+    return 0
