@@ -71,8 +71,8 @@ def monitor(
     from selfcal.wire.known_models import KnownModels
     from selfcal.wire.live import Contact, View, patient
     from selfcal.wire.monitor import Outcome, Run
-    from selfcal.wire.streams import check as check_stream
     from selfcal.wire.streams import LINES, open_streams
+    from selfcal.wire.streams import check as check_stream
 
     if (channel is None) == (read is None):
         raise UserError(
