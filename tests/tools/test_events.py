@@ -19,9 +19,9 @@ from selfcal.diagnosis import events, words
 from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.events import Member, grouped
 from selfcal.diagnosis.finding import Finding
-from selfcal.likelihood.state import Look, State, interval
+from selfcal.likelihood.state import Look, State, interval, log_normal
 from selfcal.logs.recording import load, save
-from selfcal.show import table
+from selfcal.show import identification
 from selfcal.show.findings import show
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -241,7 +241,7 @@ def test_time_that_is_left_out_has_a_row(
     save(tmp_path / "log.npz", {f"g{axis}": ("deg/s", row) for axis, row in zip("xyz", values, strict=True)}, 40.0)
     document = diagnose(tmp_path / "log.npz", axes=["gy"], decimate=1.0)
     show(document)
-    table.show(identify(tmp_path / "log.npz", axes=["gy"], suspicion=False))
+    identification.show(identify(tmp_path / "log.npz", axes=["gy"], suspicion=False))
     shown = capsys.readouterr().out
     row = re.search(r"handling +motion on gy: from ([\d.]+) s", shown)
     line = re.search(
@@ -267,7 +267,7 @@ def test_identify_tells_an_event_in_one_line() -> None:
         "gz": axis_of(motion=knock),
         "ax": axis_of(**lag, allan_8s={"value": -0.21}, allan_16s={"value": 0.07}),
     }
-    assert table._not_adequate(axes) == [
+    assert identification._not_adequate(axes) == [
         "not adequate: gx, gy, gz: motion, left out: 88 to 90.5 s",
         "not adequate: gx, gy: jump: the bias jumps at 301 s, by 12 to 47 nats: K includes that",
         "not adequate: ax: innovation_lag1 +0.300, beyond ±0.100",
@@ -283,3 +283,15 @@ def test_a_noisy_axis_is_told_beside_its_siblings() -> None:
     white |= {"ay": interval(1.0, 0.1, "g/sqrt(Hz)")}
     assert noisier(white) == ["gz is 3.1 times as noisy as gx and gy"]
     assert noisier(white | {"gz": interval(1.9, 0.1, "deg/s/sqrt(Hz)")}) == []
+
+
+def test_a_lag_of_several_axes_is_by_all_of_them() -> None:
+    """Normal posteriors of ln: the mean of 40 and 160 s, of one sd, is 80 s, known better by the square root of 2. Of
+    axes that disagree, and of what may be 0, the first one's stands."""
+    one, two, far = (log_normal(math.log(value), 0.5, "s") for value in (40.0, 160.0, 4000.0))
+    both = events._of_all([one, two])
+    assert both["median"] == pytest.approx(80.0)
+    assert both["q95"] / both["median"] == pytest.approx(math.exp(1.645 * 0.5 / math.sqrt(2.0)), rel=1e-3)
+    assert events._of_all([one, far]) is one
+    assert events._of_all([one, one]) is one
+    assert events._of_all([interval(3.0, 4.0, "s"), one])["median"] == 3.0

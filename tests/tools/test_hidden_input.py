@@ -59,9 +59,7 @@ def states(y: Array) -> dict[str, Any]:
     """What `together` takes of an axis: its readings, and a model without columns."""
     found = {}
     for name, row in zip(NAMES, y, strict=False):
-        best = SimpleNamespace(c=np.zeros(1))
-        series = SimpleNamespace(columns=np.ones((1, row.size)))
-        found[name] = SimpleNamespace(y=row, dt=1.0, best=best, series=series, regressors=(), below_lattice=False)
+        found[name] = SimpleNamespace(y=row, dt=1.0, rest=row, regressors=(), below_lattice=False)
     return found
 
 

@@ -14,7 +14,7 @@ from noise_coverage import FLICKER_HZ, numbers_of, one_over_f, with_one_over_f
 from selfcal.adequacy.one_over_f import beside_its_law, density_above, white_of
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import make_tables
-from selfcal.show import table
+from selfcal.show import identification
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
@@ -101,7 +101,7 @@ def test_identify_names_1_over_f_noise(tmp_path: Path, capsys: pytest.CaptureFix
         assert number["identified"] and number["q05"] <= B <= number["q95"]
         assert axis["summary"]["arw"]["q05"] <= 0.03 <= axis["summary"]["arw"]["q95"]
         assert axis["summary"]["rrw"]["reason"] == "the drift is 1/f noise"
-    table.show(documents[0])
+    identification.show(documents[0])
     assert "with the laws of sums.yaml: gx: flicker 1" in capsys.readouterr().out
 
 

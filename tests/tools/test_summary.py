@@ -23,7 +23,7 @@ from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN
 from selfcal.model.tables import make_tables
-from selfcal.show import table
+from selfcal.show import identification
 from selfcal.verbs.identify import identify
 
 from conftest import case_records
@@ -174,7 +174,7 @@ def test_both_systems_of_units(tmp_path: Path, capsys: pytest.CaptureFixture[str
         for number, factor in zip(document["axes"][axis]["summary"].values(), factors, strict=True):
             assert number["identified"]
             assert number["datasheet"]["median"] == pytest.approx(factor * number["median"], rel=1e-9)
-    table.show(document)
+    identification.show(document)
     said = capsys.readouterr().out
     assert said.index("bias instability") < said.index("random_walk")
     for words in ("ARW", "VRW", "RRW", "°/√h", "m/s/√h", "°/h", "mg"):
@@ -188,7 +188,7 @@ def test_a_table_that_lacks_a_number_states_it(tmp_path: Path, capsys: pytest.Ca
     save(log, {"gx": ("deg/s", 0.04 * np.random.default_rng(8).standard_normal(3000))}, 1.0, {})
     numbers = identify(log)["axes"]["gx"]["summary"]
     assert numbers["arw"]["identified"] and not numbers["rrw"]["identified"]
-    table.show(identify(log))
+    identification.show(identify(log))
     said = capsys.readouterr().out
     assert f"< {numbers['rrw']['q95']:.3g} °/s²/√Hz, not identified" in said
     assert "bias instability not identified: gx: the Allan deviation has no minimum up to half the record" in said
@@ -201,7 +201,7 @@ def test_a_narrow_terminal_loses_intervals_and_no_number(tmp_path: Path) -> None
     document = identify(log)
     for width, intervals in ((160, 2), (80, 1), (60, 0)):
         console = Console(width=width, force_terminal=True, record=True, color_system=None)
-        table.show(document, console=console)
+        identification.show(document, console=console)
         line = next(line for line in console.export_text().splitlines() if "ARW" in line)
         assert line.count("[") == intervals
         assert "°/s/√Hz" in line and line.rstrip().endswith("°/√h")

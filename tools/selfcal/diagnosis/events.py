@@ -15,7 +15,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from scipy.special import expit
+from scipy.special import chdtrc, expit
 
 from selfcal.adequacy.document import Identified
 from selfcal.bank.result import HALF_90
@@ -26,7 +26,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood.heldout import HARM_SD, in_sd
-from selfcal.likelihood.state import interval
+from selfcal.likelihood.state import interval, log_normal
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.readings.motion import joined
@@ -39,8 +39,9 @@ SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}
 LEVELS = (0.05, 0.95)
 #: What has no name.
 UNEXPLAINED = "unexplained"
-#: Units of what several axes have in common; all else is a size on an axis.
-OF_ALL = ("s", "Hz")
+#: Units of what several axes have in common; all else is a size on an axis. Probability of axes that differ as much by
+#: chance, below which they disagree.
+OF_ALL, DISAGREE = ("s", "Hz"), 1e-3
 
 
 @dataclass(frozen=True)
@@ -324,18 +325,31 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
 
 
 def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """What all axes have in common: times, frequencies and whatever has no interval, of the strongest finding."""
+    """What all axes have in common: times and frequencies, by all of them, and whatever has no interval."""
     found: dict[str, Any] = {}
     for key in dict.fromkeys(key for one in estimates for key in one):
         values = [one[key] for one in estimates if key in one]
         if all(isinstance(value, Mapping) for value in values):
             if values[0]["unit"] in OF_ALL:
-                found[key] = values[0]
+                found[key] = _of_all(values)
         elif key == "intervals":
             found[key] = [list(each) for each in joined([tuple(each) for value in values for each in value])]
         elif all(value == values[0] for value in values):
             found[key] = values[0]
     return found
+
+
+def _of_all(values: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
+    """One number that each axis shows by its own readings: the product of normal posteriors of its logarithm. Of the
+    strongest finding alone where the axes disagree by more than chance, or a value may be 0."""
+    ln = np.log([[max(value[key], 0.0) or math.nan for key in ("q05", "median", "q95")] for value in values])
+    if not (np.isfinite(ln).all() and np.ptp(ln[:, 1]) > 0.0):  # a number of all axes already
+        return values[0]
+    weight = np.maximum((ln[:, 2] - ln[:, 0]) / (2.0 * HALF_90), 1e-12) ** -2.0
+    middle = float(weight @ ln[:, 1] / weight.sum())
+    if float(chdtrc(len(values) - 1, weight @ (ln[:, 1] - middle) ** 2)) < DISAGREE:
+        return values[0]
+    return log_normal(middle, float(weight.sum() ** -0.5), values[0]["unit"])
 
 
 def _on(event: Event, axis: str) -> dict[str, Any]:

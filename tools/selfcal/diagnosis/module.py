@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from selfcal.base.grid import half_means
 from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
@@ -72,6 +72,8 @@ PATTERN = 0.7
 JUMPS = ("step", "pulse")
 #: Causes that the quantity may be, with that pattern: its course has any shape.
 OF_TIME = (*JUMPS, "ramp", "turn_on")
+#: Logarithm of a factor about a time constant within which others are as possible as their likelihood says.
+NEAR_TAU = 1.5
 #: The shortest lag of a channel, means.
 LAG_LEAST = 20.0
 #: Smoothing of a channel, s, and windows of its rate.
@@ -287,13 +289,22 @@ def _sharpest(weights: Array, known: Array, f: float, reach: float) -> float:
 
 
 def transients(seen: Seen) -> Iterator[Candidate]:
-    """A constant rate, and a bias that settles."""
+    """A constant rate, and a bias that settles: theta is its time constant, s, and the sd of the logarithm of that."""
     t = (np.arange(seen.n) + 0.5) * seen.dt
-    octaves = int(math.log2(seen.n / FASTEST))
-    tau = FASTEST * seen.dt * 2.0 ** np.arange(octaves + 1)
+    ln_tau = math.log(FASTEST * seen.dt) + 0.5 * math.log(2.0) * np.arange(2 * int(math.log2(seen.n / FASTEST)) + 1)
+    tau = np.exp(ln_tau)
     shapes: list[Shape] = [("ramp", (), t - t.mean(), LN_SLOW)]
     shapes += [("turn_on", (float(one),), np.exp(-(t + seen.since_s) / one), LN_LOOKS) for one in tau]
-    yield from _weighed(seen, shapes)
+    scored = _scored(seen, shapes)
+    for one in _weighed(seen, shapes, scored):
+        if one.theta:
+            near = np.abs(ln_tau - math.log(one.theta[0])) < NEAR_TAU
+            weight = softmax(full(scored[1], scored[2])[1:][near])
+            middle = float(weight @ ln_tau[near])
+            sd = math.sqrt(float(weight @ (ln_tau[near] - middle) ** 2) + (ln_tau[1] - ln_tau[0]) ** 2 / 12.0)
+            yield replace(one, theta=(math.exp(middle), sd))
+        else:
+            yield one
 
 
 def channels(seen: Seen) -> Iterator[Candidate]:
@@ -318,13 +329,19 @@ def channels(seen: Seen) -> Iterator[Candidate]:
         shapes.append(
             (cause, (FORMS.index("square"), SMOOTH_S), smooth**2 - np.mean(smooth**2), price + LN_FORMS["square"])
         )
-        yield from _weighed(seen, [one for one in shapes if np.ptp(one[2]) > 0.0])
+        shapes = [one for one in shapes if np.ptp(one[2]) > 0.0]
+        yield from _weighed(seen, shapes, _scored(seen, shapes))
 
 
-def _weighed(seen: Seen, shapes: Sequence[Shape]) -> Iterator[Candidate]:
-    """Slow columns. Beside the best ones the drifts are fitted anew."""
+def _scored(seen: Seen, shapes: Sequence[Shape]) -> tuple[Array, Array, Array]:
+    """The columns [k, n], their scores [k, m], and the information of each [k, m, m]."""
     columns = np.array([one[2] / max(float(np.std(one[2])), 1e-300) for one in shapes])
-    score, known = columns @ seen.course.weights, information(seen.model, seen.y, columns)
+    return columns, columns @ seen.course.weights, information(seen.model, seen.y, columns)
+
+
+def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Array]) -> Iterator[Candidate]:
+    """Slow columns. Beside the best ones the drifts are fitted anew."""
+    columns, score, known = scored
     gain = full(score, known)
     for k in np.argsort(-gain)[:REFITTED]:
         if gain[k] < NET_LEAST:

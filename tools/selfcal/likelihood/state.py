@@ -306,6 +306,14 @@ def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
     }
 
 
+def log_normal(ln_median: float, sd: float, unit: str) -> dict[str, Any]:
+    """A posterior whose logarithm is normal with this standard deviation."""
+    mean = math.exp(ln_median + 0.5 * sd**2)
+    q05, median, q95 = (math.exp(ln_median + k * HALF_90 * sd) for k in (-1.0, 0.0, 1.0))
+    width = mean * math.sqrt(math.expm1(sd**2))
+    return {"mean": mean, "median": median, "sd": width, "q05": q05, "q95": q95, "unit": unit}
+
+
 def sizes(column: Array, key: str, unit: str, state: State) -> dict[str, Any]:
     """The posterior of a column's coefficient in the form of the contract."""
     weight, means, sds = (of[0] for of in state.posterior(column))

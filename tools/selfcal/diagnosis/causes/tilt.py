@@ -49,7 +49,8 @@ def of_steps(looks: Mapping[str, Look], states: Mapping[str, State]) -> dict[str
     turn = -np.cross(f, size) / float(f @ f)
     time_s = next(iter(looks.values())).estimate["time_s"]["median"]
     turned = _turned(states, [f"g{name[-1]}" for name in axes], time_s)
-    if turned is not None and float(turned[0] @ turn) < 0.0 and np.abs(turned[0] / turned[1]).max() > SURE:
+    sure = turned is not None and bool(np.abs(turned[0] / turned[1]).max() > SURE)
+    if turned is not None and sure and float(turned[0] @ turn) < 0.0:
         return dict(looks)
     weight = np.where(information > 0.0, 1.0 / np.maximum(information, 1e-300), 0.0)
     angles = {}
@@ -57,7 +58,11 @@ def of_steps(looks: Mapping[str, Look], states: Mapping[str, State]) -> dict[str
         row = -np.cross(f, np.eye(3))[:, k] / float(f @ f)
         sd = math.sqrt(float(row**2 @ weight))
         angles[f"angle_{axes[k][-1]}_deg"] = interval(math.degrees(turn[k]), math.degrees(sd), "deg")
-    return {name: replace(look, cause="tilt", estimate={**look.estimate, **angles}) for name, look in looks.items()}
+    others = () if sure else (step.CAUSE.id,)
+    return {
+        name: replace(look, cause="tilt", estimate={**look.estimate, **angles}, others=(*look.others, *others))
+        for name, look in looks.items()
+    }
 
 
 def _specific_force(states: Mapping[str, State]) -> dict[str, tuple[float, float]] | None:

@@ -19,7 +19,19 @@ from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, Series, ln_det, run
-from selfcal.likelihood.state import NET_LEAST, SCREEN, Look, Regressor, State, gain_for, interval, mixture, net, sizes
+from selfcal.likelihood.state import (
+    NET_LEAST,
+    SCREEN,
+    Look,
+    Regressor,
+    State,
+    gain_for,
+    interval,
+    log_normal,
+    mixture,
+    net,
+    sizes,
+)
 from selfcal.likelihood.statemodel import Array, Terms
 
 #: The fastest time constant looked for, samples.
@@ -110,14 +122,15 @@ def looks(state: State, record: Record) -> list[Look]:
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
-    """The look at a settling of a known time constant, to a factor of the root of 2."""
-    column = _decays(_time(record), np.array(theta))
+    """The look at a settling whose time constant, s, is known, and the sd of the logarithm of that."""
+    tau_s, sd = theta
+    column = _decays(_time(record), np.array([tau_s]))
     gain, fit = state.with_columns(column)
     estimate = {
         "amplitude": interval(float(fit.c[-1]), float(fit.sd[-1]), state.unit),
-        "tau_s": interval(theta[0], theta[0] * math.log(2.0) / math.sqrt(12.0), "s"),
+        "tau_s": log_normal(math.log(tau_s), sd, "s"),
     }
-    found = _look(state, record, np.array(theta), gain, net(gain), estimate)
+    found = _look(state, record, np.array([tau_s]), gain, net(gain), estimate)
     return replace(found, measure=partial(sizes, column, "amplitude", state.unit))
 
 
