@@ -28,7 +28,7 @@
  * Steps of several axes at one time are motion.
  * Each is normal with variance 1 for large n. The doubt about the parameters widens it by sqrt(1 + n / n_before), which
  * is taken off. Limits: SELFCAL_ADEQUACY_LIMIT; for the skewed ones what simulation gives (tests/ACCURACY.md). */
-#include "bank.h"
+#include "bank_inside.h"
 
 #define SLOW R(0.0625)          /* l: a mean over some 16 bank samples */
 #define ALL_KNOWN R(0.70710678) /* over all epochs the doubt about the parameters adds as much as the noise, at most */

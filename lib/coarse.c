@@ -13,7 +13,7 @@
  * a half. Columns: the time; each channel; the temperature behind a low pass; exp(-t / tau) of a warm-up.
  * The bank begins anew after COARSE_MOST bank samples: the least rho and the digits of a float do for no more. What it
  * said then stands beside what it says now. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #define COARSE_MOST 16384U
 #define FASTEST R(4.0) /* rho of the first filter; of the last one 0 */

@@ -1,5 +1,5 @@
 /* Reports and status as frames. Items, bits and scales: selfcal_frames.h, made from selfcal.dbc. */
-#include "bank.h"
+#include "bank_inside.h"
 #include "selfcal_frames.h"
 
 #include <math.h>

@@ -1,7 +1,7 @@
 /* Counts per (node, sample, axis) what regressors cost, or with BENCH_SUMS the laws that are sums; and the default
  * model, which has neither, in such an image and in one without their code (-DBENCH_PLAIN). Prints as count.h says. */
 #include "count.h"
-#include "bank.h"
+#include "bank_inside.h"
 #include "record.h"
 
 #if defined(BENCH_SUMS)

@@ -1,7 +1,7 @@
 /* The bank's inside: what all axes share (bank.c: variances, gains, sums A and D), the work of each axis (a kernel:
  * drift x, sums B and C), and the code that a model may name. Not for users. */
-#ifndef SELFCAL_BANK_H
-#define SELFCAL_BANK_H
+#ifndef SELFCAL_BANK_INSIDE_H
+#define SELFCAL_BANK_INSIDE_H
 
 #include "averages.h"
 #include "twofold.h"
