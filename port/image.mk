@@ -10,7 +10,8 @@ PROGRAM_FLAGS := $(strip -DSENSOR=$(SENSOR_NAME) $(IMAGE_CFLAGS) $(CFLAGS) $(NOD
 # Between single quotes of the shell.
 QUOTED_FLAGS = $(subst ','\'',$(PROGRAM_FLAGS))
 IMAGE_SOURCES := $(wildcard port/app/*.c port/$(TARGET)/*.c) port/sensors/sensor.c $(SENSOR_SOURCE)
-IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/sensors/*.h port/$(TARGET)/*.h $(SENSOR_ROOM)*.h)
+IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/sensors/*.h port/$(TARGET)/*.h) \
+                 $(wildcard $(SENSOR_ROOM)*.h)
 
 .PHONY: $(TARGET)
 $(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
@@ -21,8 +22,8 @@ $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(MODEL_DIR)/selfcal_model
 	@rm -rf $(OUT)/objects
 	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) MODEL_DIR=$(MODEL_DIR) OUT=$(OUT)/objects \
 	    'PROGRAM_FLAGS=$(QUOTED_FLAGS)'
-	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g @$(OUT)/flags -Ilib -Iport -Iport/app -Iport/sensors -I$(SENSOR_ROOM) \
-	    -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)
+	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g @$(OUT)/flags -Ilib -Iport -Iport/app -Iport/sensors \
+	    -I$(SENSOR_ROOM) -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld \
 	    -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings $(OUT)/objects/*.o -lm -o $@
 

@@ -1,5 +1,6 @@
-/* An I2C master by two lines that a board pulls low and reads (UM10204). It waits for a sensor that stretches the clock,
- * and frees one that holds the data line: after a reset in the middle of a byte it waits for the rest of its clocks. */
+/* An I2C master by two lines that a board pulls low and reads (UM10204). It waits for a sensor that stretches the
+ * clock, and frees one that holds the data line: after a reset in the middle of a byte that one waits for the rest of
+ * its clocks. */
 #ifndef I2C_MASTER_H
 #define I2C_MASTER_H
 

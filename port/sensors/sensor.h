@@ -45,8 +45,8 @@ typedef struct {
     void (*reset_line)(bool low);
     /* SPI: the exchanges from now on go to this chip, 0 or 1. The second one's chip select is the reset line. */
     void (*choose)(uint8_t chip);
-    /* I2C: writes, then reads after a repeated start, either of which may be of 0 bytes. Bounded. False: nobody answers,
-     * a byte was not taken, or somebody holds a line; some of it may have happened. */
+    /* I2C: writes, then reads after a repeated start, either of which may be of 0 bytes. Bounded. False: nobody
+     * answers, a byte was not taken, or somebody holds a line; some of it may have happened. */
     bool (*transfer)(uint8_t address, const uint8_t *out, size_t written, uint8_t *in, size_t wanted);
 } sensor_bus_t;
 

@@ -1,6 +1,6 @@
-/* The sensor on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset or
- * the second chip's select PB1. exchange() is
- * polled; begin() goes by DMA2 (RM0090 table 44: stream 0 channel 3 receives, stream 3 channel 3 sends). */
+/* The sensor on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1, which is the
+ * second chip's select of a part of two. exchange() is polled; begin() goes by DMA2 (RM0090 table 44: stream 0 channel
+ * 3 receives, stream 3 channel 3 sends). */
 #include "board.h"
 #include "readings.h"
 #include "stm32f405.h"
