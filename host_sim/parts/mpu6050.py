@@ -105,7 +105,8 @@ class Mpu6050:
         code = self.codes[axis] or 10
         if gyro:
             return (-1.0 if axis == 1 else 1.0) * 25.0 * 1.046 ** (code - 1) * self.response[axis]
-        return 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0) * G * self.response[axis]
+        trim: float = 0.34 * (0.92 / 0.34) ** ((code - 1) / 30.0)
+        return trim * G * self.response[axis]
 
     def _sample(self, at_us: float) -> None:
         index = self.index

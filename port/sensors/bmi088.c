@@ -50,7 +50,7 @@ enum {
 #define FRAME_DATA 0x84U
 #define FRAME_TIME 0x44U
 
-enum { GYRO_FRAME = 6, ACCEL_FRAME = 7, CHUNK = 8, ACCEL_FIFO_BYTES = 1024 };
+enum { GYRO_FRAME = 6, ACCEL_FRAME = 7, CHUNK = 8, ACCEL_CHUNK = CHUNK * ACCEL_FRAME, ACCEL_FIFO_BYTES = 1024 };
 #define GYRO_STEP (2000.0F / 32767.0F)
 #define ACCEL_STEP (24.0F * SENSOR_G / 32768.0F)
 #define STEPS_PER_G (32768.0F / 24.0F)
@@ -86,7 +86,7 @@ typedef struct {
     uint8_t next, held, behind; /* frames of the chunk: the next one, all; in the FIFO after them */
     uint8_t accel_at, accel_end;
     uint8_t chunk[1 + CHUNK * GYRO_FRAME];
-    uint8_t accel_chunk[2 + CHUNK * ACCEL_FRAME];
+    uint8_t accel_chunk[2 + ACCEL_CHUNK];
 } bmi088_t;
 
 static bmi088_t *of(sensor_state_t *state) {
@@ -303,7 +303,7 @@ static bool waits(sensor_state_t *state) {
 
 /* Bytes in the accelerometer's FIFO. */
 static size_t accel_bytes(bmi088_t *self) {
-    uint8_t bytes[2];
+    uint8_t bytes[2] = {0, 0};
     const bool read = read_registers(self, ACCEL, ACC_FIFO_LENGTH, bytes, 2U);
     const size_t count = (size_t)bytes[1] << 8 | bytes[0];
     return read && count <= ACCEL_FIFO_BYTES ? count : 0U; /* more: the lines float */
@@ -346,7 +346,7 @@ static bool fetch(bmi088_t *self) {
 
 static bool fetch_accel(bmi088_t *self) {
     uint8_t out[sizeof self->accel_chunk] = {READ | ACC_FIFO_DATA};
-    const size_t wait = accel_bytes(self), count = wait < CHUNK * ACCEL_FRAME ? wait : CHUNK * ACCEL_FRAME;
+    const size_t wait = accel_bytes(self), count = wait < ACCEL_CHUNK ? wait : ACCEL_CHUNK;
     self->accel_at = self->accel_end = 0;
     self->common.bus->choose(ACCEL);
     if (count == 0U || !self->common.bus->exchange(out, self->accel_chunk, 2U + count)) {

@@ -2,7 +2,8 @@
  * clock. Data sheet BST-BMI088-DS001.
  *
  * A sample is a reading of the gyroscope, with an acceleration of up to three of its periods before. The two clocks
- * drift apart, by 1 % at most: an acceleration is then left out or taken twice, and the time remains the gyroscope's. At 1000 Hz the accelerometer runs at 1600 Hz, else at the same rate.
+ * drift apart, by 1 % at most: an acceleration is then left out or taken twice, and the time remains the gyroscope's.
+ * At 1000 Hz the accelerometer runs at 1600 Hz, else at the same rate.
  * The FIFOs hold 100 rates and 146 accelerations, so no interrupt is needed: a loop that comes back within 90 ms loses
  * nothing at 1 kHz. They have neither checksum nor stamp. After an overflow the gyroscope's begins anew, and the
  * processor's clock counts the missing samples.

@@ -386,9 +386,7 @@ def test_the_scores_of_a_line_and_of_two_levels(kind: str, size: float) -> None:
     report = bank.report(0)
     probability = {name: float(value) for name, value in report.probability.items()}
     law = "random_walk" if probability["random_walk"] > 0.01 else max(probability, key=lambda name: probability[name])
-    found = {
-        name: one.q95 if name in ("K", "sigma_m") else one.median for name, one in report.parameters[law].items()
-    }
+    found = {name: one.q95 if name in ("K", "sigma_m") else one.median for name, one in report.parameters[law].items()}
     expected = levels(y, t.size - 1) if kind == "two_level" else tones(innovations(y[EPOCH:], found, [])[0][1:])
     assert suspect == kind
     assert score == pytest.approx(expected, abs=3e-3)
