@@ -439,6 +439,7 @@ def product_table(bench: Bench) -> str:
     row("… tables", lambda f: f["sizes"]["linked.tables"])
     row("instructions of a sample at 819.2 Hz, on average", count("sample"))
     row("… of the longest turn with one", count("sample.worst"))
+    row("… and of one that ends an epoch of the judgement", count("adequacy.random_walk.end"))
     row("instructions of a report of one axis", count("report"))
     row("… of its longest call", longest_step)
     return "\n".join(lines)
