@@ -20,7 +20,7 @@
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone
 #   make fuzz [RUNS=n | SECONDS=n] [KERNEL=fixed]
 #                               random calls of the library under sanitizers, 10^7 executions
-#   make firmware [TARGET=...] [SENSOR=icm42688] [CFLAGS=...] [NODE=n] [ACCEPT=1]
+#   make firmware [TARGET=...] [SENSOR=icm42688 | SENSOR=path/mine.c] [CFLAGS=...] [NODE=n] [ACCEPT=1]
 #                               build/TARGET/selfcal.elf, .bin, .hex of each board; sizes; fails above a budget.
 #                               With another sensor than the ADIS16405: build/TARGET-SENSOR
 #   make flash TARGET=stm32f405 writes it into a module by openocd, st-flash or dfu-util

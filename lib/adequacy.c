@@ -21,14 +21,17 @@
  *   slow        sum z_t e_(t-1) / sqrt(n v), e the mean of past z with weights (1 - l)^k l, v = l / (2 - l)
  *   variance    sum (z^2 - 1) / sqrt(2 n), and its difference between the second half and the first
  *   kurtosis    sum (z^4 - 6 z^2 + 3) / sqrt(24 n)
+ *   line        the strongest tone of z (tones.c), over all epochs
  *
- * A coarse bank (coarse.c) looks for channels, a ramp and a warm-up as well, by no law of a report.
- * All but the step and the last two are also summed over all epochs, which finds an effect that is small and lasts.
+ * A coarse bank (coarse.c) looks for channels, a ramp and a warm-up as well, and levels.c for a bias of two levels, by
+ * no law of a report.
+ * All but the step, the variance and the kurtosis are also summed over all epochs, which finds an effect that is small
+ * and lasts.
  * A step pulls at the channels as well, so it goes before them, unless a channel itself has such a step at that time.
  * Steps of several axes at one time are motion.
  * Each is normal with variance 1 for large n. The doubt about the parameters widens it by sqrt(1 + n / n_before), which
  * is taken off. Limits: SELFCAL_ADEQUACY_LIMIT; for the skewed ones what simulation gives (tests/ACCURACY.md). */
-#include "bank.h"
+#include "bank_inside.h"
 
 #define SLOW R(0.0625)          /* l: a mean over some 16 bank samples */
 #define ALL_KNOWN R(0.70710678) /* over all epochs the doubt about the parameters adds as much as the noise, at most */
@@ -330,6 +333,7 @@ static void add(selfcal_watch_t *watch, const selfcal_real_t z[], size_t axis, u
     sums->power += square;
     watch->square[second_half] += square - R(1.0);
     watch->fourth += r_fma(square, square - R(6.0), R(3.0));
+    selfcal_tones_take(&watch->tones, own);
     watch->last = own;
     watch->slow = r_fma(SLOW, own - watch->slow, watch->slow);
 }
@@ -417,6 +421,8 @@ static selfcal_real_t step_score(const selfcal_adequacy_t *self, const selfcal_w
 
 void selfcal_adequacy_forget(selfcal_adequacy_t *self, uint8_t axis) {
     memset(&self->watch[axis].all, 0, sizeof self->watch[axis].all);
+    memset(&self->watch[axis].tones, 0, sizeof self->watch[axis].tones);
+    memset(&self->levels, 0, sizeof self->levels);
     self->watch[axis].rise.told = R(0.0);
     for (uint8_t other = 0; other < SELFCAL_AXES_MAX; other++) {
         self->watch[other].all.product[axis] = R(0.0);
@@ -476,6 +482,10 @@ static void judge_axis(selfcal_adequacy_t *self, uint8_t axis, uint32_t others) 
         const selfcal_real_t variance = watch->square[1] + watch->square[0];
         weigh_memory(&found, &watch->epoch, known);
         weigh_memory(&found, &watch->all, ALL_KNOWN);
+        suspect(&found, SELFCAL_SUSPECT_PERIODIC, selfcal_tones_score(&watch->tones),
+                (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT_TONE);
+        suspect(&found, SELFCAL_SUSPECT_TWO_LEVEL, selfcal_levels_score(&self->levels, axis),
+                (selfcal_real_t)SELFCAL_ADEQUACY_LIMIT);
         suspect(&found, SELFCAL_SUSPECT_VARIANCE_CHANGE, r_fmax(known * variance / r_sqrt(R(2.0) * n), R(0.0)), limit);
         suspect(&found, SELFCAL_SUSPECT_VARIANCE_CHANGE, change / r_sqrt(R(2.0) * n), limit);
         suspect(&found, SELFCAL_SUSPECT_OUTLIERS, watch->fourth / r_sqrt(R(24.0) * n),
@@ -596,6 +606,7 @@ void selfcal_adequacy_push(selfcal_adequacy_t *self, const selfcal_t *bank, cons
         }
         if (batch->count > 0U && bank->model->regressors == NULL) {
             const selfcal_real_t channel[SELFCAL_ADEQUACY_CHANNELS] = {mean_of(self, 0), mean_of(self, 1)};
+            selfcal_levels_take(&self->levels, &self->coarse, batch, batch->count - 1U, bank->model->axes);
             selfcal_coarse_take(&self->coarse, batch, batch->count - 1U, channel, bank->model);
         }
         if (any && batch->count > 0U) {

@@ -14,7 +14,7 @@
  *   g = 1e-4). So does u, u' = u - g u + beta, on e = u - u_inf, u_inf = beta/g_inf:
  *   e' = (1 - g) e - (g - g_inf) u_inf, where g - g_inf = phi (d + (1 - r) p_inf) / ((1 + p_inf) (r + P)).
  */
-#include "bank.h"
+#include "bank_inside.h"
 
 #include <float.h>
 

@@ -11,7 +11,7 @@
  * the same for all; the states carry twice the digits of selfcal_real_t, and so do the sums.
  *
  * All of it lies behind SELFCAL_SIZE() in the caller's memory; a model without regressors has none. */
-#include "bank.h"
+#include "bank_inside.h"
 
 /* A pivot below this part of its diagonal: the column is one of the others in all that was seen (or was constant).
  * Nothing is lost by taking it so: what the estimate then leaves is carried along (`rest`). */

@@ -1,6 +1,6 @@
 /* Forgetting: a bank sample counts for 2^-(age / half-life) in every sum, from one batch to the next. Linked only with
  * a model that forgets. */
-#include "bank.h"
+#include "bank_inside.h"
 
 /* Bank samples that the sums count for at least. */
 #define WEIGHT_MIN 1e-6

@@ -28,7 +28,7 @@
  *
  * Gains come in float from bank.c and become mantissa * 2^-shift here: once a span and node, for a level node once for
  * all. >> of a negative number must be arithmetic, as it is with every compiler of these parts. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #ifdef SELFCAL_FIXED
 

@@ -1,6 +1,6 @@
 /* The kernel in selfcal_real_t: every axis of one node through a span. Sums of a span are short enough for
  * selfcal_real_t; they go into the long ones scaled in full. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #ifndef SELFCAL_FIXED
 

@@ -10,7 +10,7 @@
  * The readings between a step and its detection have spoilt C of that axis: they look like more drift. It is put back
  * to what it was per sample before. Those samples then count as if they had been like the others.
  * Noise that has changed is forgotten: C, D and the weight of the samples keep the part `keep`. */
-#include "bank.h"
+#include "bank_inside.h"
 
 static void restart_node(selfcal_t *self, size_t j, const selfcal_wide_t c[]) {
     selfcal_node_t *node = &self->node[j];

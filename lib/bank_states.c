@@ -15,7 +15,7 @@
  * P and the gains are in selfcal_wide_t, until P has converged; a sample then costs the filter alone. The bias and
  * sigma_v are integrated out from the same sums as for every node (bank.c), which are here taken to twice the digits,
  * the regressors' columns among them (regressors.c says why). */
-#include "bank.h"
+#include "bank_inside.h"
 
 /* P has converged when no variance moves by this part of itself within a sample: at a gain of 1e-4 it then is within
  * 1e-8. */

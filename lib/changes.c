@@ -14,7 +14,7 @@
  * tell.
  *
  * tests/ACCURACY.md has the rates of false alarms and the delays as measured. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #define SPACING 16U
 #define STEP_LIMIT R(7.0)

@@ -1,5 +1,5 @@
 /* Invariants of a bank. Every push, skip and report leaves them true, whatever came in. */
-#include "bank.h"
+#include "bank_inside.h"
 
 /* Sizes of selfcal_config.h that the code can do with. */
 SELFCAL_STATIC_ASSERT(axes, SELFCAL_AXES_MAX >= 1 && SELFCAL_AXES_MAX <= 16);

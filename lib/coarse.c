@@ -13,7 +13,7 @@
  * a half. Columns: the time; each channel; the temperature behind a low pass; exp(-t / tau) of a warm-up.
  * The bank begins anew after COARSE_MOST bank samples: the least rho and the digits of a float do for no more. What it
  * said then stands beside what it says now. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #define COARSE_MOST 16384U
 #define FASTEST R(4.0) /* rho of the first filter; of the last one 0 */
@@ -107,6 +107,26 @@ static selfcal_real_t score_of(const selfcal_coarse_t *self, uint8_t axis, size_
     return sign * r_sqrt(most);
 }
 
+/* -2 ln p of each filter without a column, but for a constant; the likeliest filter. */
+static size_t costs_of(const selfcal_coarse_t *self, uint8_t axis, selfcal_wide_t cost[SELFCAL_COARSE_FILTERS]) {
+    size_t likeliest = 0;
+    for (size_t f = 0; f < SELFCAL_COARSE_FILTERS; f++) {
+        const selfcal_wide_t ln_square = selfcal_bank_ln((selfcal_wide_t)self->cell[axis][f].square);
+        cost[f] = (selfcal_wide_t)(self->n - 1U) * ln_square + (selfcal_wide_t)self->filter[f].ln_s;
+        likeliest = cost[f] < cost[likeliest] ? f : likeliest;
+    }
+    return likeliest;
+}
+
+selfcal_real_t selfcal_coarse_sigma(const selfcal_coarse_t *self, uint8_t axis) {
+    if (!(self->cell[axis][0].square > R(0.0))) {
+        return R(0.0);
+    }
+    selfcal_wide_t cost[SELFCAL_COARSE_FILTERS];
+    const size_t likeliest = costs_of(self, axis, cost);
+    return r_sqrt(self->cell[axis][likeliest].square / (selfcal_real_t)(self->n - 1U));
+}
+
 selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, selfcal_suspect_t *suspect) {
     static const selfcal_suspect_t of[SELFCAL_COARSE_COLUMNS] = {
         SELFCAL_SUSPECT_RAMP,        SELFCAL_SUSPECT_TEMPERATURE, SELFCAL_SUSPECT_SUPPLY,
@@ -117,15 +137,11 @@ selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, 
     if (self->n < SELFCAL_EPOCH_MIN || !(self->cell[axis][0].square > R(0.0))) {
         return most;
     }
-    selfcal_wide_t cost[SELFCAL_COARSE_FILTERS], least = (selfcal_wide_t)INFINITY;
+    selfcal_wide_t cost[SELFCAL_COARSE_FILTERS];
     selfcal_real_t over[SELFCAL_COARSE_FILTERS];
-    for (size_t f = 0; f < SELFCAL_COARSE_FILTERS; f++) { /* -2 ln p but for a constant */
-        const selfcal_wide_t ln_square = selfcal_bank_ln((selfcal_wide_t)self->cell[axis][f].square);
-        cost[f] = (selfcal_wide_t)(self->n - 1U) * ln_square + (selfcal_wide_t)self->filter[f].ln_s;
-        least = cost[f] < least ? cost[f] : least;
-    }
+    const size_t likeliest = costs_of(self, axis, cost);
     for (size_t f = 0; f < SELFCAL_COARSE_FILTERS; f++) {
-        over[f] = (selfcal_real_t)(cost[f] - least);
+        over[f] = (selfcal_real_t)(cost[f] - cost[likeliest]);
     }
     for (size_t k = 0; k < SELFCAL_COARSE_COLUMNS; k++) {
         const selfcal_real_t score = score_of(self, axis, k, over);

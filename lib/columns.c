@@ -7,7 +7,7 @@
  * Slope over the window: the line that fits the means of the bins best, weighed by their samples in the window.
  * Lag: x += g (v - x) at each sample, g = 1 - exp(-interval / time constant). Kept is x - v, in two floats.
  * Phase of a line: a product of integers modulo 2^64, which does not drift. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #define BINS (SELFCAL_COLUMN_BINS + 2U)
 #define TWO_PI R(6.283185307179586)

@@ -25,7 +25,7 @@
  * mean has the variance `level` sigma^2/n. Then T1, its terms over `within`, is taken as c chi-square with nu degrees
  * of freedom of the same mean and variance (Satterthwaite, Biometrics Bull. 2 (1946) 110-114): nu = A^2 (n - 1)/sum of
  * spread, c = A (n - 1)/nu. White: nu = A (n - 1), c = 1. */
-#include "bank.h"
+#include "bank_inside.h"
 
 /* ln Gamma(a), a > 0, to 1e-10: Stirling's series above 8. lgamma() has a global, signgam. */
 static selfcal_wide_t ln_gamma(selfcal_wide_t a) {

@@ -2,7 +2,7 @@
 #ifndef SELFCAL_IMU_INSIDE_H
 #define SELFCAL_IMU_INSIDE_H
 
-#include "bank.h"
+#include "bank_inside.h"
 
 /* imu_gate.c: tells rest from motion. */
 struct selfcal_gate_code {

@@ -2,7 +2,7 @@
  * has. The likelier of both stands. */
 #include "imu.h"
 
-#include "report.h"
+#include "report_inside.h"
 
 static selfcal_status_t begin_columns(selfcal_imu_t *imu) {
     selfcal_imu_columns_t *self = imu->columns;

@@ -2,7 +2,7 @@
  * gathered, then the copy is taken at once. From there on the bank goes on without the report. */
 #include "imu.h"
 
-#include "report.h"
+#include "report_inside.h"
 
 static selfcal_t *hold(const selfcal_t *self, uint8_t axis, selfcal_t *held) {
     *held = *self;

@@ -8,7 +8,7 @@
  * prediction x is a weighted mean of such values and 0, so |nu| <= 4 L; s >= r >= 2^-10 (SELFCAL_VARIANCE_RATIO_MAX); a
  * record has at most 2^32 bank samples. So C = sum nu^2/s <= 2^(32 + 84 + 10) = 2^126 < FLT_MAX = 2^128, and B = sum u
  * nu/s is less (|u| <= 1). */
-#include "bank.h"
+#include "bank_inside.h"
 
 /* --- blocks --- */
 

@@ -12,7 +12,7 @@
  *   times the rms difference.
  *
  * >> of a negative number must be arithmetic, as in bank_kernel_fixed.c. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #ifdef SELFCAL_FIXED
 

@@ -1,5 +1,5 @@
 /* A block's sums in selfcal_real_t, about the block's first sample: gravity or a turn-on bias costs no digits. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #ifndef SELFCAL_FIXED
 

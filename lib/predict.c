@@ -1,5 +1,5 @@
 /* The bias after the report: where it goes under each law, and how the doubt about it grows. */
-#include "bank.h"
+#include "bank_inside.h"
 
 typedef struct {
     selfcal_real_t mean, var;

@@ -10,7 +10,7 @@
  * A search finds the rows of alpha that count, and where in ln rho each counts (report_search.c). The integral runs
  * over the cells of these rows (report_integral.c). Priors enter per cell, limits by the part of the cell they leave,
  * so the interpolated thing is always the likelihood alone. */
-#include "report.h"
+#include "report_inside.h"
 
 /* ln of the density in ln(parameter) where prior_shape() is 0. */
 static selfcal_real_t ln_prior_density(const selfcal_prior_t *prior) {

@@ -1,5 +1,5 @@
 /* Bias: moments of x0 + drift now over the nodes, and how a decaying drift will move them. */
-#include "report.h"
+#include "report_inside.h"
 
 /* The terms' part of `now` at a node of a sum, x0 given with its variance. */
 static void now_terms(const selfcal_work_t *work, uint16_t k, selfcal_real_t x0, selfcal_real_t variance,

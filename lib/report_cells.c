@@ -1,6 +1,6 @@
 /* Cells: rows of cells about where the likelihood counts, what the splines and the expectation give there, and the part
  * of sigma_v that the priors' limits leave. */
-#include "report.h"
+#include "report_inside.h"
 
 /* A range has two thirds of the cells, which are 0.6 sd of a normal one wide if all are 24; more if it is wider than
  * 6.4 nepers, since moments of the parameters themselves need them narrower than 0.4. One row alone has twice as many:

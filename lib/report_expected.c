@@ -2,7 +2,7 @@
  *
  * The innovations' variance of a filter over such data has a closed form. It carries the terms of order n of a node's
  * ln-likelihood, so that the splines have to hold the rest alone. */
-#include "report.h"
+#include "report_inside.h"
 
 /* In selfcal_real_t, right to some 2e-7 n/2 ln V nats, and in selfcal_wide_t for longer records. */
 #define NAME(name) name

@@ -1,6 +1,6 @@
 /* Integral: over the cells of the rows that the search has found, by the midpoint rule. For a smooth peak it converges
  * faster than any power of the cell. sigma_v is integrated in closed form, but in cells that the priors' limits cut. */
-#include "report.h"
+#include "report_inside.h"
 
 /* Cells of a row that one step sums. One that a limit cuts counts as so many, and so do sigma_v's cells laid anew. */
 #define COST_OF_CUT 5U

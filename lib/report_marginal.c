@@ -5,7 +5,7 @@
  *     ln p = profile(node) - n_eff (delta + e^(-2 delta)/2 - 1/2),   delta = t - t^,
  * so the shape in delta is one for all nodes. n_eff is half the curvature there, of the best node. The shape is exact
  * where the bias takes no share of a sample or a whole one, else to the second order in delta. */
-#include "report.h"
+#include "report_inside.h"
 
 /* ln(sigma_v/mode): more than any cell has that counts beside a sound best, and e^(2 of it) is still a float. */
 #define DELTA_MOST R(30.0)

@@ -4,7 +4,7 @@
  *     sigma_v^2 = (residual + noise) / (n - w), w = P0 A/(P0 A + sigma_v^2), noise = (1 - w)^2 A (x0^ - x0 prior)^2,
  * w the share of one sample that the bias takes, 1 under a wide prior. With regressors in use each coefficient takes
  * such a share as well. */
-#include "report.h"
+#include "report_inside.h"
 
 #define STEP_NODES 3U
 #define STEP_VALUES 16U

@@ -3,7 +3,7 @@
  * A row's cells reach from where the likelihood begins to count to where it ends, and so do the rows. Either range is
  * found by passes of few samples: each shrinks it to those that count and one more, or lets it grow where the last one
  * counts. The nodes say where to begin: their heights are known. */
-#include "report.h"
+#include "report_inside.h"
 
 /* ln-likelihood below a row's peak, or a row's peak below the best, at which a cell or row no longer counts: 4.9 sd of
  * a normal one; more of a short record, whose tails are long. */

@@ -13,7 +13,7 @@
  * Both functions of psi are fitted as well, a term for each two lines. Taken into the expectation, all these leave to
  * the splines less than a nat, however long the record. A priori a line's power scatters as a periodogram does, and an
  * end's as large as its spectrum makes it. */
-#include "report.h"
+#include "report_inside.h"
 
 #define FIT_PRECISION R(50.0) /* 0.5/0.01: they leave 0.01 nat of a node's ln-likelihood -n/2 ln v */
 #define FIT_MOST R(1e6)

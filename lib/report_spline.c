@@ -1,5 +1,5 @@
 /* Spline: quintic B-splines through the nodes of a grid, in ln rho and ln alpha (not-a-knot). */
-#include "report.h"
+#include "report_inside.h"
 
 #define STEP_LINES 8U /* of one step */
 

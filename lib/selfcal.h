@@ -173,7 +173,9 @@ typedef enum {
     SELFCAL_SUSPECT_OUTLIERS = 8,
     SELFCAL_SUSPECT_STEP = 9,
     SELFCAL_SUSPECT_MOTION = 10, /* several axes step at once */
-    SELFCAL_SUSPECT_TURN_ON = 11
+    SELFCAL_SUSPECT_TURN_ON = 11,
+    SELFCAL_SUSPECT_PERIODIC = 12, /* a line */
+    SELFCAL_SUSPECT_TWO_LEVEL = 13 /* popcorn noise */
 } selfcal_suspect_t;
 
 /* Why an axis is not judged, has no corrected sample, or has a calibration that is not to be relied on. */

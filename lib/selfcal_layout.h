@@ -505,6 +505,17 @@ typedef struct {
     selfcal_suspect_t cause;
 } selfcal_rise_t;
 
+/* tones.c: what a tone remembers of z, and its sum. */
+enum { SELFCAL_TONES_OCTAVE = 6, SELFCAL_TONES_OCTAVES = 5 };
+typedef struct {
+    selfcal_real_t re, im, sum;
+} selfcal_tone_t;
+typedef struct {
+    uint32_t n;                                 /* samples of the first octave */
+    selfcal_real_t half[SELFCAL_TONES_OCTAVES]; /* the first of two samples of each */
+    selfcal_tone_t tone[SELFCAL_TONES_OCTAVES][SELFCAL_TONES_OCTAVE];
+} selfcal_tones_t;
+
 typedef struct {
     bool known, running, begun;
     selfcal_reason_t reason;                             /* if not known */
@@ -516,6 +527,7 @@ typedef struct {
     selfcal_real_t last, slow, fourth, square[2];
     selfcal_rise_t rise;
     selfcal_sums_t epoch, all;
+    selfcal_tones_t tones;
 } selfcal_watch_t;
 
 /* A step of the bias that may have begun with some bank sample. */
@@ -568,6 +580,33 @@ typedef struct {
     selfcal_coarse_told_t before[SELFCAL_AXES_MAX];
 } selfcal_coarse_t;
 
+/* levels.c: variances and gains of a linear filter, shared by the axes; an axis's part of one; a switching filter. */
+enum { SELFCAL_SWITCHING = 3, SELFCAL_LINEAR = SELFCAL_SWITCHING + 7 };
+typedef struct {
+    selfcal_real_t walk, stationary;   /* variances of the walk, an interval, and of the drift in the long run */
+    selfcal_real_t level, both, drift; /* covariance of level and drift */
+    selfcal_real_t gain[2], per_s, ln_s;
+} selfcal_linear_t;
+typedef struct {
+    selfcal_real_t level, drift, ln_p;
+} selfcal_linear_cell_t;
+typedef struct {
+    selfcal_real_t level, variance, upper, ln_p; /* upper: the probability of the upper one */
+    uint16_t jumps;
+    int8_t side; /* the last one that it was sure of: 1 or -1 */
+} selfcal_switching_t;
+typedef struct {
+    selfcal_real_t per_sigma, before; /* 1/sigma_v; the score of the run before */
+    selfcal_linear_cell_t linear[SELFCAL_LINEAR];
+    selfcal_switching_t switching[SELFCAL_SWITCHING];
+} selfcal_levels_axis_t;
+typedef struct {
+    bool begun;
+    uint32_t n; /* bank samples of this run */
+    selfcal_linear_t linear[SELFCAL_LINEAR];
+    selfcal_levels_axis_t axis[SELFCAL_AXES_MAX];
+} selfcal_levels_t;
+
 struct selfcal_adequacy {
     selfcal_changes_t *changes; /* NULL: they are not looked for */
     void (*look)(selfcal_adequacy_t *self, const selfcal_t *bank, const selfcal_real_t z[], uint32_t gap);
@@ -577,6 +616,7 @@ struct selfcal_adequacy {
     selfcal_real_t base[SELFCAL_ADEQUACY_INPUTS], sum[SELFCAL_ADEQUACY_INPUTS];
     float coldest, warmest; /* of the bank intervals' temperatures; NAN: there has been none */
     selfcal_coarse_t coarse;
+    selfcal_levels_t levels;
     selfcal_watch_t watch[SELFCAL_AXES_MAX];
     selfcal_judgement_t judgement[SELFCAL_AXES_MAX];
 };

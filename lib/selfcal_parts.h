@@ -247,6 +247,7 @@ selfcal_status_t selfcal_predict(const selfcal_report_t *report, const selfcal_m
 #define SELFCAL_ADEQUACY_LIMIT 5.0F
 #define SELFCAL_ADEQUACY_LIMIT_EARLY 8.0F /* of ramp, colored_noise and flicker over fewer bank samples than that: */
 #define SELFCAL_ADEQUACY_EARLY 1024U
+#define SELFCAL_ADEQUACY_LIMIT_TONE 4.5F /* a slow line: the score is made for a line, and nothing else adds to it */
 #define SELFCAL_ADEQUACY_LIMIT_VARIANCE 6.0F
 #define SELFCAL_ADEQUACY_LIMIT_KURTOSIS 13.0F
 

@@ -16,7 +16,7 @@
  * The first 8 bytes and the checksum are where they are in every version.
  *
  * The version counts up when the meaning of a member changes, or the header. */
-#include "bank.h"
+#include "bank_inside.h"
 
 #define VERSION 3U
 enum { HEADER = 24, TRAILER = 4 };

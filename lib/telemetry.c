@@ -1,5 +1,5 @@
 /* Reports and status as frames. Items, bits and scales: selfcal_frames.h, made from selfcal.dbc. */
-#include "bank.h"
+#include "bank_inside.h"
 #include "selfcal_frames.h"
 
 #include <math.h>
@@ -18,8 +18,8 @@ SELFCAL_STATIC_ASSERT(places_are_even,
                           SELFCAL_HYPOTHESIS_P2_FLAGS_SHIFT == 2 * SELFCAL_HYPOTHESIS_P1_FLAGS_SHIFT);
 SELFCAL_STATIC_ASSERT(judgement_is_as_on_the_wire,
                       (unsigned)SELFCAL_INADEQUATE == SELFCAL_ADEQUACY_ADEQUACY_INADEQUATE &&
-                          (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_SUSPICION_MOTION &&
-                          (unsigned)SELFCAL_SUSPECT_MOTION == SELFCAL_ADEQUACY_CHANGE_MOTION &&
+                          (unsigned)SELFCAL_SUSPECT_TWO_LEVEL == SELFCAL_ADEQUACY_SUSPICION_TWO_LEVEL &&
+                          (unsigned)SELFCAL_SUSPECT_TWO_LEVEL == SELFCAL_ADEQUACY_CHANGE_TWO_LEVEL &&
                           (unsigned)SELFCAL_REASON_STUCK == SELFCAL_ADEQUACY_REASON_STUCK);
 SELFCAL_STATIC_ASSERT(reasons_lie_alike,
                       SELFCAL_STATUS_REASON_GX_SHIFT == SELFCAL_CORRECTED_REASON_GX_SHIFT &&

@@ -8,16 +8,17 @@ posix: $(MODEL)/selfcal_model.c
 .PHONY: firmware firmware-images flash
 WANTED := $(filter $(or $(TARGET),$(BOARDS)),$(BOARDS))
 NOT_ALL := ACCEPT=1 takes the figures of all images as they are: no TARGET, no SENSOR, no CFLAGS
-# The default sensor is the default model's; another one has a part's file that begins with its name.
-OTHER_SENSOR := $(filter-out adis16405,$(SENSOR))
+# The default sensor is the default model's; another one has a part's file that begins with its name, a driver of one's
+# own beside it.
+OTHER_SENSOR := $(filter-out adis16405,$(SENSOR_NAME))
 IMAGES = $(BUILD)/$(1)$(OTHER_SENSOR:%=-%)
-PART := tools/selfcal/model/models/parts/$(OTHER_SENSOR)
+PART := $(if $(findstring /,$(SENSOR)),$(SENSOR_ROOM),tools/selfcal/model/models/parts/)$(OTHER_SENSOR)
 SENSOR_MODEL := $(firstword $(if $(OTHER_SENSOR),$(wildcard $(PART)*.yaml) $(PART).yaml) \
                             tools/selfcal/model/models/default.yaml)
 
 firmware: setup-dev firmware-images $(if $(ACCEPT),bench-images)
 	@$(if $(WANTED),,$(error TARGET=$(TARGET): there are $(BOARDS)))$(BIN)/python tests/bench/image_sizes.py \
-	    --sensor $(SENSOR) $(WANTED)
+	    --sensor $(SENSOR_NAME) $(WANTED)
 	@$(if $(ACCEPT),$(if $(TARGET)$(OTHER_SENSOR)$(CFLAGS),$(error $(NOT_ALL))))
 	@$(if $(ACCEPT),$(BIN)/python tests/bench/bench.py --accept)
 

@@ -6,11 +6,12 @@ include port/boards.mk port/arm.mk
 CORE := $(CORE_$(TARGET))
 
 $(if $(OUT),,$(error OUT=DIR is wanted))
-PROGRAM_FLAGS := $(strip -DSENSOR=$(SENSOR) $(IMAGE_CFLAGS) $(CFLAGS) $(NODE_FLAGS))
+PROGRAM_FLAGS := $(strip -DSENSOR=$(SENSOR_NAME) $(IMAGE_CFLAGS) $(CFLAGS) $(NODE_FLAGS))
 # Between single quotes of the shell.
 QUOTED_FLAGS = $(subst ','\'',$(PROGRAM_FLAGS))
-IMAGE_SOURCES := $(wildcard port/app/*.c port/$(TARGET)/*.c) port/sensors/sensor.c port/sensors/$(SENSOR).c
-IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/sensors/*.h port/$(TARGET)/*.h)
+IMAGE_SOURCES := $(wildcard port/app/*.c port/$(TARGET)/*.c) port/sensors/sensor.c $(SENSOR_SOURCE)
+IMAGE_HEADERS := $(wildcard lib/*.[ch] port/*.h port/app/*.h port/sensors/*.h port/$(TARGET)/*.h) \
+                 $(wildcard $(SENSOR_ROOM)*.h)
 
 .PHONY: $(TARGET)
 $(TARGET): $(OUT)/selfcal.elf $(OUT)/selfcal.bin $(OUT)/selfcal.hex
@@ -22,7 +23,7 @@ $(OUT)/selfcal.elf: $(IMAGE_SOURCES) $(IMAGE_HEADERS) $(MODEL_DIR)/selfcal_model
 	@$(MAKE) --no-print-directory -f port/library.mk objects CORE=$(CORE) MODEL_DIR=$(MODEL_DIR) OUT=$(OUT)/objects \
 	    'PROGRAM_FLAGS=$(QUOTED_FLAGS)'
 	$(call arm_objects,$(ARM_$(CORE)) -fstack-usage -g @$(OUT)/flags -Ilib -Iport -Iport/app -Iport/sensors \
-	    -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)
+	    -I$(SENSOR_ROOM) -I$(MODEL_DIR),$(IMAGE_SOURCES) $(MODEL_DIR)/selfcal_model.c,$(OUT)/objects)
 	arm-none-eabi-gcc $(ARM_$(CORE)) -nostartfiles -T port/$(TARGET)/link.ld \
 	    -Wl,--gc-sections,-Map=$(OUT)/selfcal.map,--fatal-warnings $(OUT)/objects/*.o -lm -o $@
 

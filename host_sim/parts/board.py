@@ -13,6 +13,7 @@ from unicorn import arm_const as arm
 from .adis16405 import Adis16405, Sample
 from .bxcan import Bxcan, Frame
 from .flash import Flash
+from .i2c import Device, I2cBus
 from .machine import NRF51822, STM32F405, Core, Machine, SystemControl
 from .nrf51 import Gpio as NrfGpio
 from .nrf51 import Gpiote, Nvmc, PowerClock, Spi0, Timer0, Uart0, Wdt
@@ -73,6 +74,20 @@ class Bench:
         self.frames: list[tuple[float, Frame]] = []
         self.text = bytearray()
         self._make_sensor = sensor or (lambda machine: Adis16405(machine, source or resting(seed)))
+        self.i2c: I2cBus | None = None
+
+    def _wire(self, sensor: Sensor) -> None:
+        if isinstance(sensor, Device):
+            self.i2c = I2cBus(self.machine, sensor)
+
+    def _lines(self, scl: int, sda: int) -> int:
+        """Levels of the port's pins, a bit each: of those that are not I2C's 1."""
+        low = 0 if self.i2c is None else (not self.i2c.scl) << scl | (not self.i2c.sda) << sda
+        return ~low & 0xFFFFFFFF
+
+    def _let_go(self) -> None:
+        if self.i2c is not None:
+            self.i2c.release()
 
     def run(self, seconds: float) -> None:
         """Let time go by."""
@@ -90,6 +105,7 @@ class Board(Bench):
     `clock_broken`: "crystal" or "pll"."""
 
     SLOTS, STRIDE = 0x080C0000, 0x20000
+    SCL, SDA = 5, 7
 
     def __init__(
         self,
@@ -121,7 +137,9 @@ class Board(Bench):
         self.usart = Usart(machine, self.rcc)
         self.flash = Flash(machine)
         self.sensor = self._make_sensor(machine)
-        machine.on_reset = self.rcc.note_reset
+        self._wire(self.sensor)
+        self.port_a.inputs = lambda: self._lines(self.SCL, self.SDA)
+        machine.on_reset = self._reset
 
         self.sensor.on_ready = lambda level: self.exti.edge(1, 0, level)
         self.spi.device = self._spi_byte
@@ -139,9 +157,15 @@ class Board(Bench):
             self.machine.violations.append("SPI1's pins are not its own")
         return self.sensor.exchange(byte, mode, sck_hz, end_us)
 
+    def _reset(self, cause: str) -> None:
+        self.rcc.note_reset(cause)
+        self._let_go()
+
     def _port_a(self, pin: int, level: bool) -> None:
         if pin == 4:
             self.sensor.select(not level)
+        elif self.i2c is not None and pin in (self.SCL, self.SDA):
+            self.i2c.drive(int(pin == self.SDA), level)
 
     def _port_b(self, pin: int, level: bool) -> None:
         if pin == 1:
@@ -160,8 +184,11 @@ class Board(Bench):
             machine.uc.mem_write(self.SLOTS, retained)
         self.flash.cut_at = -1
         self.rcc.csr = self.rcc.FLAG["power"]
+        self._let_go()
         machine.power_cycle()
         self.sensor.power_on()
+        if self.i2c is not None:
+            self.i2c.power_on()
 
     def erases(self, slot: int) -> int:
         """Times that a slot's beginning was erased."""
@@ -182,7 +209,7 @@ class NrfBoard(Bench):
     """An nRF51822's: telemetry as SLCAN. `retained`: content of the flash's last 64 KB to start with."""
 
     SLOTS, STRIDE = 0x30000, 0x8000
-    READY, RESET, CS = 20, 18, 16
+    READY, RESET, CS, SCL, SDA = 20, 18, 16, 23, 21
 
     def __init__(
         self,
@@ -208,7 +235,9 @@ class NrfBoard(Bench):
         self.usart = Uart0(machine)
         self.flash = Nvmc(machine)
         self.sensor = self._make_sensor(machine)
-        machine.on_reset = self.power.note_reset
+        self._wire(self.sensor)
+        self.pins.inputs = lambda: self._lines(self.SCL, self.SDA)
+        machine.on_reset = self._reset
         self.sensor.on_ready = lambda level: self.gpiote.edge(self.READY, level)
         self.spi.device = self.sensor.exchange
         self.pins.on_output = self._output
@@ -218,8 +247,14 @@ class NrfBoard(Bench):
             machine.uc.mem_write(self.SLOTS, retained)
         machine.start()
 
+    def _reset(self, cause: str) -> None:
+        self.power.note_reset(cause)
+        self._let_go()
+
     def _output(self, pin: int, level: bool) -> None:
-        if pin == self.CS:
+        if self.i2c is not None and pin in (self.SCL, self.SDA):
+            self.i2c.drive(int(pin == self.SDA), level)
+        elif pin == self.CS:
             self.sensor.select(not level)
         elif pin == self.RESET:
             self.sensor.reset_line(level)
@@ -243,8 +278,11 @@ class NrfBoard(Bench):
         self.flash.settle()
         self.power.power_on()
         self._line.clear()
+        self._let_go()
         machine.power_cycle()
         self.sensor.power_on()
+        if self.i2c is not None:
+            self.i2c.power_on()
 
     def erases(self, slot: int) -> int:
         """Times that a slot's beginning was erased."""

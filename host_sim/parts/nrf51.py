@@ -140,6 +140,7 @@ class Gpio(Peripheral):
     def __init__(self, machine: Machine) -> None:
         super().__init__(machine)
         self.on_output: Callable[[int, bool], None] = lambda pin, level: None
+        self.inputs: Callable[[], int] = lambda: 0xFFFFFFFF
 
     def reset(self) -> None:
         """Inputs, their buffers off (PIN_CNF 2)."""
@@ -150,6 +151,10 @@ class Gpio(Peripheral):
     def level(self, pin: int) -> bool:
         """Of a line."""
         return bool(self.out >> pin & 1) if self.registers[0x700 + 4 * pin] & 1 else True
+
+    def read(self, offset: int) -> int:
+        """IN, PIN_CNF."""
+        return self.inputs() if offset == 0x510 else super().read(offset)
 
     def write(self, offset: int, value: int) -> None:
         """OUTSET, OUTCLR, PIN_CNF."""

@@ -265,6 +265,7 @@ class Gpio(Part):
         self.base = base
         super().__init__(machine)
         self.on_output: Callable[[int, bool], None] = lambda pin, level: None
+        self.inputs: Callable[[], int] = lambda: 0xFFFF
         self.odr = self._outputs = 0  # a bit a pin
 
     def reset(self) -> None:
@@ -289,7 +290,9 @@ class Gpio(Part):
         return self.odr | ~self._outputs
 
     def read(self, offset: int) -> int:
-        """Configuration and ODR."""
+        """Configuration, IDR and ODR."""
+        if offset == 0x10:
+            return self.inputs() & 0xFFFF
         return self.odr if offset == 0x14 else self.registers[offset]
 
     def write(self, offset: int, value: int) -> None:

@@ -110,7 +110,7 @@ static void feed(void) {
 void module_run(const module_board_t *its_board) {
     board = its_board;
     slots.memory = board->memory;
-    if (!readings_init(board->bus) || app_init(&app, &port, board->report_ms) != SELFCAL_OK) {
+    if (!readings_init() || app_init(&app, &port, board->report_ms) != SELFCAL_OK) {
         return;
     }
     if (BOARD_GATE) {

@@ -19,7 +19,6 @@ typedef enum {
 } reset_cause_t;
 
 typedef struct {
-    const sensor_bus_t *bus;
     const slots_memory_t *memory;
     uint32_t report_ms;                         /* between reports of all axes */
     uint32_t (*time_ms)(void);                  /* since start, modulo 2^32 */

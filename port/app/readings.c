@@ -25,7 +25,7 @@ typedef char the_axes_and_channels_are_the_ports
 
 static uint8_t channel[SELFCAL_MODEL_AXES]; /* of the sensor, for each axis of the model */
 
-bool readings_init(const sensor_bus_t *bus) {
+bool readings_init(void) {
     for (size_t axis = 0; axis < SELFCAL_MODEL_AXES; axis++) {
         const unsigned at = port_axis(selfcal_model_axis_name[axis]);
         if (at == PORT_AXES) {
@@ -39,7 +39,7 @@ bool readings_init(const sensor_bus_t *bus) {
     if (!CHANNELS_KNOWN) {
         the_sensor_has_not_this_channel();
     }
-    return sensor_open(&SENSOR, bus, SELFCAL_MODEL_RATE_HZ);
+    return sensor_open(&SENSOR, &OF(SENSOR, bus), SELFCAL_MODEL_RATE_HZ);
 }
 
 void readings_ready(void) {

@@ -6,7 +6,7 @@
 #include "sensor.h"
 
 /* False: the model has an axis or a rate that the sensor has not. */
-bool readings_init(const sensor_bus_t *bus);
+bool readings_init(void);
 
 /* From the interrupt handlers of data-ready and of a transfer's end, and from the main loop. */
 void readings_ready(void);

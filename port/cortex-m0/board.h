@@ -52,9 +52,8 @@ extern const slots_memory_t flash_memory;
 /* False: it gives none. 20 ms at most. */
 bool rng_number(uint32_t *number);
 
-/* spi.c */
+/* spi.c, i2c.c: `spi_bus` and `i2c_bus` */
 
-extern const sensor_bus_t spi_bus;
 void spi_handler(void);
 void ready_handler(void);
 

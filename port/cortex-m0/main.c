@@ -27,8 +27,8 @@ static void board_tell(selfcal_module_t *told) {
 }
 
 static const module_board_t board_calls = {
-    &spi_bus,  &flash_memory, BOARD_REPORT_MS, clock_ms,   clock_ms,   uart_send,   uart_sent,
-    uart_poll, board_sleep,   watchdog_feed,   board_tell, rng_number, board_reset,
+    &flash_memory, BOARD_REPORT_MS, clock_ms,      clock_ms,   uart_send,  uart_sent,
+    uart_poll,     board_sleep,     watchdog_feed, board_tell, rng_number, board_reset,
 };
 
 int main(void) {

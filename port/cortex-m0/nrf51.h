@@ -34,9 +34,11 @@
 /* GPIO, chapter 14 */
 #define GPIO_OUTSET REG32(0x50000508U)
 #define GPIO_OUTCLR REG32(0x5000050CU)
+#define GPIO_IN REG32(0x50000510U)
 #define GPIO_PIN_CNF(pin) REG32(0x50000700U + 4U * (uint32_t)(pin))
 #define GPIO_OUTPUT 0x3U /* its input buffer off */
 #define GPIO_INPUT 0x0U
+#define GPIO_OPEN_DRAIN 0x60DU /* S0D1, pulled up, its input buffer on */
 #define GPIO_PULL_DOWN 0x4U
 #define GPIO_PULL_UP 0xCU
 

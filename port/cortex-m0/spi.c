@@ -12,13 +12,18 @@ static const uint8_t *going_out;
 static uint8_t *coming_in;
 static volatile uint16_t to_go, sent, received;
 static uint8_t stall_us;
+static bool second; /* of two chips */
+
+static void pull(uint32_t pin, bool low) {
+    if (low) {
+        GPIO_OUTCLR = BIT(pin);
+    } else {
+        GPIO_OUTSET = BIT(pin);
+    }
+}
 
 static void select_sensor(bool on) {
-    if (on) {
-        GPIO_OUTCLR = BIT(PIN_CS);
-    } else {
-        GPIO_OUTSET = BIT(PIN_CS);
-    }
+    pull(second ? PIN_RESET : PIN_CS, on);
 }
 
 static void let_go(void) {
@@ -27,11 +32,7 @@ static void let_go(void) {
 }
 
 static void reset_line(bool low) {
-    if (low) {
-        GPIO_OUTCLR = BIT(PIN_RESET);
-    } else {
-        GPIO_OUTSET = BIT(PIN_RESET);
-    }
+    pull(PIN_RESET, low);
 }
 
 static void open(const sensor_wire_t *wire) {
@@ -119,7 +120,11 @@ static bool begin(const uint8_t *out, uint8_t *in, size_t count) {
     return true;
 }
 
-const sensor_bus_t spi_bus = {clock_us, clock_us32, open, exchange, begin, reset_line};
+static void choose(uint8_t chip) {
+    second = chip != 0U;
+}
+
+const sensor_bus_t spi_bus = {clock_us, clock_us32, open, exchange, begin, reset_line, choose, NULL};
 
 void spi_handler(void) {
     if (SPI0_READY == 0U) {

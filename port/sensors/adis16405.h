@@ -29,6 +29,7 @@
     (1638.4F / (rate_hz) >= 1.5F && 1638.4F / (rate_hz) < 128.5F && ADIS16405_OFF(rate_hz) <= 1.6384F / (rate_hz) &&   \
      ADIS16405_OFF(rate_hz) >= -1.6384F / (rate_hz))
 #define adis16405_rates "1638.4 Hz / n, n = 2 to 128"
+#define adis16405_bus spi_bus
 #define adis16405_has_supply 1
 
 extern const sensor_t adis16405;

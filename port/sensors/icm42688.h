@@ -19,6 +19,7 @@
     (ICM42688_NEAR(rate_hz, 25.0F) || ICM42688_NEAR(rate_hz, 50.0F) || ICM42688_NEAR(rate_hz, 100.0F) ||               \
      ICM42688_NEAR(rate_hz, 200.0F) || ICM42688_NEAR(rate_hz, 500.0F) || ICM42688_NEAR(rate_hz, 1000.0F))
 #define icm42688_rates "25, 50, 100, 200, 500 or 1000 Hz"
+#define icm42688_bus spi_bus
 #define icm42688_has_supply 0
 
 extern const sensor_t icm42688;

@@ -22,14 +22,14 @@ enum { SENSOR_GYRO, SENSOR_ACCEL, SENSOR_KINDS };
 
 #define SENSOR_G 9.80665F
 
-/* How the sensor wants its SPI. */
+/* How the sensor wants its SPI; of I2C, which goes at up to 400 kHz, nothing. */
 typedef struct {
     uint32_t sck_max_hz;
     uint32_t stall_us; /* between two transfers, at least */
     uint8_t mode;      /* 0 to 3 */
 } sensor_wire_t;
 
-/* A board's SPI and clock. */
+/* A board's clock, and its SPI (`spi_bus`) or I2C (`i2c_bus`), which lacks the functions of the other. */
 typedef struct {
     /* Time since start, us: from the main loop, and modulo 2^32 from anywhere. */
     uint64_t (*time_us)(void);
@@ -43,7 +43,15 @@ typedef struct {
     bool (*begin)(const uint8_t *out, uint8_t *in, size_t count);
     /* The sensor's reset line; not needed where it is not wired. */
     void (*reset_line)(bool low);
+    /* SPI: the exchanges from now on go to this chip, 0 or 1. The second one's chip select is the reset line. */
+    void (*choose)(uint8_t chip);
+    /* I2C: writes, then reads after a repeated start, either of which may be of 0 bytes. Bounded. False: nobody
+     * answers, a byte was not taken, or somebody holds a line; some of it may have happened. */
+    bool (*transfer)(uint8_t address, const uint8_t *out, size_t written, uint8_t *in, size_t wanted);
 } sensor_bus_t;
+
+/* A board has both. An image has the one that its sensor's header names. */
+extern const sensor_bus_t spi_bus, i2c_bus;
 
 /* The numbers of state and fault are those of selfcal.dbc. */
 typedef enum {

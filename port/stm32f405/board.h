@@ -50,7 +50,7 @@ void systick_handler(void);
 
 /* --- sensor --- */
 
-extern const sensor_bus_t spi_bus;
+/* spi.c, i2c.c: `spi_bus` and `i2c_bus`. */
 void sensor_ready_handler(void);
 void sensor_done_handler(void);
 

@@ -32,7 +32,6 @@ static void board_tell(selfcal_module_t *told) {
 }
 
 static const module_board_t board_calls = {
-    &spi_bus,
     &flash_memory,
     BOARD_REPORT_MS,
     clock_ms,

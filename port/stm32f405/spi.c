@@ -1,5 +1,6 @@
-/* The sensor on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1. exchange() is
- * polled; begin() goes by DMA2 (RM0090 table 44: stream 0 channel 3 receives, stream 3 channel 3 sends). */
+/* The sensor on SPI1: SCK PA5, MISO PA6, MOSI PA7, chip select PA4 (by hand), data-ready PB0, reset PB1, which is the
+ * second chip's select of a part of two. exchange() is polled; begin() goes by DMA2 (RM0090 table 44: stream 0 channel
+ * 3 receives, stream 3 channel 3 sends). */
 #include "board.h"
 #include "readings.h"
 #include "stm32f405.h"
@@ -8,18 +9,23 @@ enum { CS_PIN = 4, READY_PIN = 0, RESET_PIN_NUMBER = 1 };
 enum { RX_STREAM = 0, TX_STREAM = 3, CHANNEL = 3 };
 
 static uint32_t stall_us;
+static bool second; /* of two chips */
+
+static void reset_line(bool low) {
+    GPIO_BSRR(GPIOB) = low ? BIT(RESET_PIN_NUMBER + 16) : BIT(RESET_PIN_NUMBER);
+}
 
 static void select_sensor(bool on) {
-    GPIO_BSRR(GPIOA) = on ? BIT(CS_PIN + 16) : BIT(CS_PIN);
+    if (second) {
+        reset_line(on);
+    } else {
+        GPIO_BSRR(GPIOA) = on ? BIT(CS_PIN + 16) : BIT(CS_PIN);
+    }
 }
 
 static void let_go(void) {
     select_sensor(false);
     clock_spin_us(stall_us);
-}
-
-static void reset_line(bool low) {
-    GPIO_BSRR(GPIOB) = low ? BIT(RESET_PIN_NUMBER + 16) : BIT(RESET_PIN_NUMBER);
 }
 
 static void open(const sensor_wire_t *wire) {
@@ -117,7 +123,11 @@ static bool begin(const uint8_t *out, uint8_t *in, size_t count) /* NOLINT(reada
     return true;
 }
 
-const sensor_bus_t spi_bus = {clock_us, clock_us32, open, exchange, begin, reset_line};
+static void choose(uint8_t chip) {
+    second = chip != 0U;
+}
+
+const sensor_bus_t spi_bus = {clock_us, clock_us32, open, exchange, begin, reset_line, choose, NULL};
 
 void sensor_ready_handler(void) {
     EXTI_PR = BIT(READY_PIN);

@@ -1,7 +1,7 @@
 /* Counts the instructions of the library on a Cortex-M, prints them as count.h says, and ends with exit code 0. Every
  * run is the same. */
 #include "count.h"
-#include "bank.h"
+#include "bank_inside.h"
 #include "paper_float.h"
 #include "record.h"
 

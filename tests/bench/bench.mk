@@ -6,8 +6,8 @@ BENCH_C := $(wildcard lib/*.c tests/bench/*.c) $(wildcard port/app/app*.c)
 BENCH_H := $(wildcard lib/*.h tests/bench/*.h port/*.h port/app/*.h)
 ARM_FAST += tests/bench/%
 MAP_cortex-m4f := FLASH_ORIGIN=0x08000000,--defsym=RAM_BYTES=0x20000
-# 8 KB more than the part has: the measuring, its records and the judgement take some of it.
-MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0xA000
+# 16 KB more than the part has: the measuring, its records and the judgement take some of it.
+MAP_cortex-m0 := FLASH_ORIGIN=0,--defsym=RAM_BYTES=0xC000
 
 bench: setup-dev bench-images firmware-images $(BENCH)/host/O2/bench $(BENCH)/host/O3-avx2/bench
 	@$(BIN)/python tests/bench/bench.py --host $(if $(ACCEPT),--accept)

@@ -78,7 +78,7 @@ def _board(core: str, *, image: bool = True) -> tuple[int, str, int]:
 MACHINES = {
     "cortex-m4f": Machine("netduinoplus2", (), *_board("cortex-m4f")),
     # The nRF51822 with 32 KB of RAM, since the bank and a report of six axes do not fit the 16 KB of the board's own.
-    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0xA000"), *_board("cortex-m0")),
+    "cortex-m0": Machine("microbit", ("-global", "nrf51-soc.sram-size=0xC000"), *_board("cortex-m0")),
 }
 
 #: Files by the beginnings of their names: what a bank that reports and sends cannot be without.
@@ -293,6 +293,9 @@ def table(bench: Bench) -> str:
     per("judgement of the model, per (bank sample, axis): random walk", "adequacy.random_walk", ".0f")
     per("… Gauss-Markov", "adequacy.gauss_markov", ".0f")
     per("… and the search for changes: random walk", "changes.random_walk", ".0f")
+    per("the bank sample that ends an epoch, six axes: random walk", "adequacy.random_walk.end")
+    per("… Gauss-Markov", "adequacy.gauss_markov.end")
+    per("… and the search for changes: random walk", "changes.random_walk.end")
     shares: dict[str, dict[str, str]] = {"push": {}, "bank": {}}
     for target, figures in targets.items():
         seconds = RATE_HZ / MACHINES[target].systick_hz
@@ -436,6 +439,7 @@ def product_table(bench: Bench) -> str:
     row("… tables", lambda f: f["sizes"]["linked.tables"])
     row("instructions of a sample at 819.2 Hz, on average", count("sample"))
     row("… of the longest turn with one", count("sample.worst"))
+    row("… and of one that ends an epoch of the judgement", count("adequacy.random_walk.end"))
     row("instructions of a report of one axis", count("report"))
     row("… of its longest call", longest_step)
     return "\n".join(lines)

@@ -80,14 +80,16 @@ def image(
 ) -> Path:
     """The ELF file of a configuration, made if it is not there or older than a source. `quiet`: at `rate_hz`, bank at
     `bank_hz`, these `laws` (a report of Gauss-Markov takes the emulator seconds). `node`: its number on its bus.
-    `sensor`: one of port/sensors, with the model file of its name."""
+    `sensor`: one of port/sensors, with the model file of its name, or the path of a driver."""
     folder = ROOT / "build" / "firmware" / (f"{name}-extended" if EXTENDED else name)
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         model = Model.load().path
         if sensor != image_sizes.SENSOR:
-            [model] = PARTS.glob(f"{sensor}*.yaml")
+            own = "/" in sensor  # a driver elsewhere, with its model file beside it
+            room, driver = (Path(sensor).parent, Path(sensor).stem) if own else (PARTS, sensor)
+            [model] = room.glob(f"{driver}*.yaml")
         document = yaml.safe_load(model.read_text())
         if quiet:
             document["bank_rate_hz"] = bank_hz

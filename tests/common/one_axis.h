@@ -6,7 +6,7 @@
 #include <string.h>
 
 /* Before the names below, which its functions have as well. */
-#include "report.h"
+#include "report_inside.h"
 
 #include "noise.h"
 #include "selfcal_model.h"

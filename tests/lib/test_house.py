@@ -56,6 +56,17 @@ def test_a_circle_is_found() -> None:
     assert count_house.circle({"a": {"b", "c"}, "b": {"c"}}) == []
 
 
+def test_a_file_and_the_header_of_its_name_are_one() -> None:
+    """A stage takes a type from the header of the file that calls it: no function is called back, yet it is a circle.
+    With that header under a name of its own there is none."""
+    stage = "int stage(void) {\n    return 0;\n}\n"
+    whole = "int whole(void) {\n    return stage();\n}\n"
+    texts = {"whole.h": "", "stage.c": '#include "whole.h"\n' + stage, "whole.c": '#include "whole.h"\n' + whole}
+    assert count_house.circle(count_house.uses(texts)) == ["stage", "whole", "stage"]
+    below = {name.replace("whole.h", "below.h"): text.replace("whole.h", "below.h") for name, text in texts.items()}
+    assert count_house.circle(count_house.uses(below)) == []
+
+
 @pytest.fixture
 def product(tmp_path: Path) -> Path:
     """A folder with the library and the generated files, as a product copies them."""

@@ -41,7 +41,7 @@ static bool exchange(const uint8_t *out, uint8_t *in, size_t count) {
     return true;
 }
 
-static const sensor_bus_t bus = {time_us, time_us32, open_wire, exchange, NULL, NULL};
+static const sensor_bus_t bus = {time_us, time_us32, open_wire, exchange, NULL, NULL, NULL, NULL};
 
 void setUp(void) {
     now_us = 1000U;

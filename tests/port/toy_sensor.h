@@ -9,6 +9,7 @@
 
 #define toy_has_rate(rate_hz) ((rate_hz) > 199.9F && (rate_hz) < 200.1F)
 #define toy_rates "200 Hz"
+#define toy_bus spi_bus
 #define toy_has_supply 0
 
 enum { TOY_ID = 0, TOY_CONTROL = 1, TOY_COUNT = 2, TOY_DATA = 3, TOY_TEMPERATURE = 9, TOY_REGISTERS = 10 };

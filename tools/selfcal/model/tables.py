@@ -22,7 +22,7 @@ from selfcal.model.regressors import channels_of, sources_of
 RATE_LIMITS = (1e-6, 1e6)
 #: Samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
-#: Bank intervals that a stated correlation time lasts: ALPHA_DT_MAX in lib/bank.h, TIME_MAX in lib/bank_states.c.
+#: Bank intervals of a stated correlation time, at most: ALPHA_DT_MAX in lib/bank_inside.h, TIME_MAX in bank_states.c.
 ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
 
 

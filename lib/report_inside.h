@@ -10,10 +10,10 @@
  *   report_integral.c  the sums over the cells there
  *   report_marginal.c  sigma_v, histograms, estimates
  *   report_bias.c      the bias now */
-#ifndef SELFCAL_REPORT_H
-#define SELFCAL_REPORT_H
+#ifndef SELFCAL_REPORT_INSIDE_H
+#define SELFCAL_REPORT_INSIDE_H
 
-#include "bank.h"
+#include "bank_inside.h"
 
 /* In this order. One step of any takes below 61 000 instructions on a Cortex-M4F without regressors in use, and below a
  * 600 000 on a Cortex-M0: 37 ms at 16 MHz. */

@@ -1,7 +1,7 @@
 /* The bank's inside: what all axes share (bank.c: variances, gains, sums A and D), the work of each axis (a kernel:
  * drift x, sums B and C), and the code that a model may name. Not for users. */
-#ifndef SELFCAL_BANK_H
-#define SELFCAL_BANK_H
+#ifndef SELFCAL_BANK_INSIDE_H
+#define SELFCAL_BANK_INSIDE_H
 
 #include "averages.h"
 #include "twofold.h"
@@ -285,6 +285,17 @@ void selfcal_coarse_take(selfcal_coarse_t *self, const selfcal_batch_t *batch, u
                          const selfcal_real_t channel[], const selfcal_model_t *model);
 selfcal_real_t selfcal_coarse_score(const selfcal_coarse_t *self, uint8_t axis, selfcal_suspect_t *suspect);
 void selfcal_coarse_restart(selfcal_coarse_t *self);
+/* sigma_v of the likeliest walk, unit; 0 where the readings have no noise. After the first bank sample. */
+selfcal_real_t selfcal_coarse_sigma(const selfcal_coarse_t *self, uint8_t axis);
+
+/* levels.c: a bank sample that the coarse bank has taken; the score of two levels. A memory of zeros begins anew. */
+void selfcal_levels_take(selfcal_levels_t *self, const selfcal_coarse_t *coarse, const selfcal_batch_t *batch,
+                         uint32_t at, uint8_t axes);
+selfcal_real_t selfcal_levels_score(const selfcal_levels_t *self, uint8_t axis);
+
+/* tones.c: an innovation; the score of the strongest tone. */
+void selfcal_tones_take(selfcal_tones_t *self, selfcal_real_t z);
+selfcal_real_t selfcal_tones_score(const selfcal_tones_t *self);
 
 /* --- converged nodes --- */
 
