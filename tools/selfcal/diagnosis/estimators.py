@@ -24,8 +24,6 @@ from selfcal.likelihood.statemodel import Array
 ORDERS, TAPS, BLOCK_ROWS = 4, (1, 2, 4, 8, 16, 32), (5, 8, 12)
 #: Residual sum of squares, free numbers, and gain and delay, of one order.
 Tried = tuple[float, int, tuple[float, float]]
-#: Drawn records of the answer.
-DRAWS = 20
 
 
 @dataclass(frozen=True)
@@ -42,18 +40,19 @@ class Estimate:
 @dataclass(frozen=True)
 class Beside:
     """One method beside the answer: its `estimate`, and least and most [2] of gain and delay over records that the
-    answer makes. Of 20 records the next one is between them with 90 %."""
+    answer makes."""
 
     estimate: Estimate
     least: Array
     most: Array
 
     @property
-    def agrees(self) -> bool:
-        """Whether the answer explains the estimate: within twice the range, and half a step of the delay."""
+    def within(self) -> tuple[bool, bool]:
+        """Whether the answer explains gain and delay: within twice the range, and half a step of the delay."""
         own = np.array([self.estimate.gain, self.estimate.delay])
         more = 0.5 * (self.most - self.least) + np.array([0.0, 0.5])
-        return bool(np.all((own >= self.least - more) & (own <= self.most + more)))
+        gain, delay = (own >= self.least - more) & (own <= self.most + more)
+        return bool(gain), bool(delay)
 
 
 def arx(u: Array, y: Array) -> Estimate:
@@ -120,21 +119,22 @@ METHODS: Mapping[str, Callable[[Array, Array], Estimate]] = MappingProxyType(
 )
 
 
-def beside(state: State, fit: Fit, u: Array, answer: Array, before: Array, steps: int) -> dict[str, Beside]:
+def beside(state: State, fit: Fit, u: Array, answers: Array, before: Array, steps: int) -> dict[str, Beside]:
     """What each method makes of an input [n] and the record in means of `steps` samples, and what it would make of
-    records that the `answer` [n] to that input and the fitted noise make. `before` [n]: what the input left from before
-    the record; it is taken out."""
+    records that `answers` [draws, n] to that input, the likeliest first, and the fitted noise make. `before` [n]: what
+    the input left from before the record; it is taken out."""
     rest = replace(state, y=state.y - before)
-    _, white, _ = run(rest.series.beside(np.array([u, answer])), fit.terms, fit.theta, innovations=True)
+    _, white, _ = run(rest.series.beside(np.vstack([u, answers])), fit.terms, fit.theta, innovations=True)
     white = np.nan_to_num(white)
-    known, _ = np.linalg.qr(white[:, 1:-2])
-    white = white[:, [0, -2, -1]]
+    own = 1 + len(answers)
+    known, _ = np.linalg.qr(white[:, 1:-own])
+    white = np.delete(white, range(1, white.shape[1] - own), axis=1)
     white -= known @ (known.T @ white)
     count = white.shape[0] // steps
-    y, given, due = white[: count * steps].reshape(count, steps, 3).mean(axis=1).T
-    noise = float(np.std(y - due))
+    y, given, *due = white[: count * steps].reshape(count, steps, 1 + own).mean(axis=1).T
+    noise = float(np.std(y - due[0]))
     random = np.random.default_rng(1)
-    drawn = [due + noise * random.standard_normal(count) for _ in range(DRAWS)]
+    drawn = [one + noise * random.standard_normal(count) for one in due]
     found = {}
     for name, method in METHODS.items():
         each = [method(given, one) for one in drawn]
