@@ -21,7 +21,7 @@ from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.transfer import DRAWS, PROBABILITY, STRUCTURES, Drive, Empirical, Input, Posterior, Tried
-from selfcal.likelihood.state import ALIKE, NET_LEAST, State
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Regressor, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import POWER
@@ -37,6 +37,8 @@ SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 STEPS_LEAST, RECORDS = 150, 20
 #: Frequencies of the response that is written.
 FREQUENCIES = 60
+#: Several inputs are each looked at beside the others so many times before they are answered.
+ROUNDS = 2
 #: A misfit is named that chance makes once in so many records.
 MISFIT = 500.0
 LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
@@ -65,7 +67,8 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
     behind its noise, and between the readings of a held one. The held readings may act themselves as well: a part that
     compensates by its own temperature."""
     if name in record.axes:
-        return [_about(Input(bridged(record.axes[name].y) + record.axes[name].level, record.axes[name].unit))]
+        acts = bridged(record.axes[name].y) + record.axes[name].level
+        return [_about(Input(acts, acts, record.axes[name].unit))]
     if name not in record.channel_names.values():
         known = name in dict(SIDE_CHANNELS.values())
         reason = (
@@ -81,31 +84,53 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
     read_at = clock.time_s if rows is None else clock.time_s[rows]
     held_s = float(read_at[-1] - read_at[0]) / max(1, read_at.size - 1)
     if rows is None or held_s < 2.0 / record.rate_hz:
-        return [_about(Input(transfer.quiet(values), unit))]
+        return [_about(Input(transfer.quiet(values), values, unit))]
     # The middle of each cell of the grid.
     time = record.time_s + 0.5 * (1.0 / record.rate_hz - 1.0 / record.recorded_hz)
     time += float(recording.clock_of(next(iter(record.axes))).time_s[0])
     read = recording.columns[name].values[rows]
     lines = np.interp(time, read_at, transfer.quiet(read))
-    held = Input(values, unit, held_s=held_s, taken="held readings")
-    return [_about(Input(lines, unit, held_s=held_s, taken=LINES)), _about(held)]
+    held = Input(values, values, unit, held_s=held_s, taken="held readings")
+    return [_about(Input(lines, lines, unit, held_s=held_s, taken=LINES)), _about(held)]
 
 
 def _about(given: Input) -> Input:
     """The input about its median."""
     reference = float(np.median(given.values))
-    return replace(given, values=given.values - reference, reference=reference)
+    return replace(given, values=given.values - reference, read=given.read - reference, reference=reference)
+
+
+def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str, tuple[dict[str, Any], Input]]:
+    """The answer to each input, beside the columns that the others act by, and the input as it acts likeliest."""
+    known: dict[str, Array] = {}
+
+    def beside_others(name: str) -> State:
+        columns = [(other, one) for other, block in known.items() if other != name for one in block]
+        more = [Regressor(f"{other}_{k}", "input", one, "1", {}) for k, (other, one) in enumerate(columns)]
+        return state.refit(regressors=(*state.regressors, *more)) if more else state
+
+    for _ in range(ROUNDS if len(inputs) > 1 else 0):
+        for name, each in inputs.items():
+            found, _ = _found(beside_others(name), each)
+            best = max(found, key=lambda one: one.score)
+            known[name] = best.columns if best.score > 0.0 else best.columns[:0]
+    return {name: answer_of(beside_others(name), each) for name, each in inputs.items()}
+
+
+def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
+    """Every structure of the input as it acts likeliest, and that input."""
+    each = [[transfer.tried(state, Drive(u.values, state.dt), one) for one in STRUCTURES] for u in inputs]
+    # Of two that explain a record alike, the first is meant.
+    best = [max(one.score for one in tried) for tried in each]
+    place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
+    return each[place], inputs[place]
 
 
 def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Input]:
     """Everything that is found of an axis and an input, as the document has it, and the input as it acts likeliest."""
     dt = state.dt
-    drives = [Drive(one.values, dt) for one in inputs]
-    each = [[transfer.tried(state, drive, one) for one in STRUCTURES] for drive in drives]
-    # Of two that explain a record alike, the first is meant.
-    best = [max(one.score for one in tried) for tried in each]
-    place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
-    found, given, drive = each[place], inputs[place], drives[place]
+    found, given = _found(state, inputs)
+    drive = Drive(given.values, dt)
     unit = given.unit
     found = transfer.beside_two_terms(state, found)
     chosen = max(found, key=lambda one: one.score)
@@ -117,21 +142,26 @@ def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], In
     orders = {str(order): float(weight[poles == order].sum()) for order in sorted(set(poles.tolist()))}
     likely = sorted(orders, key=lambda order: -orders[order])
     within = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
-    seen = transfer.empirical(given.values, bridged(state.y), dt)
+    rest = bridged(state.y)
+    for one, c in zip(state.regressors, chosen.fit.c[1:], strict=False):
+        rest = rest - c * one.values
+    seen = transfer.empirical(given.values, rest, dt)
     entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
     if shown:
         acts_back = not any(units.same_kind(unit, side) for _, side in SIDE_CHANNELS.values())
         alike = [k for k in np.argsort(-weight) if weight[k] > 1.0 / 50.0]
         drawn = [transfer.posterior(state, drive, found[k]) for k in alike]
         pooled = Pooled(drawn, weight[alike])
-        methods = _methods(state, drive, chosen, pooled, seen)
-        misfits = _misfits(transfer.left_over(state, drive, chosen), methods)
+        methods = _methods(state, drive, given.read, chosen, pooled, seen)
+        held_out = transfer.held_out(state, chosen)
+        misfits = _misfits(transfer.left_over(state, drive, chosen), held_out * chosen.fit.n / 3.0, methods)
         verdict, reason = transfer.source(state, drive, chosen, drawn[0], misfits, acts_back=acts_back)
         entry |= {
             "structure": chosen.structure.name,
             "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, within)), "probability": orders},
             "structures": {one.structure.name: float(share) for one, share in zip(found, weight, strict=True)},
             "source": {"verdict": verdict, "reason": reason},
+            "held_out": {"nats_per_sample": held_out},
         }
         if verdict == "no structure":
             entry |= _silent(state, given, methods)
@@ -175,11 +205,13 @@ class Pooled:
         return np.array(made)
 
 
-def _misfits(left_over: float, methods: Mapping[str, Any]) -> list[str]:
+def _misfits(left_over: float, held_out: float, methods: Mapping[str, Any]) -> list[str]:
     """What contradicts the structure, in words. Where it holds, each is so by chance once in MISFIT records."""
     said = []
     if left_over > math.log(MISFIT):
         said.append("the residuals still go with the input")
+    if held_out < -math.log(MISFIT):
+        said.append("by the part before, the last third is predicted worse with the input than without")
     for name, one in methods.get("methods", {}).items():
         if not one["agrees"]:
             key = next(key for key in ("gain", "delay_s") if not one["within"][key])
@@ -233,7 +265,7 @@ def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
     }
 
 
-def _methods(state: State, drive: Drive, chosen: Tried, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
+def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
     """Estimates of other methods beside an answer that is linear and has a static gain, and the step of their means."""
     if "gain" not in chosen.structure.keys or not chosen.structure.linear:
         return {}
@@ -243,7 +275,7 @@ def _methods(state: State, drive: Drive, chosen: Tried, pooled: Pooled, seen: Em
     own = len(chosen.structure.keys)
     parts = chosen.fit.c[-len(chosen.columns) :, None] * chosen.columns
     answers = np.vstack([parts[:own].sum(axis=0), *pooled.answers(drive, RECORDS - 1)])
-    found = beside(state, chosen.fit, drive.u, answers, parts[own:].sum(axis=0), steps)
+    found = beside(state, chosen.fit, drive.u, read, answers, parts[own:].sum(axis=0), steps)
     step_s = steps * state.dt
     clear = seen.coherence > seen.chance
     # Its own errors are in the answer's ratio too.
@@ -340,6 +372,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         line(f"the other methods' static gains: {low:.3g} to {high:.3g} {document['range']['unit']}")
     if "record_next" in document:
         line(f"record next: {document['record_next']}")
+    gain = document["held_out"]["nats_per_sample"]
+    line(f"the last third, predicted by the part before: {gain:+.2g} nats a sample better with the input than without")
     if "methods" not in document:
         return
     line("")

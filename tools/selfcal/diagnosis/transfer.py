@@ -21,7 +21,7 @@ from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
 from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, agreement, whitened
-from selfcal.likelihood.fit import Fit, Sums, ln_det, ln_likelihood, refit
+from selfcal.likelihood.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
 from selfcal.model.forms import POWER, played, slope
@@ -57,10 +57,11 @@ CORNER = 20.0
 
 @dataclass(frozen=True)
 class Input:
-    """An input: `values` [n] about its `reference` in `unit`. `held_s`: from one reading of a held input to the next,
-    `taken` in words as which its readings were taken."""
+    """An input: `values` [n] about its `reference` in `unit`, of the readings `read` [n]. `held_s`: from one reading of
+    a held input to the next, `taken` in words as which its readings were taken."""
 
     values: Array
+    read: Array
     unit: str
     reference: float = 0.0
     held_s: float = 0.0
@@ -374,7 +375,7 @@ def _nodes(
     limits = np.log(drive.limits(one.structure))
     if not limits.size:
         return np.empty((1, 0)), np.empty((0, 0))
-    far = [max(drifts, key=lambda node: node[place]) for place in (3, 2)]
+    far = [max(drifts, key=lambda node: node[3]), max(drifts, key=lambda node: node[2])]
 
     def scores(some: Array) -> Array:
         blocks = [drive.columns(one.structure, tuple(x)) for x in np.exp(some).tolist()]
@@ -463,6 +464,25 @@ def _drifts(state: State, block: Array, known: Fit) -> list[tuple[Fit, Array, fl
                 nodes.append((fit, theta, volume + float(theta[is_size].sum()), volume + value))
     most = max(node[3] for node in nodes)
     return [node for node in nodes if node[3] > most - WEIGHTY]
+
+
+def held_out(state: State, one: Tried) -> float:
+    """What the influence gains on the last third, nats a sample. The drift and the size of the noise are of the part
+    before; so are the coefficients, with what that part leaves open of them."""
+    n = state.y.size
+    mark = n - n // 3
+    before = replace(state, y=np.where(np.arange(n) < mark, state.y, np.nan))
+
+    def rest(columns: Array) -> float:
+        learnt = refit(before.series.beside(columns), one.fit)
+        values = []
+        for sums in run(state.series.beside(columns), learnt.terms, learnt.theta, (mark, n))[0]:
+            _, inverse, rss = sums.coefficients()
+            fit = sums.n * 2.0 * math.log(learnt.sigma) + sums.D + rss / learnt.sigma**2
+            values.append(0.5 * (ln_det(learnt.sigma**2 * inverse) - fit))
+        return values[1] - values[0]
+
+    return (rest(one.columns) - rest(np.empty((0, n)))) / max(1, int(np.isfinite(state.y[mark:]).sum()))
 
 
 def left_over(state: State, drive: Drive, one: Tried) -> float:
