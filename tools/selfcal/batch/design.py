@@ -55,7 +55,7 @@ class Experiment:
         # The register begins with its longest run.
         bits = np.resize(np.roll(max_len_seq(STAGES)[0], -STAGES), count).astype(bool)
         kept = np.flatnonzero(np.append(True, np.diff(bits.astype(int)) != 0))
-        return kept * bit_s, np.where(bits[kept], self.levels[1], self.levels[0])
+        return np.asarray(kept * bit_s, np.float64), np.where(bits[kept], self.levels[1], self.levels[0])
 
     def input(self, bit_s: float, samples: int, dt: float) -> Floats:
         """[samples]: the input about its middle."""

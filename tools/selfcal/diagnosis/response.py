@@ -163,7 +163,7 @@ def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], In
             "source": {"verdict": verdict, "reason": reason},
             "held_out": {"nats_per_sample": held_out},
         }
-        if verdict == "no structure":
+        if misfits:
             entry |= _silent(state, given, methods)
         else:
             entry |= {

@@ -138,11 +138,13 @@ def lags_of(number: Mapping[str, Any]) -> list[Any]:
 
 def behind(u: Array, dt: float, number: Mapping[str, float]) -> tuple[Array, list[Array]]:
     """The input [n] behind a filter, at rest at its first value, and what the time before the record may add: each pole
-    its decay, a delay what moved on a straight line."""
+    its decay, a delay what moved on a straight line, a play where it stood."""
     time = np.arange(u.size) * dt
     before: list[Array] = []
     if "width" in number:
-        u = played(u, number["width"])
+        half = 0.5 * number["width"]
+        u, high = (played(np.append(u[0] + at, u), number["width"])[1:] for at in (-half, half))
+        before = [high - u]
     if "pure_delay_s" in number:
         ago = time - number["pure_delay_s"]
         u = np.interp(ago, time, u)
@@ -519,10 +521,11 @@ def source(
     lags = state.dt * 2.0 ** np.arange(1 + int(math.log2(max(LONGEST_LAG * drive.u.size, 1.0))))
     ahead = [late(drive.u[::-1], float(lag), state.dt)[::-1] for lag in lags]
     both = state.scores([np.vstack([one.columns, column]) for column in ahead], one.fit)
-    if net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST:
-        return "cannot tell", f"the input's later values explain the output as well: {feedback}"
-    if misfits:
+    back = net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST
+    if misfits and not (back and acts_back):
         return "no structure", "; ".join(misfits)
+    if back:
+        return "cannot tell", f"the input's later values explain the output as well: {feedback}"
     if not one.structure.late:
         either = "either may act on the other" if acts_back else "the input may act"
         return "cannot tell", f"both move at once: {either}, or a common cause on both"
