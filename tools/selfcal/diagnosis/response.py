@@ -27,6 +27,7 @@ from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import POWER
 from selfcal.model.regressors import coefficient_unit
 from selfcal.readings.held import updates
+from selfcal.readings.lattice import step_of
 
 SCHEMA = "selfcal.response/1"
 #: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
@@ -83,13 +84,15 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
     rows = updates(recording.columns[name].values, clock.place)
     read_at = clock.time_s if rows is None else clock.time_s[rows]
     held_s = float(read_at[-1] - read_at[0]) / max(1, read_at.size - 1)
+    # Of means the rounding is less: readings within each scatter over the lattice.
+    lattice = step_of(recording.columns[name].values)[0] if record.rate_hz == record.recorded_hz else 0.0
     if rows is None or held_s < 2.0 / record.rate_hz:
-        return [_about(Input(transfer.quiet(values), values, unit))]
+        return [_about(Input(transfer.quiet(values, lattice), values, unit))]
     # The middle of each cell of the grid.
     time = record.time_s + 0.5 * (1.0 / record.rate_hz - 1.0 / record.recorded_hz)
     time += float(recording.clock_of(next(iter(record.axes))).time_s[0])
     read = recording.columns[name].values[rows]
-    lines = np.interp(time, read_at, transfer.quiet(read))
+    lines = np.interp(time, read_at, transfer.quiet(read, lattice))
     held = Input(values, values, unit, held_s=held_s, taken="held readings")
     return [_about(Input(lines, lines, unit, held_s=held_s, taken=LINES)), _about(held)]
 

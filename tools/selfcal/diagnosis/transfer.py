@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_solve_banded, cholesky_banded
-from scipy.optimize import minimize_scalar
+from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
@@ -209,9 +209,10 @@ class Drive:
         return np.array([*map(of, structure.keys), *before, *more])
 
 
-def quiet(values: Array) -> Array:
+def quiet(values: Array, lattice: float = 0.0) -> Array:
     """[n]: what readings [n] with a noise of their own are of: an integrated random walk, whose size the readings
-    tell (the spline of Wahba, 1978). What it leaves of the noise does not go with it, and so it biases no gain."""
+    tell (the spline of Wahba, 1978). What it leaves of the noise does not go with it, and so it biases no gain. On a
+    `lattice` the noise is that of rounding at least: between its steps readings look exact."""
     n = values.size
     about = values - values.mean()
     if n < ROUGH or not np.any(np.diff(values, 2)):
@@ -232,7 +233,15 @@ def quiet(values: Array) -> Array:
         return 0.5 * (n - 2) * (math.log(left) - ln_stiff) + float(np.log(root[2]).sum()), curve
 
     found = minimize_scalar(lambda x: smoothed(x)[0], bounds=STIFF, method="bounded", options={"xatol": 0.1})
-    return np.asarray(values.mean() + smoothed(float(found.x))[1])
+
+    def fine(ln_stiff: float) -> float:
+        """How far what the curve leaves is above the noise of rounding."""
+        return float(np.var(about - smoothed(ln_stiff)[1])) - lattice**2 / 12.0
+
+    stiff = float(found.x)
+    if fine(stiff) < 0.0 < fine(STIFF[1]):
+        stiff = brentq(fine, stiff, STIFF[1], xtol=0.05)
+    return np.asarray(values.mean() + smoothed(stiff)[1])
 
 
 def late(values: Array, lag_s: complex, dt: float) -> NDArray[Any]:
