@@ -44,6 +44,8 @@ DRAWS, POSSIBLE, WEIGHTY = 4000, 6.0, 5.0
 #: standard deviations; how far off these are looked for first, and how often.
 NODE_STEPS, NODES_MOST = (0.05, 0.7), 150
 NODE, REACH_FIRST, REACHES = 0.5, 0.01, 10
+#: Price of a number of a structure beside half BIC, nats: several structures have one more than a lag, each another.
+LN_CHOICE = 1.0
 #: ln of the number of independent looks: the structures and their numbers.
 LN_STRUCTURES = math.log(42.0)
 #: Structures within so many nats of the best are scored beside a drift of two terms.
@@ -257,8 +259,8 @@ def late(values: Array, lag_s: complex, dt: float) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Tried:
-    """A structure at its best point: its columns [k, n], the gain of ln likelihood, its score (half BIC, nats), and the
-    fit."""
+    """A structure at its best point: its columns [k, n], the gain of ln likelihood, its score (half BIC and the choice,
+    nats), and the fit."""
 
     structure: Structure
     point: Point
@@ -305,7 +307,7 @@ def tried(state: State, drive: Drive, structure: Structure) -> Tried:
         columns = drive.columns(structure, point)
     gain, fit = state.with_columns(columns)
     free = len(columns) + len(structure.shape)
-    return Tried(structure, point, columns, gain, gain - 0.5 * free * math.log(fit.n), fit)
+    return Tried(structure, point, columns, gain, gain - free * (0.5 * math.log(fit.n) + LN_CHOICE), fit)
 
 
 def _top(score: Callable[[Sequence[Point]], Array], start: Point, limits: Array) -> Point:
