@@ -254,7 +254,7 @@ def test_no_axis_acts_on_a_temperature(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_ratio_of_spectra_follows_a_known_lag(tmp_path: Path) -> None:
     """Each band is 90 % by itself, and some 20 bands of a record are nearly independent."""
     inside = []
-    for seed in range(case_records(4, 40)):
+    for seed in range(case_records(2, 40)):
         drawn = Drawn(seed, n=4000, dt=0.5)
         other_axis(drawn)
         found = response(drawn.write(tmp_path / "log.npz"), input="gy", output="gx")["empirical"]
