@@ -119,7 +119,7 @@ def test_what_no_structure_has_gets_no_interval(name: str, tmp_path: Path) -> No
             continue
         assert found["source"]["verdict"] == "no structure" and found["source"]["reason"]
         assert "frequency_response" not in found
-        assert "switch the input at random" in found["record_next"]
+        assert "switch the input between two levels" in found["record_next"]
         if "range" in found:
             low, high = found["range"]["gain"]
             assert low <= min(one["gain"] for one in found["methods"].values()) and low <= high

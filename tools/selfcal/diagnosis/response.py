@@ -236,9 +236,10 @@ def _silent(state: State, given: Input, methods: Mapping[str, Any]) -> dict[str,
         late_s = max(abs(one["delay_s"]) for one in found.values())
         entry["range"] = {"gain": [min(gains), max(gains)], "unit": coefficient_unit(state.unit, given.unit)}
     span = state.y.size * state.dt
-    bit_s = min(max(0.5 * late_s, 4.0 * state.dt), span / 50.0)
-    words = f"switch the input at random between two levels every {bit_s:.2g} s, for {2.0 * span:.2g} s; nothing else"
-    return entry | {"record_next": f"{words} may change meanwhile"}
+    # From times that show a delay to those that show a static gain.
+    short_s = min(max(0.5 * late_s, 4.0 * state.dt), span / 50.0)
+    words = f"switch the input between two levels after random times of {short_s:.2g} to {span / 10.0:.2g} s"
+    return entry | {"record_next": f"{words}, for {2.0 * span:.2g} s; nothing else may change meanwhile"}
 
 
 def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
@@ -356,7 +357,10 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         return
     order = document["order"]
     others = ", ".join(map(str, order["within_90"]))
-    line(f"influence: {document['structure']}, order {order['chosen']} (90 %: {others})")
+    if "estimate" in document:
+        line(f"influence: {document['structure']}, order {order['chosen']} (90 %: {others})")
+    else:
+        line(f"influence: no structure holds, the nearest is {document['structure']}")
     line(f"evidence {document['evidence_gain_nats']:.1f} nats, {document['net_nats']:.1f} net of the search")
     if "estimate" in document:
         table = Table(box=box.SIMPLE_HEAD)
@@ -404,7 +408,8 @@ def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
         3, 1, figsize=(8.0, 8.6), sharex=True, layout="constrained", height_ratios=(3, 3, 2)
     )
     column, axis = document["input"], document["output"]
-    found = document["structure"] if document["influence"] else "no influence"
+    found = document["structure"] if "estimate" in document else "no structure"
+    found = found if document["influence"] else "no influence"
     figure.suptitle(
         f"{printable(Path(document['recording']['path']).name)}: {column['column']} -> {axis['axis']}, {found}\n"
         f"source: {document['source']['verdict']}",
