@@ -1,4 +1,4 @@
-"""ARX, correlation and subspace on systems of known gain, delay and order, and beside right and wrong answers."""
+"""The methods beside `response` on systems of known gain, delay and order, and beside right and wrong answers."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from influences import Drawn, other_axis
 from numpy.typing import NDArray
 from scipy.signal import lfilter
 
-from selfcal.diagnosis.estimators import METHODS, arx, beside, correlation, subspace
+from selfcal.diagnosis.estimators import METHODS, armax, arx, beside, box_jenkins, correlation, instruments, subspace
 from selfcal.diagnosis.record import of_recording
 from selfcal.diagnosis.transfer import late
 from selfcal.logs.recording import load
@@ -40,6 +40,59 @@ def test_arx_finds_an_arx_system() -> None:
         assert found.delay == pytest.approx(delay_of(b, a), abs=0.3)
         assert found.evidence[found.order] == 0.0 and max(found.evidence.values()) == 0.0
         assert found.evidence[1] < -10.0
+
+
+def test_armax_has_the_noise_that_pulls_arx() -> None:
+    """White noise at the output of one pole: the noise of the equation is C = A. ARX is pulled to shorter lags, by far
+    more than the sd of the gain, 0.02, and of the delay, 0.4, over 40 records."""
+    b, a = [0.0, 0.2], [1.0, -0.9]
+    for seed in range(case_records(4, 60)):
+        random = np.random.default_rng([10, seed])
+        u = lfilter([1.0], [1.0, -0.8], random.standard_normal(N))
+        y = lfilter(b, a, u) + 0.8 * random.standard_normal(N)
+        for method in (armax, box_jenkins):
+            found = method(u, y)
+            assert found.values[1][0] == pytest.approx(2.0, abs=0.15)
+            assert found.values[1][1] == pytest.approx(delay_of(b, a), abs=1.6)
+        assert arx(u, y).values[1][1] < delay_of(b, a) - 2.5
+
+
+def test_box_jenkins_agrees_with_statsmodels() -> None:
+    """One pole beside noise of another pole and a zero: statsmodels' exact likelihood of a regression whose errors are
+    ARMA(1, 1), on the input behind the true pole. Half BIC's model has that pole to find: over 12 records the two gains
+    differ with an sd of 0.017."""
+    from statsmodels.tsa.statespace.sarimax import SARIMAX
+
+    for seed in range(case_records(2, 20)):
+        random = np.random.default_rng([11, seed])
+        u = lfilter([1.0], [1.0, -0.5], random.standard_normal(N))
+        behind = lfilter([0.0, 0.2], [1.0, -0.8], u)
+        y = behind + lfilter([1.0, 0.4], [1.0, -0.6], 0.1 * random.standard_normal(N))
+        exact = SARIMAX(y, exog=behind, order=(1, 0, 1)).fit(disp=False)
+        assert box_jenkins(u, y).values[1][0] == pytest.approx(float(exact.params[0]), abs=0.06)
+
+
+def _lagged(u: Array, count: int) -> Array:
+    return np.array([np.concatenate([np.zeros(k), u[: u.size - k]]) for k in range(count)]).T
+
+
+def test_instruments_undo_the_noise_of_the_readings() -> None:
+    """A noise of half the input's deviation takes a fifth of a gain of 1 in least squares: 1 / (1 + 0.25). The gain by
+    instruments has an sd of 0.03. Own arithmetic: the same estimator by the inverse of its normal equations."""
+    for seed in range(case_records(4, 60)):
+        random = np.random.default_rng([12, seed])
+        true = lfilter([math.sqrt(1.0 - 0.9**2)], [1.0, -0.9], random.standard_normal(N))
+        read = true + 0.5 * random.standard_normal(N)
+        y = true + 0.3 * random.standard_normal(N)
+        assert float(read @ y / (read @ read)) == pytest.approx(0.8, abs=0.06)
+        found = instruments(read, y).values[0][0]
+        assert found == pytest.approx(1.0, abs=0.12)
+        ahead = np.array([np.append(read[k:], np.zeros(k)) for k in range(1, 7)]).T
+        Z = np.hstack([ahead, _lagged(read, 7)[:, 1:]])[12:-6]
+        X = read[12:-6, None]
+        first = np.linalg.inv(Z.T @ Z) @ Z.T @ X
+        own = float((first.T @ Z.T @ y[12:-6])[0] / (first.T @ Z.T @ Z @ first)[0, 0])
+        assert found == pytest.approx(own, rel=1e-9)
 
 
 def test_correlation_finds_a_weighting_function() -> None:
@@ -74,9 +127,9 @@ def test_subspace_finds_the_order_of_a_system(b: list[float], a: list[float]) ->
 
 
 def test_an_answer_is_explained_or_not(tmp_path: Path) -> None:
-    """A right answer explains 19 of 20 methods. Of one with twice the lag or 0.8 of the gain two of three say no."""
+    """A right answer explains 19 of 20 methods. Of one with twice the lag or 0.8 of the gain five of six say no."""
     agreed = {"right": 0, "lag": 0, "gain": 0}
-    count = case_records(2, 50)
+    count = case_records(1, 50)
     for seed in range(count):
         drawn = Drawn(seed)
         other_axis(drawn)
@@ -86,8 +139,8 @@ def test_an_answer_is_explained_or_not(tmp_path: Path) -> None:
         state = record.axes["gx"]
         _, fit = state.refit().with_columns(late(u, 8.0, 1.0)[None])
         for key, gain, lag in (("right", 0.3, 8.0), ("lag", 0.3, 16.0), ("gain", 0.24, 8.0)):
-            found = beside(state, fit, u, gain * late(u, lag, 1.0), np.zeros(u.size), 3)
-            agrees = sum(one.agrees for one in found.values())
+            found = beside(state, fit, u, u, np.tile(gain * late(u, lag, 1.0), (20, 1)), np.zeros(u.size), 3)
+            agrees = sum(all(one.within) for one in found.values())
             agreed[key] += agrees
             assert key == "right" or agrees <= 1
     assert agreed["right"] >= 0.95 * count * len(METHODS) - 2.0 * math.sqrt(0.05 * count * len(METHODS))

@@ -17,6 +17,7 @@ from scipy import signal
 
 from selfcal.adequacy.allan import overlapping
 from selfcal.adequacy.drawn import simulate_bank_samples
+from selfcal.bank.result import Estimate
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model
 from selfcal.show.chart import Figure, Panel
@@ -177,3 +178,15 @@ def test_what_it_refuses(tmp_path: Path) -> None:
     done = run("paper", "-o", tmp_path / "no" / "a.html")
     assert done.returncode == 2
     assert "make it first" in done.stderr
+
+
+def test_a_median_far_from_the_others_is_named() -> None:
+    """Four records of K, one nine times the others: the text has its factor and its interval. Alike, it has none."""
+
+    def of(median: float) -> Estimate:
+        return Estimate(mean=median, median=median, sd=median, q05=0.1 * median, q95=4.0 * median, identified=True)
+
+    ones = [of(one) for one in (2e-4, 1.9e-4, 1.8e-3, 2.1e-4)]
+    said = section4._far_off(("first", "second", "third", "fourth"), {"K": ones})
+    assert said.startswith("K of third is 8.8 times the middle one: its interval, 1.8e-04 to 7.2e-03")
+    assert section4._far_off(("first", "second"), {"K": ones[:2]}) == ""

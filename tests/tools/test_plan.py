@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from test_cases_priors import at_rest, write
 
 from selfcal.base.errors import UserError
-from selfcal.batch.plan import LEAST, Wish, _half_interval, coefficient_rows, rows_of
+from selfcal.batch.design import Experiment, drawn_rows
+from selfcal.batch.plan import LEAST, Wish, _half_interval, coefficient_rows, rows_of, steady
 from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.part import part as part_of_log
 from selfcal.verbs.plan import plan
@@ -250,3 +251,62 @@ def test_the_command(tmp_path: Path) -> None:
     assert found.returncode == 0 and "in all: record 64 s at 1 Hz or faster" in found.stdout, found.stderr
     assert (tmp_path / "p.png").stat().st_size > 10_000
     assert json.loads((tmp_path / "p.json").read_text())["wishes"][0]["duration_s"] == 64.0
+
+
+@pytest.mark.parametrize(
+    ("truth", "levels", "wants"),
+    [
+        ({"hypothesis": "random_walk", "N": 0.04, "K": 2e-4}, (22.0, 30.0), {"gain": 0.1, "lag": 0.25}),
+        ({"hypothesis": "gauss_markov", "N": 0.05, "sigma_m": 0.02, "alpha": 0.005}, (20.0, 35.0), {"gain": 0.06}),
+    ],
+    ids=["walk", "markov"],
+)
+def test_the_planned_input_makes_a_response_known(
+    truth: dict[str, Any], levels: tuple[float, float], wants: dict[str, float], tmp_path: Path
+) -> None:
+    """At the planned length at least 80 of 100 other records have what is wanted; of fewer, three deviations less."""
+    count = case_records(0, 100)
+    if not count:
+        pytest.skip("SLOW: make cases")
+    model = part(tmp_path, **truth)
+    found = plan(
+        model,
+        want=[f"{key} within {100.0 * most:g} %" for key, most in wants.items()],
+        response="0.06:120",
+        levels=f"{levels[0]}:{levels[1]}",
+        input_lag_s=45.0,
+        drive=tmp_path / "chamber.csv",
+    )
+    rows = (tmp_path / "chamber.csv").read_text().splitlines()
+    assert rows[0] == "t[s],temp[degC]"
+    at, level = np.array([[float(x) for x in row.split(",")] for row in rows[1:]]).T
+    assert at[0] == 0.0 and at[-1] == found["duration_s"] and np.all(np.diff(at) > 0.0)
+    assert set(level) == set(levels)
+    experiment = Experiment(0.06, 120.0, levels, 45.0)
+    samples = round(found["duration_s"])
+    each = [drawn_rows(Model.load(model), "gz", experiment, found["bit_s"], samples, 5000 + k)[0] for k in range(count)]
+    met = sum(all(one[key] <= most for key, most in wants.items()) for one in each)
+    assert met >= 0.8 * count - 3.0 * math.sqrt(0.16 * count), met
+
+
+def test_a_bias_in_its_steady_state_has_a_line() -> None:
+    """A walk's bias is known as well from half of a long record. White noise alone goes on: its sd is N / sqrt(T)."""
+    lengths = (100.0, 200.0, 400.0)
+    walk = [{"duration_s": one, "q10": 0.01, "q50": 0.02, "q90": 0.03 + 1.0 / one**2} for one in lengths]
+    white = [{"duration_s": one, "q10": 0.1, "q50": 0.2, "q90": one**-0.5} for one in lengths]
+    assert steady(walk) == walk[-1]["q90"]
+    assert steady(white) is None and steady(walk[:1]) is None
+
+
+def test_a_plan_of_an_input_names_what_is_missing(tmp_path: Path) -> None:
+    model = part(tmp_path, hypothesis="random_walk", N=0.04, K=2e-4)
+    asked: list[tuple[dict[str, Any], str]] = [
+        ({"want": ["gain within 5 %"], "response": "0.05"}, "as 0.05:150"),
+        ({"want": ["gain within 5 %"], "response": "0.05:150"}, "as 20:45"),
+        ({"want": ["gain within 5 %"], "response": "0.05:150", "levels": "30:20"}, "LOW below HIGH"),
+        ({"want": ["K within 5 %"], "response": "0.05:150", "levels": "20:30"}, "lag within 20 %"),
+        ({"want": ["K within 5 %"], "levels": "20:30"}, "are for --response"),
+    ]
+    for given, said in asked:
+        with pytest.raises(UserError, match=said):
+            plan(model, **given)

@@ -29,6 +29,7 @@ from influences import (
     thermal,
     wander,
 )
+from response_cells import INSIDE, OUTSIDE, Record
 from scipy.stats import binom
 
 from selfcal.base.errors import UserError
@@ -76,6 +77,79 @@ def test_intervals_cover_the_truth(
     assert min(covered.values()) >= least, covered
     assert named >= at_least(0.9, count), named
     assert told >= at_least(0.95, count), told
+
+
+@pytest.mark.parametrize("name", ["delay", "resonance", "hysteresis"])
+@pytest.mark.parametrize("kind", ["prbs", "wandering"])
+def test_gain_and_dynamics_cover_the_truth(name: str, kind: str, tmp_path: Path) -> None:
+    """Each number in its 90 % where it is stated; it is stated in 9 of 10 records at least."""
+    count = case_records(0 if kind == "wandering" else 2, 100)
+    if not count:
+        pytest.skip("SLOW: make cases")
+    covered: dict[str, int] = {}
+    stated = 0
+    for seed in range(count):
+        record = Record(kind, 7000 + seed)
+        acts, truth = INSIDE[name](record)
+        found = response(record.write(tmp_path / "log.npz", acts), input="temp", output="gx")
+        if "estimate" not in found:
+            assert found["source"]["verdict"] == "no structure"
+            continue
+        stated += 1
+        for key, value in truth.items():
+            one = found["estimate"].get(key)
+            covered[key] = covered.get(key, 0) + (one is not None and one["q05"] <= value <= one["q95"])
+    assert stated >= at_least(0.9, count)
+    assert min(covered.values()) >= at_least(0.9, stated), covered
+
+
+@pytest.mark.parametrize("name", OUTSIDE)
+def test_what_no_structure_has_gets_no_interval(name: str, tmp_path: Path) -> None:
+    """No interval of the gain, the range of other methods in its place, and a record to make. What is stated all the
+    same holds the truth, but for one record in ten."""
+    count = case_records(1, 50)
+    wrong = 0
+    for seed in range(count):
+        record = Record("prbs", 7200 + seed)
+        acts, truth = OUTSIDE[name](record)
+        found = response(record.write(tmp_path / "log.npz", acts), input="temp", output="gx")
+        if "estimate" in found:
+            gain = found["estimate"].get("gain")
+            wrong += gain is not None and not gain["q05"] <= truth["gain"] <= gain["q95"]
+            continue
+        assert found["source"]["verdict"] == "no structure" and found["source"]["reason"]
+        assert "frequency_response" not in found
+        assert "switch the input between two levels" in found["record_next"]
+        if "range" in found:
+            low, high = found["range"]["gain"]
+            assert low <= min(one["gain"] for one in found["methods"].values()) and low <= high
+    assert wrong <= 0.1 * count, wrong
+
+
+def test_two_inputs_that_go_together_are_told_apart(tmp_path: Path) -> None:
+    """A supply that falls as a temperature rises, correlated by 0.9 and more: the temperature acts behind 150 s, the
+    supply at once. Of one truth, 90 % of the intervals hold it."""
+    count = case_records(1, 40)
+    held = {"temp": 0, "supply": 0}
+    for seed in range(count):
+        drawn = Drawn(900 + seed)
+        whole = drawn.now(drawn.whole)
+        supply = 5.0 - 0.02 * (whole - 30.0) + wander(drawn.random, whole.size, drawn.step, 0.02, 300.0)
+        drawn.gx += drawn.now(0.05 * late(drawn.whole, 150.0, drawn.step)) + 1.5 * (supply - 5.0)
+        read = supply[FINE // 2 :: FINE] + 0.002 * drawn.random.standard_normal(drawn.n)
+        columns = {
+            "gx": ("deg/s", drawn.gx.reshape(drawn.n, FINE).mean(axis=1)),
+            "temp": ("degC", drawn.temperature()),
+            "supply": ("V", read),
+        }
+        save(tmp_path / "log.npz", columns, 1.0)
+        found = response(tmp_path / "log.npz", input=["temp", "supply"], output="gx")
+        for part, value in zip(found["inputs"], (0.05, 1.5), strict=True):
+            gain = part.get("estimate", {}).get("gain", {"q05": -math.inf, "q95": math.inf})
+            held[part["input"]["column"]] += gain["q05"] <= value <= gain["q95"]
+    assert min(held.values()) >= at_least(0.9, count), held
+    with pytest.raises(UserError, match="--plot is of one input"):
+        response(tmp_path / "log.npz", input=["temp", "supply"], output="gx", plot=tmp_path / "r.png")
 
 
 @pytest.mark.parametrize("input_", ["temp", "gy"])
@@ -180,7 +254,7 @@ def test_no_axis_acts_on_a_temperature(tmp_path: Path, monkeypatch: pytest.Monke
 def test_the_ratio_of_spectra_follows_a_known_lag(tmp_path: Path) -> None:
     """Each band is 90 % by itself, and some 20 bands of a record are nearly independent."""
     inside = []
-    for seed in range(case_records(4, 40)):
+    for seed in range(case_records(2, 40)):
         drawn = Drawn(seed, n=4000, dt=0.5)
         other_axis(drawn)
         found = response(drawn.write(tmp_path / "log.npz"), input="gy", output="gx")["empirical"]

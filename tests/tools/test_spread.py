@@ -20,6 +20,7 @@ from selfcal.base.errors import UserError
 from selfcal.batch import spread as module
 from selfcal.batch.spread import Row, record_seeds, spread
 from selfcal.verbs.montecarlo import montecarlo
+from selfcal.verbs.paper import paper
 
 CLUSTER = all(importlib.util.find_spec(name) for name in ("distributed", "pyarrow"))
 needs_cluster = pytest.mark.skipif(not CLUSTER, reason="DASK OR PYARROW ABSENT: make setup-cluster")
@@ -70,6 +71,8 @@ def test_absent_packages_are_one_line(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(module.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(UserError, match=r"--results needs pyarrow: .* -m pip install pyarrow"):
         spread(partial(squares, None), range(2), settings={}, results=tmp_path)
+    with pytest.raises(UserError, match=r"--results needs pyarrow"):
+        paper(tmp_path / "paper.html", results=tmp_path / "kept", data=tmp_path / "absent")
     with pytest.raises(UserError, match=r"--scheduler needs dask\.distributed: .* -m pip install distributed"):
         spread(partial(squares, None), range(2), settings={}, scheduler="tcp://127.0.0.1:1")
 

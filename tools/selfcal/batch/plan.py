@@ -56,6 +56,8 @@ FASTER, WORTH = 10.0, 0.8
 TINY = 1e-12
 #: Readings at least of which an information is taken.
 _FEWEST = 8
+#: A bias is in its steady state where half the length has an interval that is wider by less than this factor.
+STEADY = 1.1
 #: Cycles of a regressor's channel over the record: one sweep is half of one. Record without another wish, s.
 CYCLES, SWEEP_S = (0.5, 1.0, 4.0), 3600.0
 #: Forms whose column is in proportion to the channel.
@@ -357,6 +359,13 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
+def steady(curve: Sequence[Mapping[str, float]]) -> float | None:
+    """What nine records of ten keep at the longest length, if half of that length has it too, but for STEADY."""
+    longest = curve[-1]
+    half = [one for one in curve if one["duration_s"] <= 0.5 * longest["duration_s"]]
+    return longest["q90"] if half and half[-1]["q90"] < STEADY * longest["q90"] else None
+
+
 def _swings(wish: Mapping[str, Any]) -> str:
     """By how much to change the channel: once, or to and fro."""
     once, _, often = wish["cycling"]
@@ -373,6 +382,8 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         there = wish["duration_s"]
         said = "no length that can be simulated suffices" if there is None else f"record {duration_words(there)}"
         lines.append(f"{wish['wish']}: {_swings(wish) if 'cycling' in wish else said}")
+        if wish["wish"].startswith("bias") and (least := steady(wish["curve"])):
+            lines.append(f"  nine of ten such parts know it within {least:.2g} at any length: longer does not help")
         for one in document["rates"]:
             times = math.nan if there is None or one["wish"] != wish["wish"] else one["duration_s"] / there
             factor = one["rate_hz"] / document["rate_hz"]

@@ -291,6 +291,12 @@ def _silent() -> Iterator[None]:
         logging.disable(before)
 
 
+def check_results(folder: Path | str | None) -> None:
+    """Raises UserError where finished pieces cannot be kept."""
+    if folder is not None and importlib.util.find_spec("pyarrow") is None:
+        raise UserError(f"--results needs pyarrow: {install('pyarrow')}")
+
+
 class Store:
     """A folder of finished pieces, each a Parquet file that is whole or absent.
 
@@ -298,8 +304,7 @@ class Store:
     """
 
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        if importlib.util.find_spec("pyarrow") is None:
-            raise UserError(f"--results needs pyarrow: {install('pyarrow')}")
+        check_results(folder)
         self.folder = folder
         self.key = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
         try:

@@ -1,4 +1,5 @@
-"""Other ways to identify an influence, beside the answer by prediction error: least squares, correlation, subspace.
+"""Other ways to identify an influence, beside the answer by prediction error: least squares, ARMAX, Box and Jenkins's
+model, instruments, correlation, subspace.
 
 Input u and output y pass the whitening filter of the fitted drift first, so that G(s) stays between them and the noise
 of y is white. All work on means over one step, a third of the delay that they look for.
@@ -13,7 +14,8 @@ from types import MappingProxyType
 
 import numpy as np
 from scipy.linalg import lstsq, qr, svd
-from scipy.signal import fftconvolve
+from scipy.optimize import least_squares
+from scipy.signal import fftconvolve, lfilter
 
 from selfcal.diagnosis.forms import LONGEST_LAG
 from selfcal.likelihood.fit import Fit, run
@@ -22,38 +24,46 @@ from selfcal.likelihood.statemodel import Array
 
 #: Orders of ARX and of a state model at most, taps of the weighting function, and block rows of the subspace.
 ORDERS, TAPS, BLOCK_ROWS = 4, (1, 2, 4, 8, 16, 32), (5, 8, 12)
+#: Orders of a model whose noise has poles or zeros of its own at most, and steps of its fit; instruments on each side.
+NOISE_ORDERS, FIT_STEPS, INSTRUMENTS = 2, 20, 6
 #: Residual sum of squares, free numbers, and gain and delay, of one order.
 Tried = tuple[float, int, tuple[float, float]]
-#: Drawn records of the answer.
-DRAWS = 20
 
 
 @dataclass(frozen=True)
 class Estimate:
-    """The `order` that a method chose with the `evidence` of each, nats below the best (half BIC), the static `gain`
-    and the delay of slow changes, `delay` steps."""
+    """The `order` that a method chose with the `evidence` of each, nats below the best (half BIC). `values`: by order
+    the static gain, and the delay of slow changes, steps."""
 
     order: int
     evidence: Mapping[int, float]
-    gain: float
-    delay: float
+    values: Mapping[int, tuple[float, float]]
+
+    @property
+    def gain(self) -> float:
+        return self.values[self.order][0]
+
+    @property
+    def delay(self) -> float:
+        return self.values[self.order][1]
 
 
 @dataclass(frozen=True)
 class Beside:
     """One method beside the answer: its `estimate`, and least and most [2] of gain and delay over records that the
-    answer makes. Of 20 records the next one is between them with 90 %."""
+    answer makes."""
 
     estimate: Estimate
     least: Array
     most: Array
 
     @property
-    def agrees(self) -> bool:
-        """Whether the answer explains the estimate: within twice the range, and half a step of the delay."""
+    def within(self) -> tuple[bool, bool]:
+        """Whether the answer explains gain and delay: within twice the range, and half a step of the delay."""
         own = np.array([self.estimate.gain, self.estimate.delay])
         more = 0.5 * (self.most - self.least) + np.array([0.0, 0.5])
-        return bool(np.all((own >= self.least - more) & (own <= self.most + more)))
+        gain, delay = (own >= self.least - more) & (own <= self.most + more)
+        return bool(gain), bool(delay)
 
 
 def arx(u: Array, y: Array) -> Estimate:
@@ -66,6 +76,74 @@ def arx(u: Array, y: Array) -> Estimate:
         return rss, c.size, (_ratio(b.sum(), a.sum()), _delay(b) - _delay(a))
 
     return _likeliest({order: tried(order) for order in range(1, ORDERS + 1)}, y.size - ORDERS)
+
+
+def armax(u: Array, y: Array) -> Estimate:
+    """A(q) y = B(q) u + C(q) e by prediction error."""
+    return _prediction_error(u, y, noise_of_its_own=False)
+
+
+def box_jenkins(u: Array, y: Array) -> Estimate:
+    """y = B(q) / F(q) u + C(q) / D(q) e by prediction error."""
+    return _prediction_error(u, y, noise_of_its_own=True)
+
+
+def _prediction_error(u: Array, y: Array, *, noise_of_its_own: bool) -> Estimate:
+    """The best coefficients of each order by the steps of Levenberg and Marquardt, from those of ARX on."""
+
+    def tried(order: int) -> Tried:
+        past = _delayed(y, range(1, order + 1))
+        start, _ = _solved(np.hstack([-past, _delayed(u, range(order + 1))])[ORDERS:], y[ORDERS:])
+        if not _stable(np.append(1.0, start[:order])):
+            start[:order] = 0.0
+        noise = np.zeros(2 * order) if noise_of_its_own else start[:order]
+
+        def parts(x: Array) -> tuple[Array, Array, Array, Array]:
+            """Polynomials B, F, C and D."""
+            f, b, c, d = np.split(x, (order, 2 * order + 1, 3 * order + 1))
+            one = np.ones(1)
+            return b, np.append(one, f), np.append(one, c), np.append(one, d if noise_of_its_own else f)
+
+        def errors(x: Array) -> Array:
+            B, F, C, D = parts(x)
+            if not (_stable(F) and _stable(C)):
+                return np.full(y.size, 10.0 * float(np.abs(y).max()))
+            return np.asarray(lfilter(D, C, y - lfilter(B, F, u)))
+
+        def slopes(x: Array) -> Array:
+            B, F, C, D = parts(x)
+            known = lfilter(B, F, u)
+            e = lfilter(D, C, y - known)
+            by_f = lfilter(D, np.convolve(C, F), known)
+            by_d = lfilter([1.0], C, y - known)
+            columns = [by_f if noise_of_its_own else by_f + by_d, -lfilter(D, np.convolve(C, F), u)]
+            columns += [-lfilter([1.0], C, e)] + ([by_d] if noise_of_its_own else [])
+            firsts = (1, 0, 1, 1)
+            each = [_delayed(one, range(first, order + 1)) for first, one in zip(firsts, columns, strict=False)]
+            return np.hstack(each)
+
+        found = least_squares(errors, np.concatenate([start, noise]), slopes, method="lm", max_nfev=FIT_STEPS)
+        B, F, _, _ = parts(found.x)
+        return 2.0 * float(found.cost), found.x.size, (_ratio(B.sum(), F.sum()), _delay(B) - _delay(F))
+
+    return _likeliest({order: tried(order) for order in range(1, NOISE_ORDERS + 1)}, y.size)
+
+
+def instruments(u: Array, y: Array) -> Estimate:
+    """A(q) y = B(q) u by two-stage least squares. Readings of the input before and after those of the equation are the
+    instruments: the noise of a reading is in none of them, and it biases nothing. Nor does noise at the output."""
+
+    def tried(order: int) -> Tried:
+        own = np.hstack([-_delayed(y, range(1, order + 1)), _delayed(u, range(order + 1))])
+        ahead = _delayed(u[::-1], range(1, INSTRUMENTS + 1))[::-1]
+        others = np.hstack([ahead, _delayed(u, range(order + 1, order + 1 + INSTRUMENTS))])
+        inside = slice(2 * INSTRUMENTS, -INSTRUMENTS)
+        told = others[inside] @ lstsq(others[inside], own[inside], check_finite=False)[0]
+        c, rss = _solved(told, y[inside])
+        a, b = np.append(1.0, c[:order]), c[order:]
+        return rss, c.size, (_ratio(b.sum(), a.sum()), _delay(b) - _delay(a))
+
+    return _likeliest({order: tried(order) for order in range(NOISE_ORDERS + 1)}, y.size)
 
 
 def correlation(u: Array, y: Array) -> Estimate:
@@ -116,30 +194,45 @@ def subspace(u: Array, y: Array) -> Estimate:
 
 #: Methods by name.
 METHODS: Mapping[str, Callable[[Array, Array], Estimate]] = MappingProxyType(
-    {"arx": arx, "correlation": correlation, "subspace": subspace}
+    {
+        "arx": arx,
+        "armax": armax,
+        "box-jenkins": box_jenkins,
+        "instruments": instruments,
+        "correlation": correlation,
+        "subspace": subspace,
+    }
 )
+#: Those that take the input as it was read.
+AS_READ = ("instruments",)
 
 
-def beside(state: State, fit: Fit, u: Array, answer: Array, before: Array, steps: int) -> dict[str, Beside]:
-    """What each method makes of an input [n] and the record in means of `steps` samples, and what it would make of
-    records that the `answer` [n] to that input and the fitted noise make. `before` [n]: what the input left from before
-    the record; it is taken out."""
+def beside(
+    state: State, fit: Fit, u: Array, read: Array, answers: Array, before: Array, steps: int
+) -> dict[str, Beside]:
+    """What each method makes of an input [n], or of its readings `read` [n], and the record in means of `steps`
+    samples, and what it would make of records that `answers` [draws, n] to that input, the likeliest first, and the
+    fitted noise make. `before` [n]: what the input left from before the record; it is taken out."""
     rest = replace(state, y=state.y - before)
-    _, white, _ = run(rest.series.beside(np.array([u, answer])), fit.terms, fit.theta, innovations=True)
+    _, white, _ = run(rest.series.beside(np.vstack([u, read, answers])), fit.terms, fit.theta, innovations=True)
     white = np.nan_to_num(white)
-    known, _ = np.linalg.qr(white[:, 1:-2])
-    white = white[:, [0, -2, -1]]
+    kept = 2 + len(answers)
+    known, _ = np.linalg.qr(white[:, 1:-kept])
+    white = np.delete(white, range(1, white.shape[1] - kept), axis=1)
     white -= known @ (known.T @ white)
     count = white.shape[0] // steps
-    y, given, due = white[: count * steps].reshape(count, steps, 3).mean(axis=1).T
-    noise = float(np.std(y - due))
+    y, quiet, raw, *due = white[: count * steps].reshape(count, steps, 1 + kept).mean(axis=1).T
+    noise = float(np.std(y - due[0]))
     random = np.random.default_rng(1)
-    drawn = [due + noise * random.standard_normal(count) for _ in range(DRAWS)]
+    drawn = [one + noise * random.standard_normal(count) for one in due]
     found = {}
     for name, method in METHODS.items():
-        each = [method(given, one) for one in drawn]
-        spread = np.array([[one.gain, one.delay] for one in each])
-        found[name] = Beside(method(given, y), spread.min(axis=0), spread.max(axis=0))
+        given = raw if name in AS_READ else quiet
+        own = method(given, y)
+        # Of the order that the record took: another one is another estimate.
+        each = [method(given, one).values for one in drawn]
+        spread = np.array([one[own.order] for one in each if own.order in one] or [(own.gain, own.delay)])
+        found[name] = Beside(own, spread.min(axis=0), spread.max(axis=0))
     return found
 
 
@@ -151,18 +244,24 @@ def _likeliest(tried: Mapping[int, Tried], n: int) -> Estimate:
         if math.isfinite(rss)
     }
     best = max(score, key=lambda order: score[order])
-    return Estimate(best, {order: one - score[best] for order, one in score.items()}, *tried[best][2])
+    evidence = {order: one - score[best] for order, one in score.items()}
+    return Estimate(best, evidence, {order: tried[order][2] for order in score})
 
 
 def _delayed(values: Array, steps: Iterable[int]) -> Array:
     """[n, k]: values [n] so many steps late, 0 before their begin."""
-    return np.array([np.concatenate([np.zeros(k), values[: values.size - k]]) for k in steps]).T
+    late = [np.concatenate([np.zeros(k), values[: values.size - k]]) for k in steps]
+    return np.array(late).reshape(len(late), values.size).T
 
 
 def _solved(columns: Array, y: Array) -> tuple[Array, float]:
     """Least squares: coefficients [k] and the residual sum of squares."""
     c = np.asarray(lstsq(columns, y, check_finite=False)[0])
     return c, float(np.sum((y - columns @ c) ** 2))
+
+
+def _stable(polynomial: Array) -> bool:
+    return bool(np.abs(np.roots(polynomial)).max(initial=0.0) < 1.0)
 
 
 def _delay(h: Array) -> float:

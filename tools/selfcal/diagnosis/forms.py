@@ -371,29 +371,38 @@ def inconstancy(state: State, column: Array, beside: Array | None = None) -> flo
 
     A reading that follows another axis does so at all frequencies alike. Two axes that share a line, a temperature or a
     shock agree at some frequencies only, and the axis that is followed does not follow with one coefficient either.
-    Bands hold equal information; in each the coefficient is estimated by itself. `beside`: columns [k, n] that are in
-    the model as well.
+    `beside`: columns [k, n] that are in the model as well.
     """
-    fit = state.best
-    more = column[None] if beside is None or not len(beside) else np.vstack([beside, column])
-    _, white, _ = run(state.series.beside(more), fit.terms, fit.theta, innovations=True)
+    w, (u,), q = whitened(state, column[None], beside)
+    u, w = u - q @ (q.T @ u), w - q @ (q.T @ w)
+    chi, bands = agreement(u, w - float(u @ w) / float(u @ u) * u)
+    return -math.log(max(float(chdtrc(bands - 1, chi)), 1e-300)) if bands > 1 else 0.0
+
+
+def whitened(state: State, columns: Array, beside: Array | None = None) -> tuple[Array, Array, Array]:
+    """The record [n] and columns [k, n] behind the filter of the drift, and an orthonormal base [n, p] of what the
+    model has, and `beside` [j, n]."""
+    more = columns if beside is None or not len(beside) else np.vstack([beside, columns])
+    _, white, _ = run(state.series.beside(more), state.best.terms, state.best.theta, innovations=True)
     white = np.nan_to_num(white)
-    q, _ = np.linalg.qr(white[:, 1:-1])
-    u = white[:, -1] - q @ (q.T @ white[:, -1])
-    w = white[:, 0] - q @ (q.T @ white[:, 0])
-    c = float(u @ w) / float(u @ u)
-    U, W = rfft(u), rfft(w - c * u)
-    A, B = np.abs(U) ** 2, (np.conj(U) * W).real
+    k = len(columns)
+    return white[:, 0], white[:, -k:].T, np.linalg.qr(white[:, 1:-k])[0]
+
+
+def agreement(u: Array, w: Array, *, any_phase: bool = False) -> tuple[float, int]:
+    """How a record w [n] goes with a column u [n], both white: chi squared, a coefficient in each band, and the number
+    of bands. Bands hold equal information. `any_phase`: what comes at another time counts too, a second one a band."""
+    U, W = rfft(u), rfft(w)
+    A, B = np.abs(U) ** 2, np.conj(U) * W
     edges = np.searchsorted(np.cumsum(A) / A.sum(), np.linspace(0.0, 1.0, BANDS + 1)[1:-1])
     edges = np.unique(np.concatenate([[0], edges + 1, [A.size]]))
-    edges = edges[edges <= A.size]
-    information = np.add.reduceat(A, edges[:-1])
-    score = np.add.reduceat(B, edges[:-1])
+    edges = edges[edges < A.size]
+    information = np.add.reduceat(A, edges)
+    score = np.add.reduceat(B, edges)
+    power_of = np.abs(score) ** 2 if any_phase else score.real**2
     # The transform doubles every bin but the first: half of the bins' power is in the real part.
-    noise = float(np.var(w - c * u)) * u.size / 2.0
-    chi = float((score**2 / np.maximum(information, 1e-300)).sum()) / noise
-    freedom = information.size - 1
-    return -math.log(max(float(chdtrc(freedom, chi)), 1e-300)) if freedom > 0 else 0.0
+    noise = float(np.var(w)) * u.size / 2.0
+    return float((power_of / np.maximum(information, 1e-300)).sum()) / noise, edges.size
 
 
 def _keys(state: State, option: Option) -> list[tuple[str, str]]:

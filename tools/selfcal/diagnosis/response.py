@@ -3,38 +3,45 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich import box
 from rich.table import Table
+from scipy.stats import binom
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
 from selfcal.base.output import console_of, plotter, save_picture
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
-from selfcal.diagnosis.forms import NOISES, SMOOTHING_S
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.transfer import PROBABILITY, Empirical, Input, Posterior, Tried
-from selfcal.likelihood.state import ALIKE, NET_LEAST, State
+from selfcal.diagnosis.transfer import DRAWS, PROBABILITY, STRUCTURES, Drive, Empirical, Input, Posterior, Tried
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Regressor, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import POWER
 from selfcal.model.regressors import coefficient_unit
 from selfcal.readings.held import updates
+from selfcal.readings.lattice import step_of
 
 SCHEMA = "selfcal.response/1"
 #: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
 #: time constants are in memory together.
 SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
-#: Other methods take means over so many seconds at least of a channel with a noise of its own, and so many steps.
-NOISY_STEP_S, STEPS_LEAST = 10.0, 150
-#: Frequencies of the response that is written, and draws that its band is of.
-FREQUENCIES, BAND_DRAWS = 60, 1000
+#: Other methods take so many means at least, and so many records that the answer makes. Of 20 records the next one is
+#: within their range with 90 %.
+STEPS_LEAST, RECORDS = 150, 20
+#: Frequencies of the response that is written.
+FREQUENCIES = 60
+#: Several inputs are each looked at beside the others so many times before they are answered.
+ROUNDS = 2
+#: A misfit is named that chance makes once in so many records.
+MISFIT = 500.0
 LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
 #: How the readings of a held input were taken.
 LINES = "straight lines between readings"
@@ -45,7 +52,12 @@ WORDS = {
     "rate": "rate coefficient",
     "direct": "gain of fast changes",
     "lag_s": "time constant",
+    "lag_2_s": "second time constant",
+    "pure_delay_s": "pure delay",
     "delay_s": "delay of slow changes",
+    "period_s": "period",
+    "damping": "damping ratio",
+    "width": "width of the play",
     "square": "square coefficient",
     "cube": "cube coefficient",
 }
@@ -56,7 +68,8 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
     behind its noise, and between the readings of a held one. The held readings may act themselves as well: a part that
     compensates by its own temperature."""
     if name in record.axes:
-        return [_about(Input(bridged(record.axes[name].y) + record.axes[name].level, record.axes[name].unit))]
+        acts = bridged(record.axes[name].y) + record.axes[name].level
+        return [_about(Input(acts, acts, record.axes[name].unit))]
     if name not in record.channel_names.values():
         known = name in dict(SIDE_CHANNELS.values())
         reason = (
@@ -71,41 +84,57 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
     rows = updates(recording.columns[name].values, clock.place)
     read_at = clock.time_s if rows is None else clock.time_s[rows]
     held_s = float(read_at[-1] - read_at[0]) / max(1, read_at.size - 1)
-    random = np.random.default_rng(1)
+    # Of means the rounding is less: readings within each scatter over the lattice.
+    lattice = step_of(recording.columns[name].values)[0] if record.rate_hz == record.recorded_hz else 0.0
     if rows is None or held_s < 2.0 / record.rate_hz:
-        noises = _noise_of(values) * random.standard_normal((NOISES, values.size))
-        return [_about(Input(values, unit, noises=noises, widths_s=(0.0, *SMOOTHING_S)))]
+        return [_about(Input(transfer.quiet(values, lattice), values, unit))]
     # The middle of each cell of the grid.
     time = record.time_s + 0.5 * (1.0 / record.rate_hz - 1.0 / record.recorded_hz)
     time += float(recording.clock_of(next(iter(record.axes))).time_s[0])
     read = recording.columns[name].values[rows]
-    drawn = _noise_of(read) * random.standard_normal((NOISES, read.size))
-    noises = np.array([np.interp(time, read_at, one) for one in drawn])
-    lines = Input(np.interp(time, read_at, read), unit, 0.0, noises, (0.0, *SMOOTHING_S), held_s, LINES)
-    return [_about(lines), _about(Input(values, unit, held_s=held_s, taken="held readings"))]
+    lines = np.interp(time, read_at, transfer.quiet(read, lattice))
+    held = Input(values, values, unit, held_s=held_s, taken="held readings")
+    return [_about(Input(lines, lines, unit, held_s=held_s, taken=LINES)), _about(held)]
 
 
 def _about(given: Input) -> Input:
     """The input about its median."""
     reference = float(np.median(given.values))
-    return replace(given, values=given.values - reference, reference=reference)
+    return replace(given, values=given.values - reference, read=given.read - reference, reference=reference)
 
 
-def _noise_of(values: Array) -> float:
-    """Deviation of a white noise by differences. The order that sees least of what changes slowly."""
-    orders = range(2, 6)
-    return math.sqrt(min(float(np.var(np.diff(values, k))) / math.comb(2 * k, k) for k in orders))
+def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str, tuple[dict[str, Any], Input]]:
+    """The answer to each input, beside the columns that the others act by, and the input as it acts likeliest."""
+    known: dict[str, Array] = {}
+
+    def beside_others(name: str) -> State:
+        columns = [(other, one) for other, block in known.items() if other != name for one in block]
+        more = [Regressor(f"{other}_{k}", "input", one, "1", {}) for k, (other, one) in enumerate(columns)]
+        return state.refit(regressors=(*state.regressors, *more)) if more else state
+
+    for _ in range(ROUNDS if len(inputs) > 1 else 0):
+        for name, each in inputs.items():
+            found, _ = _found(beside_others(name), each)
+            best = max(found, key=lambda one: one.score)
+            known[name] = best.columns if best.score > 0.0 else best.columns[:0]
+    return {name: answer_of(beside_others(name), each) for name, each in inputs.items()}
+
+
+def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
+    """Every structure of the input as it acts likeliest, and that input."""
+    each = [[transfer.tried(state, Drive(u.values, state.dt), one) for one in STRUCTURES] for u in inputs]
+    # Of two that explain a record alike, the first is meant.
+    best = [max(one.score for one in tried) for tried in each]
+    place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
+    return each[place], inputs[place]
 
 
 def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Input]:
     """Everything that is found of an axis and an input, as the document has it, and the input as it acts likeliest."""
     dt = state.dt
-    each = [[transfer.tried(state, one) for one in transfer.structures(u.values, dt, u.widths_s)] for u in inputs]
-    # Of two that explain a record alike, the first is meant.
-    best = [max(one.score for one in tried) for tried in each]
-    place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
-    found, given = each[place], inputs[place]
-    u, unit = given.values, given.unit
+    found, given = _found(state, inputs)
+    drive = Drive(given.values, dt)
+    unit = given.unit
     found = transfer.beside_two_terms(state, found)
     chosen = max(found, key=lambda one: one.score)
     net = transfer.worth(state, chosen)
@@ -116,23 +145,37 @@ def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], In
     orders = {str(order): float(weight[poles == order].sum()) for order in sorted(set(poles.tolist()))}
     likely = sorted(orders, key=lambda order: -orders[order])
     within = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
-    seen = transfer.empirical(u, bridged(state.y), dt)
+    rest = bridged(state.y)
+    for one, c in zip(state.regressors, chosen.fit.c[1:], strict=False):
+        rest = rest - c * one.values
+    seen = transfer.empirical(given.values, rest, dt)
     entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
     if shown:
         acts_back = not any(units.same_kind(unit, side) for _, side in SIDE_CHANNELS.values())
-        drawn = transfer.posterior(state, chosen, transfer.undistorted(state, given, chosen))
-        verdict, reason = transfer.source(state, u, chosen, drawn, acts_back=acts_back)
+        alike = [k for k in np.argsort(-weight) if weight[k] > 1.0 / 50.0]
+        drawn = [transfer.posterior(state, drive, found[k]) for k in alike]
+        pooled = Pooled(drawn, weight[alike])
+        methods = _methods(state, drive, given.read, chosen, pooled, seen)
+        held_out = transfer.held_out(state, chosen)
+        misfits = _misfits(transfer.left_over(state, drive, chosen), held_out * chosen.fit.n / 3.0, methods)
+        verdict, reason = transfer.source(state, drive, chosen, drawn[0], misfits, acts_back=acts_back)
         entry |= {
             "structure": chosen.structure.name,
             "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, within)), "probability": orders},
             "structures": {one.structure.name: float(share) for one, share in zip(found, weight, strict=True)},
-            "estimate": _estimate(drawn, state.unit, unit),
             "source": {"verdict": verdict, "reason": reason},
-            "frequency_response": _band(drawn, state.y.size, dt),
-            **_methods(state, given, chosen, drawn, seen),
+            "held_out": {"nats_per_sample": held_out},
         }
+        if misfits:
+            entry |= _silent(state, given, methods)
+        else:
+            entry |= {
+                "estimate": _estimate(pooled, state.unit, unit),
+                "frequency_response": _band(pooled, state.y.size, dt),
+            }
+        entry |= methods
     else:
-        least = state.least(u)
+        least = state.least(given.values)
         entry |= {
             "source": {"verdict": "none", "reason": NO_INFLUENCE},
             "would_have_been_found": {"gain": least, "unit": coefficient_unit(state.unit, unit)},
@@ -140,39 +183,107 @@ def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], In
     return entry | {"empirical": _empirical(seen)}, given
 
 
-def _estimate(drawn: Posterior, output: str, unit: str) -> dict[str, Any]:
-    """Posterior of each number of the structure."""
-    values = dict(zip(drawn.structure.keys[: drawn.structure.own], drawn.c.T, strict=True))
-    if drawn.structure.poles:
-        values["lag_s"] = drawn.lag
-    if drawn.structure.name in ("static and rate", "lag and direct", "second order"):
-        values["delay_s"] = drawn.delay_s
-    named = {"rate": coefficient_unit(output, f"{unit}/s"), "lag_s": "s", "delay_s": "s"}
+@dataclass(frozen=True)
+class Pooled:
+    """Posteriors of the structures that a record leaves possible, the likeliest first, and the weight of each."""
+
+    each: Sequence[Posterior]
+    weight: Array
+
+    def of(self, value: Callable[[Posterior], NDArray[Any]], key: str = "gain") -> NDArray[Any]:
+        """Draws of a value, from each structure that has the key by its weight."""
+        chosen = [k for k, one in enumerate(self.each) if key in one.structure.keys]
+        share = self.weight[chosen] / self.weight[chosen].sum()
+        return np.concatenate(
+            [value(self.each[k])[: round(DRAWS * part)] for k, part in zip(chosen, share, strict=True)]
+        )
+
+    def answers(self, drive: Drive, count: int) -> Array:
+        """[count, n]: what the input makes by draws of all the structures."""
+        made = []
+        places = np.random.default_rng(2).choice(len(self.each), count, p=self.weight / self.weight.sum())
+        for k, place in enumerate(places):
+            one = self.each[place]
+            made.append(one.c[k] @ drive.columns(one.structure, tuple(one.shape[k]))[: len(one.structure.keys)])
+        return np.array(made)
+
+
+def _misfits(left_over: float, held_out: float, methods: Mapping[str, Any]) -> list[str]:
+    """What contradicts the structure, in words. Where it holds, each is so by chance once in MISFIT records."""
+    said = []
+    if left_over > math.log(MISFIT):
+        said.append("the residuals still go with the input")
+    if held_out < -math.log(MISFIT):
+        said.append("by the part before, the last third is predicted worse with the input than without")
+    for name, one in methods.get("methods", {}).items():
+        if not one["agrees"]:
+            key = next(key for key in ("gain", "delay_s") if not one["within"][key])
+            low, high = one["if_answer_holds"][key]
+            what = {"gain": "a static gain", "delay_s": "a delay"}[key]
+            said.append(f"{name} finds {what} of {one[key]:.3g}, where {low:.3g} to {high:.3g} was due")
+    spectra = methods.get("spectra")
+    if spectra and spectra["hold_answer"] < binom.ppf(1.0 / MISFIT, spectra["bands"], PROBABILITY):
+        said.append(f"{spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")
+    return said
+
+
+def _silent(state: State, given: Input, methods: Mapping[str, Any]) -> dict[str, Any]:
+    """The range of the other methods in the place of an interval, and the record that would show a structure."""
+    entry: dict[str, Any] = {}
+    late_s = 0.0
+    if found := methods.get("methods"):
+        gains = [one["gain"] for one in found.values()]
+        late_s = max(abs(one["delay_s"]) for one in found.values())
+        entry["range"] = {"gain": [min(gains), max(gains)], "unit": coefficient_unit(state.unit, given.unit)}
+    span = state.y.size * state.dt
+    # From times that show a delay to those that show a static gain.
+    short_s = min(max(0.5 * late_s, 4.0 * state.dt), span / 50.0)
+    words = f"switch the input between two levels after random times of {short_s:.2g} to {span / 10.0:.2g} s"
+    return entry | {"record_next": f"{words}, for {2.0 * span:.2g} s; nothing else may change meanwhile"}
+
+
+def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
+    """Posterior of each number of the likeliest structure; gain and delay are of all that may be."""
+    drawn = pooled.each[0]
+    structure = drawn.structure
+    values = dict(zip(structure.keys, drawn.c.T, strict=True)) | dict(zip(structure.shape, drawn.shape.T, strict=True))
+    values.pop("window_s", None)
+    if "gain" in values and structure.linear:
+        values["gain"] = pooled.of(lambda one: one.c[:, one.structure.keys.index("gain")])
+        if structure.shape:
+            values["delay_s"] = pooled.of(lambda one: one.delay_s)
+    if structure.name == "delay":
+        del values["pure_delay_s"]
+    elif structure.name == "lag":
+        del values["delay_s"]
+    named = {"rate": coefficient_unit(output, f"{unit}/s"), "damping": "1", "width": unit}
     named |= {key: coefficient_unit(output, units.power(unit, exponent)) for key, exponent in POWER.items()}
     return {
         key: {
             "mean": float(draws.mean()),
             "sd": float(draws.std()),
             **dict(zip(("q05", "median", "q95"), np.quantile(draws, (LOW, 0.5, HIGH)).tolist(), strict=True)),
-            "unit": named.get(key, coefficient_unit(output, unit)),
+            "unit": "s" if key.endswith("_s") else named.get(key, coefficient_unit(output, unit)),
         }
         for key, draws in values.items()
     }
 
 
-def _methods(state: State, given: Input, chosen: Tried, drawn: Posterior, seen: Empirical) -> dict[str, Any]:
+def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
     """Estimates of other methods beside an answer that is linear and has a static gain, and the step of their means."""
-    keys = set(chosen.structure.keys)
-    if "gain" not in keys or keys & set(POWER):
+    if "gain" not in chosen.structure.keys or not chosen.structure.linear:
         return {}
-    finest = max(state.dt, NOISY_STEP_S if given.noises.size else 0.0, abs(float(np.median(drawn.delay_s))) / 3.0)
+    late_s = abs(float(np.median(pooled.each[0].delay_s)))
+    finest = max(state.dt, late_s / 3.0)
     steps = max(1, min(round(finest / state.dt), state.y.size // STEPS_LEAST))
-    own, columns = chosen.structure.own, chosen.structure.columns(chosen.number)
-    parts = chosen.fit.c[-len(columns) :, None] * columns
-    found = beside(state, chosen.fit, given.values, parts[:own].sum(axis=0), parts[own:].sum(axis=0), steps)
+    own = len(chosen.structure.keys)
+    parts = chosen.fit.c[-len(chosen.columns) :, None] * chosen.columns
+    answers = np.vstack([parts[:own].sum(axis=0), *pooled.answers(drive, RECORDS - 1)])
+    found = beside(state, chosen.fit, drive.u, read, answers, parts[own:].sum(axis=0), steps)
     step_s = steps * state.dt
     clear = seen.coherence > seen.chance
-    off = np.abs(seen.ratio - drawn.at(seen.frequency_hz).mean(axis=0))[clear]
+    # Its own errors are in the answer's ratio too.
+    off = np.abs(seen.ratio - transfer.empirical(drive.u, parts.sum(axis=0), state.dt).ratio)[clear]
     return {
         "methods_step_s": step_s,
         "spectra": {"bands": off.size, "hold_answer": int(np.count_nonzero(off <= seen.within[clear]))},
@@ -186,18 +297,18 @@ def _methods(state: State, given: Input, chosen: Tried, drawn: Posterior, seen: 
                     "gain": [float(one.least[0]), float(one.most[0])],
                     "delay_s": [float(one.least[1] * step_s), float(one.most[1] * step_s)],
                 },
-                "agrees": one.agrees,
+                "within": dict(zip(("gain", "delay_s"), one.within, strict=True)),
+                "agrees": all(one.within),
             }
             for name, one in found.items()
         },
     }
 
 
-def _band(drawn: Posterior, n: int, dt: float) -> dict[str, list[float]]:
+def _band(pooled: Pooled, n: int, dt: float) -> dict[str, list[float]]:
     """Gain and phase over frequency with their 90 % bands, point by point."""
     frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, FREQUENCIES)
-    few = Posterior(drawn.structure, drawn.c[:BAND_DRAWS], drawn.lag[:BAND_DRAWS])
-    G = few.at(frequency)
+    G = pooled.of(lambda one: one.at(frequency), pooled.each[0].structure.keys[0])
     gain = np.quantile(np.abs(G), (LOW, 0.5, HIGH), axis=0)
     middle = G.mean(axis=0)
     turn = np.quantile(np.angle(G / middle), (LOW, 0.5, HIGH), axis=0)
@@ -246,19 +357,30 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         return
     order = document["order"]
     others = ", ".join(map(str, order["within_90"]))
-    line(f"influence: {document['structure']}, order {order['chosen']} (90 %: {others})")
+    if "estimate" in document:
+        line(f"influence: {document['structure']}, order {order['chosen']} (90 %: {others})")
+    else:
+        line(f"influence: no structure holds, the nearest is {document['structure']}")
     line(f"evidence {document['evidence_gain_nats']:.1f} nats, {document['net_nats']:.1f} net of the search")
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("", "median", "5 %", "95 %", "unit"):
-        table.add_column(heading, no_wrap=True)
-    for key, one in document["estimate"].items():
-        table.add_row(WORDS[key], *(f"{one[at]:.4g}" for at in ("median", "q05", "q95")), one["unit"])
-    console.print(table)
-    if set(document["estimate"]) & set(POWER):
+    if "estimate" in document:
+        table = Table(box=box.SIMPLE_HEAD)
+        for heading in ("", "median", "5 %", "95 %", "unit"):
+            table.add_column(heading, no_wrap=True)
+        for key, one in document["estimate"].items():
+            table.add_row(WORDS[key], *(f"{one[at]:.4g}" for at in ("median", "q05", "q95")), one["unit"])
+        console.print(table)
+    if set(document.get("estimate", ())) & set(POWER):
         line(f"gain at {given['reference']:.4g} {given['unit']}, from which the powers count")
     if given.get("taken") == LINES:
         line(f"a delay of less than {document['delay_resolution_s']:.4g} s is not resolved")
     line(f"source: {source['verdict']}: {source['reason']}")
+    if "range" in document:
+        low, high = document["range"]["gain"]
+        line(f"the other methods' static gains: {low:.3g} to {high:.3g} {document['range']['unit']}")
+    if "record_next" in document:
+        line(f"record next: {document['record_next']}")
+    gain = document["held_out"]["nats_per_sample"]
+    line(f"the last third, predicted by the part before: {gain:+.2g} nats a sample better with the input than without")
     if "methods" not in document:
         return
     line("")
@@ -286,7 +408,8 @@ def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
         3, 1, figsize=(8.0, 8.6), sharex=True, layout="constrained", height_ratios=(3, 3, 2)
     )
     column, axis = document["input"], document["output"]
-    found = document["structure"] if document["influence"] else "no influence"
+    found = document["structure"] if "estimate" in document else "no structure"
+    found = found if document["influence"] else "no influence"
     figure.suptitle(
         f"{printable(Path(document['recording']['path']).name)}: {column['column']} -> {axis['axis']}, {found}\n"
         f"source: {document['source']['verdict']}",
@@ -302,8 +425,7 @@ def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
                 seen["frequency_hz"], shown[0], shown[1:], color=color, marker="o", markersize=3.5, linestyle="",
                 elinewidth=1, label=label,
             )  # fmt: skip
-        if document["influence"]:
-            band = document["frequency_response"]
+        if band := document.get("frequency_response"):
             at = band["frequency_hz"]
             panel.fill_between(at, band[f"{key}_q05"], band[f"{key}_q95"], color="tab:blue", alpha=0.3, linewidth=0)
             panel.plot(at, band[key], color="tab:blue", label=f"{document['structure']}, 90 %")

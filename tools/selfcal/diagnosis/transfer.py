@@ -8,33 +8,46 @@ the ratio of multitaper spectra, with no model at all.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, inconstancy
-from selfcal.diagnosis.record import smoothed
+from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, agreement, whitened
 from selfcal.likelihood.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
-from selfcal.model.forms import slope
+from selfcal.model.forms import POWER, played, slope
 
 Complex = NDArray[np.complex128]
+#: Numbers of a structure.
+Point = tuple[float, ...]
 #: Probability of an interval.
 PROBABILITY = 0.9
-#: Windows of a rate, s; the numbers of a lag are a factor 2 apart, then finer in so many passes.
-RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
-ZOOMS, FINER = 3, 8
-#: Time constants that stand for the posterior, over those within so many nats of the best one; draws of it.
-FINE, POSSIBLE, DRAWS = 21, 6.0, 4000
-#: Steps of the drift's parameters at least and at most, and nodes of one drift at most.
+#: ln of the stiffness of a curve through an input's readings, least and most; fewer readings are taken as they are.
+STIFF, ROUGH = (-10.0, 25.0), 30
+#: Factors between a filter's numbers that are tried first, beside 2.
+COARSE = {"pure_delay_s": 1.6, "damping": 3.0}
+#: Steps of their logarithms from there on: the first, and the last.
+STEP_FIRST, STEP_LAST = 0.35, 0.005
+#: Draws of a posterior, from points within so many nats of the best one. A drift whose weight is less by so many nats
+#: than the likeliest's is none of them.
+DRAWS, POSSIBLE, WEIGHTY = 4000, 6.0, 5.0
+#: Steps of the drift's parameters at least and at most, and nodes of a lattice at most. Steps of the filter's numbers,
+#: standard deviations; how far off these are looked for first, and how often.
 NODE_STEPS, NODES_MOST = (0.05, 0.7), 150
-#: ln of the number of independent looks: ten structures and their numbers.
-LN_STRUCTURES = math.log(28.0)
+NODE, REACH_FIRST, REACHES = 0.5, 0.01, 10
+#: Price of a number of a structure beside half BIC, nats: several structures have one more than a lag, each another.
+LN_CHOICE = 1.0
+#: ln of the number of independent looks: the structures and their numbers.
+LN_STRUCTURES = math.log(42.0)
 #: Structures within so many nats of the best are scored beside a drift of two terms.
 NEAR = 10.0
 #: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
@@ -46,165 +59,271 @@ CORNER = 20.0
 
 @dataclass(frozen=True)
 class Input:
-    """An input: `values` [n] about its `reference` in `unit`. `noises` [k, n]: drawn noise of its readings, empty where
-    the readings act themselves. `widths_s`: means that may smooth that noise; centred, so that they have no lag.
-    `held_s`: from one reading of a held input to the next, `taken` in words as which its readings were taken."""
+    """An input: `values` [n] about its `reference` in `unit`, of the readings `read` [n]. `held_s`: from one reading of
+    a held input to the next, `taken` in words as which its readings were taken."""
 
     values: Array
+    read: Array
     unit: str
     reference: float = 0.0
-    noises: Array = field(default_factory=lambda: np.empty((0, 0)))
-    widths_s: tuple[float, ...] = (0.0,)
     held_s: float = 0.0
     taken: str = ""
 
 
 @dataclass(frozen=True)
 class Structure:
-    """A form of the influence. `columns(number)` [k, n] are what its k coefficients multiply, `keys` their names;
-    `numbers` the smoothings, windows or time constants to try, s. `transfer(c, number, s)` is G(s), of a curve its
-    slope at the reference. `poles`: its order."""
+    """A form of the influence: coefficients by name, `keys`, of what a filter makes of the input. `shape`: the filter's
+    numbers."""
 
     name: str
-    poles: int
     keys: tuple[str, ...]
-    numbers: tuple[float, ...]
-    columns: Callable[[float], Array]
-    transfer: Callable[[Array, Array, Complex], Complex]
+    shape: tuple[str, ...] = ()
 
     @property
-    def own(self) -> int:
-        """Coefficients of the input; the others are of its state at the start of the record."""
-        return sum(not key.startswith("start") for key in self.keys)
+    def poles(self) -> int:
+        """Its order."""
+        return len(set(self.shape) - {"pure_delay_s", "width", "window_s"})
+
+    @property
+    def late(self) -> bool:
+        """Whether it follows the input."""
+        return bool(set(self.shape) - {"window_s"})
+
+    @property
+    def linear(self) -> bool:
+        return not set(self.keys) & set(POWER) and "width" not in self.shape
+
+    def named(self, point: Point) -> dict[str, float]:
+        """The filter's numbers by name."""
+        return dict(zip(self.shape, point, strict=True))
+
+    def at(self, c: Array, shape: Array, s: Complex) -> Complex:
+        """G [draws, f] of coefficients `c` [draws, k] and numbers `shape` [draws, m]; of a curve its slope at the
+        reference."""
+        number = {name: shape[:, k, None] for k, name in enumerate(self.shape)}
+        H: Complex = np.exp(-number["pure_delay_s"] * s) if "pure_delay_s" in number else np.ones_like(s)
+        for T in lags_of(number):
+            H = H / (1.0 + T * s)
+        of = {"gain": H, "rate": H * s, "direct": 1.0 - H}
+        return np.asarray(sum(c[:, k, None] * of[key] for k, key in enumerate(self.keys) if key in of) + 0.0 * H)
+
+
+#: Every structure. A hysteresis is a play: it follows at half of its width. A rate is a slope over a window.
+STRUCTURES = (
+    Structure("static", ("gain",)),
+    Structure("rate", ("rate",), ("window_s",)),
+    Structure("static and rate", ("gain", "rate"), ("window_s",)),
+    Structure("square", ("gain", "square")),
+    Structure("cube", ("gain", "square", "cube")),
+    Structure("hysteresis", ("gain",), ("width",)),
+    Structure("delay", ("gain",), ("pure_delay_s",)),
+    Structure("late rate", ("rate",), ("lag_s",)),
+    Structure("lag", ("gain",), ("lag_s",)),
+    Structure("lag and direct", ("gain", "direct"), ("lag_s",)),
+    Structure("lag and square", ("gain", "square"), ("lag_s",)),
+    Structure("lag and cube", ("gain", "square", "cube"), ("lag_s",)),
+    Structure("delay and lag", ("gain",), ("pure_delay_s", "lag_s")),
+    Structure("two lags", ("gain",), ("lag_s", "lag_2_s")),
+    Structure("resonance", ("gain",), ("period_s", "damping")),
+)
+
+
+def lags_of(number: Mapping[str, Any]) -> list[Any]:
+    """Time constants, s, of the poles of a filter; those of a resonance are complex."""
+    found = [number[key] for key in ("lag_s", "lag_2_s") if key in number]
+    if "period_s" in number:
+        damping = number["damping"]
+        turn = 1j * np.sqrt(1.0 - damping**2)
+        found += [number["period_s"] / (2.0 * math.pi) * (damping + sign * turn) for sign in (1.0, -1.0)]
+    return found
+
+
+def behind(u: Array, dt: float, number: Mapping[str, float]) -> tuple[Array, list[Array]]:
+    """The input [n] behind a filter, at rest at its first value, and what the time before the record may add: each pole
+    its decay, a delay what moved on a straight line, a play where it stood."""
+    time = np.arange(u.size) * dt
+    before: list[Array] = []
+    if "width" in number:
+        half = 0.5 * number["width"]
+        u, high = (played(np.append(u[0] + at, u), number["width"])[1:] for at in (-half, half))
+        before = [high - u]
+    if "pure_delay_s" in number:
+        ago = time - number["pure_delay_s"]
+        u = np.interp(ago, time, u)
+        before = [np.minimum(ago, 0.0)]
+    # Equal time constants have no partial fractions.
+    T = np.array(lags_of(number)) * np.linspace(1.0, 1.001, len(lags_of(number)))
+    if not T.size:
+        return u, before
+    share = [one ** (T.size - 1) / np.prod(one - np.delete(T, k)) for k, one in enumerate(T)]
+
+    def through(x: Array) -> Array:
+        return np.asarray(sum((w * late(x, one, dt)).real for w, one in zip(share, T, strict=True)))
+
+    decays = [np.exp(-time / one) for one in T]
+    if np.iscomplexobj(T):
+        decays = [decays[0].real, decays[0].imag]
+    return through(u), [through(one) for one in before] + decays
 
 
 @dataclass(frozen=True)
-class Tried:
-    """A structure at its best number: gain of ln likelihood, its score (half BIC, nats), and the fit. `seen`: every
-    number tried, with its score at the fit's drift."""
+class Drive:
+    """An input `u` [n], its samples `dt` s apart: the columns of each structure at each point, which are its
+    numbers."""
 
-    structure: Structure
-    number: float
-    gain: float
-    score: float
-    fit: Fit
-    seen: tuple[tuple[float, float], ...] = ()
+    u: Array
+    dt: float
 
+    def limits(self, structure: Structure) -> Array:
+        """Least and most [m, 2] of each number of the filter: what the samples and the record show."""
+        span = self.u.size * self.dt
+        swing = float(np.ptp(self.u))
+        known = {
+            "pure_delay_s": (0.25 * self.dt, LONGEST_LAG * span),
+            "period_s": (4.0 * self.dt, 0.5 * span),
+            "damping": (0.02, 0.99),
+            "width": (0.02 * swing, 0.9 * swing),
+            "window_s": (self.dt, span / 6.0),
+        }
+        lag = (0.25 * self.dt, LONGEST_LAG * span)
+        return np.array([known.get(name, lag) for name in structure.shape]).reshape(-1, 2)
 
-@dataclass(frozen=True)
-class Posterior:
-    """Draws of a structure's numbers: coefficients `c` [draws, k] and time constant `lag` [draws], s."""
+    def points(self, structure: Structure) -> list[Point]:
+        """Those that are tried first."""
+        grids = []
+        for name, (low, high) in zip(structure.shape, self.limits(structure), strict=True):
+            count = 2 + int(math.log(high / low) / math.log(COARSE.get(name, 2.0)))
+            grids.append(np.geomspace(low, high, count)[1:-1].tolist())
+        return [point for point in product(*grids) if "lag_2_s" not in structure.shape or point[1] <= point[0]]
 
-    structure: Structure
-    c: Array
-    lag: Array
+    def columns(self, structure: Structure, point: Point) -> Array:
+        """[k, n]: what each key multiplies, and then what the time before the record may add."""
+        number = structure.named(point)
+        v, before = behind(self.u, self.dt, number)
 
-    def at(self, frequency_hz: Array) -> Complex:
-        """G [draws, f]."""
-        s = np.asarray(2j * np.pi * frequency_hz, np.complex128)
-        return self.structure.transfer(self.c[:, :, None], self.lag[:, None], s[None, :])
+        def of(key: str) -> Array:
+            if key == "rate":
+                late = "lag_s" in number
+                return (self.u - v) / number["lag_s"] if late else slope(self.u, number["window_s"], self.dt)
+            return self.u - v if key == "direct" else v ** {"gain": 1, **POWER}[key]
 
-    @property
-    def delay_s(self) -> Array:
-        """[draws]: how late slow changes arrive, s: the slope of the phase at frequency 0."""
-        slowest = np.array([1e-6 / (2.0 * math.pi * max(1.0, float(self.lag.max(initial=0.0))))])
-        return np.asarray(-np.angle(self.at(slowest) / self.at(np.zeros(1)))[:, 0] / (2.0 * math.pi * slowest[0]))
-
-
-def structures(u: Array, dt: float, widths_s: Sequence[float]) -> list[Structure]:
-    """Every structure for an input [n] with its samples dt s apart, smoothed by means of `widths_s`."""
-    span = u.size * dt
-    lags = _lags(u.size, dt)
-    windows_s = tuple(dict.fromkeys(max(one, dt) for one in RATE_WINDOWS_S if one <= span / 6.0))
-    widths = tuple(one for one in widths_s if one <= span / 10.0)
-
-    def level(width: float) -> Array:
-        return smoothed(u, max(1, round(width / dt)))
-
-    def behind(lag: float) -> Array:
-        return late(u, lag, dt)
-
-    def decay(lag: float) -> Array:
-        # A lag begins at rest; before the record the input may have moved.
-        gone: Array = np.exp(-np.arange(u.size) * dt / lag)
-        return gone
-
-    middle = widths[len(widths) // 2]
-    return [
-        Structure("static", 0, ("gain",), widths, lambda w: level(w)[None], lambda c, _, s: c[:, 0] + 0.0 * s),
-        Structure("rate", 0, ("rate",), windows_s, lambda w: slope(u, w, dt)[None], lambda c, _, s: c[:, 0] * s),
-        Structure(
-            "static and rate", 0, ("gain", "rate"), windows_s,
-            lambda w: np.array([level(middle if w > dt else 0.0), slope(u, w, dt)]),
-            lambda c, _, s: c[:, 0] + c[:, 1] * s,
-        ),
-        Structure(
-            "square", 0, ("gain", "square"), widths,
-            lambda w: np.array([(value := level(w)), value**2]), lambda c, _, s: c[:, 0] + 0.0 * s,
-        ),
-        Structure(
-            "cube", 0, ("gain", "square", "cube"), widths,
-            lambda w: np.array([(value := level(w)), value**2, value**3]), lambda c, _, s: c[:, 0] + 0.0 * s,
-        ),
-        Structure(
-            "late rate", 1, ("rate", "start"), lags,
-            lambda lag: np.array([(u - behind(lag)) / lag, decay(lag)]),
-            lambda c, lag, s: c[:, 0] * s / (1.0 + lag * s),
-        ),
-        Structure(
-            "lag", 1, ("gain", "start"), lags,
-            lambda lag: np.array([behind(lag), decay(lag)]), lambda c, lag, s: c[:, 0] / (1.0 + lag * s),
-        ),
-        Structure(
-            "lag and direct", 1, ("gain", "direct", "start"), lags,
-            lambda lag: np.array([(slow := behind(lag)), u - slow, decay(lag)]),
-            lambda c, lag, s: (c[:, 0] + c[:, 1] * lag * s) / (1.0 + lag * s),
-        ),
-        Structure(
-            "lag and square", 1, ("gain", "square", "start", "start_square"), lags,
-            lambda lag: np.array([(slow := behind(lag)), slow**2, (gone := decay(lag)), gone * slow]),
-            lambda c, lag, s: c[:, 0] / (1.0 + lag * s),
-        ),
-        Structure(
-            "second order", 2, ("gain", "start", "start_rate"), lags,
-            lambda lag: np.array([
-                late(behind(lag), lag, dt), (gone := decay(lag)), gone * np.arange(u.size) * dt / lag
-            ]),
-            lambda c, lag, s: c[:, 0] / (1.0 + lag * s) ** 2,
-        ),
-    ]  # fmt: skip
+        more = [one * v for one in before] if "square" in structure.keys else []
+        return np.array([*map(of, structure.keys), *before, *more])
 
 
-def late(values: Array, lag_s: float, dt: float) -> Array:
-    """[n]: `values` [n] behind a first-order lag, at rest at the first one.
+def quiet(values: Array, lattice: float = 0.0) -> Array:
+    """[n]: what readings [n] with a noise of their own are of: an integrated random walk, whose size the readings
+    tell (the spline of Wahba, 1978). What it leaves of the noise does not go with it, and so it biases no gain. On a
+    `lattice` the noise is that of rounding at least: between its steps readings look exact."""
+    n = values.size
+    about = values - values.mean()
+    if n < ROUGH or not np.any(np.diff(values, 2)):
+        return values
+    # Second differences D: D'D has five diagonals.
+    ends = np.ones(n - 2)
+    bands = np.zeros((3, n))
+    for size, parts in ((2, (1.0, 4.0, 1.0)), (1, (-2.0, -2.0)), (0, (1.0,))):
+        for shift, part in enumerate(parts):
+            bands[size, 2 - size + shift : n - len(parts) + 1 + shift] += part * ends
+    unit = np.array([[0.0], [0.0], [1.0]])
+
+    def smoothed(ln_stiff: float) -> tuple[float, Array]:
+        """Restricted likelihood, less, and the curve."""
+        root = cholesky_banded(unit + math.exp(ln_stiff) * bands)
+        curve = cho_solve_banded((root, False), about)
+        left = max(float(about @ (about - curve)), 1e-300)
+        return 0.5 * (n - 2) * (math.log(left) - ln_stiff) + float(np.log(root[2]).sum()), curve
+
+    found = minimize_scalar(lambda x: smoothed(x)[0], bounds=STIFF, method="bounded", options={"xatol": 0.1})
+
+    def fine(ln_stiff: float) -> float:
+        """How far what the curve leaves is above the noise of rounding."""
+        return float(np.var(about - smoothed(ln_stiff)[1])) - lattice**2 / 12.0
+
+    stiff = float(found.x)
+    if fine(stiff) < 0.0 < fine(STIFF[1]):
+        stiff = brentq(fine, stiff, STIFF[1], xtol=0.05)
+    return np.asarray(values.mean() + smoothed(stiff)[1])
+
+
+def late(values: Array, lag_s: complex, dt: float) -> NDArray[Any]:
+    """[n]: `values` [n] behind a first-order lag, at rest at the first one; of a complex time constant it is complex.
 
     Exact for samples between which the input moves on straight lines, and for means over each interval of an input that
     is constant there. A module's lag takes each sample for the whole interval before it: half an interval less."""
-    kept = math.exp(-dt / lag_s)
-    mean = -lag_s / dt * math.expm1(-dt / lag_s)
+    kept = np.exp(-dt / lag_s)
+    mean = -lag_s / dt * np.expm1(-dt / lag_s)
     about = values - values[0]
     return np.asarray(values[0] + lfilter([1.0 - mean, mean - kept], [1.0, -kept], about))
 
 
-def tried(state: State, structure: Structure) -> Tried:
-    """The best number of a structure; those of a pole are then looked for between the grid's."""
+@dataclass(frozen=True)
+class Tried:
+    """A structure at its best point: its columns [k, n], the gain of ln likelihood, its score (half BIC and the choice,
+    nats), and the fit."""
+
+    structure: Structure
+    point: Point
+    columns: Array
+    gain: float
+    score: float
+    fit: Fit
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Draws of a structure's numbers: coefficients `c` [draws, k] and the filter's `shape` [draws, m]."""
+
+    structure: Structure
+    c: Array
+    shape: Array
+
+    def at(self, frequency_hz: Array) -> Complex:
+        """G [draws, f]."""
+        return self.structure.at(self.c, self.shape, np.asarray(2j * np.pi * frequency_hz, np.complex128)[None, :])
+
+    @property
+    def delay_s(self) -> Array:
+        """[draws]: how late slow changes arrive, s: the slope of the phase at frequency 0."""
+        slowest = np.array([1e-6 / (2.0 * math.pi * max(1.0, float(self.shape.max(initial=0.0))))])
+        return np.asarray(-np.angle(self.at(slowest) / self.at(np.zeros(1)))[:, 0] / (2.0 * math.pi * slowest[0]))
+
+
+def tried(state: State, drive: Drive, structure: Structure) -> Tried:
+    """A structure at its best point: of those tried first, and the numbers of a filter then looked for between them."""
+    points = drive.points(structure)
+    blocks = [drive.columns(structure, one) for one in points]
     drifts = [state.best, *state.stiffer(1.5)]
-    blocks = [structure.columns(one) for one in structure.numbers]
-    scores = np.max([state.scores(blocks, at) for at in drifts], axis=0)
-    number = structure.numbers[int(np.argmax(scores))]
-    _, fit = state.with_columns(structure.columns(number))
-    seen = dict(zip(structure.numbers, state.scores(blocks, fit), strict=True))
-    factor = 2.0
-    for _ in range(ZOOMS if structure.poles else 0):
-        middle = max(seen, key=lambda one: seen[one])
-        more = [float(x) for x in middle * factor ** np.linspace(-1.0, 1.0, FINER)]
-        seen |= dict(zip(more, state.scores([structure.columns(one) for one in more], fit), strict=True))
-        factor **= 2.0 / (FINER - 1)
-    number = max(seen, key=lambda one: seen[one])
-    gain, fit = state.with_columns(structure.columns(number))
-    free = len(structure.keys) + (structure.poles > 0)
-    score = gain - 0.5 * free * math.log(fit.n)
-    return Tried(structure, number, gain, score, fit, tuple(sorted(seen.items())))
+    columns = blocks[int(np.argmax(np.max([state.scores(blocks, at) for at in drifts], axis=0)))]
+    gain, fit = state.with_columns(columns)
+    place = int(np.argmax(state.scores(blocks, fit)))
+    point, columns = points[place], blocks[place]
+    if structure.shape:
+
+        def score(some: Sequence[Point]) -> Array:
+            return state.scores([drive.columns(structure, one) for one in some], fit)
+
+        point = _top(score, point, drive.limits(structure))
+        columns = drive.columns(structure, point)
+    gain, fit = state.with_columns(columns)
+    free = len(columns) + len(structure.shape)
+    return Tried(structure, point, columns, gain, gain - free * (0.5 * math.log(fit.n) + LN_CHOICE), fit)
+
+
+def _top(score: Callable[[Sequence[Point]], Array], start: Point, limits: Array) -> Point:
+    """The point of the highest score from `start` on, by ever shorter steps of the numbers' logarithms."""
+    moves = np.array([move for move in product((-1.0, 0.0, 1.0), repeat=len(limits)) if any(move)])
+    here, step = np.log(start), STEP_FIRST
+    best = float(score([start])[0])
+    while step > STEP_LAST:
+        near = np.clip(here + step * moves, *np.log(limits).T)
+        values = score([tuple(one) for one in np.exp(near).tolist()])
+        place = int(np.argmax(values))
+        if values[place] > best + 1e-3:
+            here, best = near[place], float(values[place])
+        else:
+            step /= 2.0
+    return tuple(np.exp(here).tolist())
 
 
 def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
@@ -217,7 +336,7 @@ def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
     base = max(state.rich.ln_likelihood, state.best.ln_likelihood)
 
     def refitted(one: Tried) -> tuple[Fit, float]:
-        fit = refit(state.series.beside(one.structure.columns(one.number)), state.rich)
+        fit = refit(state.series.beside(one.columns), state.rich)
         clearly = fit.ln_likelihood > one.fit.ln_likelihood + ALIKE
         return fit if clearly else one.fit, fit.ln_likelihood - base - one.gain
 
@@ -228,31 +347,21 @@ def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
 
 def worth(state: State, one: Tried) -> float:
     """Evidence of an influence, -ln p: net of the search, and of an input's decay that any drift might have."""
-    columns = one.structure.columns(one.number)
-    own = one.structure.own
-    start = max(0.0, state.with_columns(columns[own:])[0]) if own < len(columns) else 0.0
-    gain = min(one.gain, state.rich_gain(columns)) - start
-    return net(gain, own + (one.structure.poles > 0), LN_STRUCTURES + own * LN_SLOW)
+    own = len(one.structure.keys)
+    start = max(0.0, state.with_columns(one.columns[own:])[0]) if own < len(one.columns) else 0.0
+    gain = min(one.gain, state.rich_gain(one.columns)) - start
+    return net(gain, own + len(one.structure.shape), LN_STRUCTURES + own * LN_SLOW)
 
 
-def posterior(state: State, one: Tried, undistorted: Array, seed: int = 1) -> Posterior:
-    """Draws over coefficients, the time constant, and the drift: every near one, and its parameters."""
+def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterior:
+    """Draws over coefficients, the filter's numbers, and the drift: every near one, and its parameters."""
     structure = one.structure
-    drifts = list(_drifts(state, structure.columns(one.number), one.fit))
-    grid = np.array([one.number])
-    if structure.poles:
-        # The largest drift that is possible leaves most time constants possible.
-        fit, theta, _ = max(drifts, key=lambda node: node[2])
-        numbers, scores = np.array(one.seen).T
-        largest = state.scores([structure.columns(float(x)) for x in numbers], replace(fit, theta=theta))
-        near = (scores > scores.max() - POSSIBLE) | (largest > largest.max() - POSSIBLE)
-        inside = np.flatnonzero(near)
-        low, high = numbers[max(inside[0] - 1, 0)], numbers[min(inside[-1] + 1, numbers.size - 1)]
-        grid = np.geomspace(low, high, FINE)
-    blocks = [structure.columns(float(number)) for number in grid]
-    k = len(blocks[0])
+    drifts = _drifts(state, one.columns, one.fit)
+    points, steps = _nodes(state, drive, one, drifts)
+    blocks = [drive.columns(structure, tuple(point)) for point in np.exp(points).tolist()]
+    k = len(one.columns)
     ln_weight, means, roots, places = [], [], [], []
-    for fit, theta, ln_share in drifts:
+    for fit, theta, ln_share, _ in drifts:
         for place, sums in enumerate(state.sums(fit.terms, theta, blocks)):
             c, inverse, rss = sums.coefficients()
             values, vectors = np.linalg.eigh(rss / sums.n * inverse[-k:, -k:])
@@ -265,10 +374,63 @@ def posterior(state: State, one: Tried, undistorted: Array, seed: int = 1) -> Po
     drawn = random.choice(weight.size, DRAWS, p=weight / weight.sum())
     z = random.standard_normal((DRAWS, k))
     c = np.array(means)[drawn] + np.einsum("dij,dj->di", np.array(roots)[drawn], z)
-    # Within a cell of the grid any number is as likely.
-    cell = math.log(grid[1] / grid[0]) if grid.size > 1 else 0.0
-    lag = grid[np.array(places)[drawn]] * np.exp(cell * random.uniform(-0.5, 0.5, DRAWS))
-    return Posterior(structure, c[:, : structure.own] @ undistorted.T, lag)
+    # Within a cell of the lattice any point is as likely.
+    inside = random.uniform(-0.5, 0.5, (DRAWS, len(steps))) @ steps.T
+    shape = np.exp(np.clip(points[np.array(places)[drawn]] + inside, *np.log(drive.limits(structure)).T))
+    return Posterior(structure, c[:, : len(structure.keys)], shape)
+
+
+def _nodes(
+    state: State, drive: Drive, one: Tried, drifts: Sequence[tuple[Fit, Array, float, float]]
+) -> tuple[Array, Array]:
+    """Logarithms of the filter's numbers that the record leaves possible [points, m], on a lattice about the best with
+    the steps [m, m], its columns. At the likeliest drift, and at the largest, which leaves most possible."""
+    limits = np.log(drive.limits(one.structure))
+    if not limits.size:
+        return np.empty((1, 0)), np.empty((0, 0))
+    far = [max(drifts, key=lambda node: node[3]), max(drifts, key=lambda node: node[2])]
+
+    def scores(some: Array) -> Array:
+        blocks = [drive.columns(one.structure, tuple(x)) for x in np.exp(some).tolist()]
+        return np.array([state.scores(blocks, replace(fit, theta=theta)) for fit, theta, _, _ in far])
+
+    middle, m = np.log(one.point), len(limits)
+    top = scores(middle[None])
+    reach = np.full(m, REACH_FIRST)
+    for _ in range(REACHES):
+        values = scores(np.clip(middle + np.vstack([np.diag(reach), -np.diag(reach)]), *limits.T))[0]
+        fall = top[0, 0] - values.reshape(2, m).max(axis=0)
+        if np.all(fall > 0.3):
+            break
+        reach = np.where(fall > 0.3, reach, 1.6 * reach)
+    stencil = np.array(list(product((-1.0, 0.0, 1.0), repeat=m)))
+    values = scores(np.clip(middle + stencil * reach, *limits.T))[0]
+    # A parabola through the stencil.
+    pairs = [(i, j) for i in range(m) for j in range(i, m)]
+    products = [stencil[:, i] * stencil[:, j] for i, j in pairs]
+    design = np.column_stack([np.ones(len(stencil)), stencil, *products])
+    bend = np.linalg.lstsq(design, values, rcond=None)[0][1 + m :]
+    curvature = np.zeros((m, m))
+    for (i, j), value in zip(pairs, bend, strict=True):
+        curvature[i, j] -= value
+        curvature[j, i] -= value
+    sizes, ways = np.linalg.eigh(curvature)
+    steps = NODE * (reach[:, None] * ways) / np.sqrt(np.maximum(sizes, 0.1))
+    found: dict[tuple[int, ...], Array] = {}
+    seen = waiting = {(0,) * m}
+    most = top[:, 0]
+    while waiting and len(found) < NODES_MOST:
+        inside = [at for at in waiting if np.all(np.abs(np.clip(x := middle + steps @ at, *limits.T) - x) < 1e-9)]
+        if not inside:
+            break
+        values = scores(np.array([middle + steps @ at for at in inside])).T
+        most = np.maximum(most, values.max(axis=0))
+        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > most - POSSIBLE)}
+        found |= near
+        moves = [(j, way) for j in range(m) for way in (1, -1)]
+        waiting = {tuple(x + way * (i == j) for i, x in enumerate(at)) for at in near for j, way in moves} - seen
+        seen = seen | waiting
+    return np.array([middle + steps @ at for at in found]), steps
 
 
 def _ln_weight(sums: Sums) -> float:
@@ -278,15 +440,16 @@ def _ln_weight(sums: Sums) -> float:
     return ln_likelihood(sums) + 0.5 * ln_det(rss / sums.n * inverse)
 
 
-def _drifts(state: State, block: Array, known: Fit) -> Iterator[tuple[Fit, Array, float]]:
+def _drifts(state: State, block: Array, known: Fit) -> list[tuple[Fit, Array, float, float]]:
     """Parameters of every drift that the record leaves possible beside columns [k, n], on a lattice about each
-    fit, and ln of the prior share of each. `known`: the structure's; of two terms it is taken alone.
+    fit, ln of the prior share of each and ln of its weight. `known`: the structure's; of two terms it is taken alone.
 
     A size is as likely as any other up to the largest. Uniform in its logarithm, most weight would be on no drift at
     all wherever the record hardly shows one, and intervals of slow coefficients would be too narrow."""
     fits = [state.fitted_with(terms, block) for terms in state.bases()]
     fits = fits if known.terms in state.bases() else [known]
     walk = max(one.ln_likelihood for one in fits if one.terms.walk)
+    nodes: list[tuple[Fit, Array, float, float]] = []
     for fit in fits:
         terms = fit.terms
         if not terms.walk and fit.ln_likelihood < walk + ALIKE:
@@ -311,52 +474,70 @@ def _drifts(state: State, block: Array, known: Fit) -> Iterator[tuple[Fit, Array
         for place, value in found.items():
             if value > most - POSSIBLE:
                 theta = fit.theta + steps * place
-                yield fit, theta, volume + float(theta[is_size].sum())
+                nodes.append((fit, theta, volume + float(theta[is_size].sum()), volume + value))
+    most = max(node[3] for node in nodes)
+    return [node for node in nodes if node[3] > most - WEIGHTY]
 
 
-def undistorted(state: State, given: Input, one: Tried) -> Array:
-    """[k, k]: what the coefficients of an input that was smoothed become for the input itself.
+def held_out(state: State, one: Tried) -> float:
+    """What the influence gains on the last third, nats a sample. The drift and the size of the noise are of the part
+    before; so are the coefficients, with what that part leaves open of them."""
+    n = state.y.size
+    mark = n - n // 3
+    before = replace(state, y=np.where(np.arange(n) < mark, state.y, np.nan))
 
-    The smoothed columns z are instruments for the plain ones x: c = (z x)^-1 (z z) c_z. Readings of what acts have a
-    noise of their own, which is in z x as well: it is drawn anew and taken out. In powers it is neglected."""
-    number, own = one.number, one.structure.own
-    plain = one.structure.numbers[0] if one.structure.poles == 0 else number
-    inputs = [given.values, *given.noises]
-    pairs = []
-    for values in inputs:
-        same = next(each for each in structures(values, state.dt, given.widths_s) if each.name == one.structure.name)
-        pairs += [same.columns(number)[:own], same.columns(plain)[:own]]
-    rest = one.structure.columns(number)[own:]
-    series = state.series.beside(np.vstack([*([rest] if len(rest) else []), *pairs]))
-    G = run(series, one.fit.terms, one.fit.theta)[0][0].G[1:, 1:]
-    known = len(G) - 2 * own * len(inputs)
-    left = G[known:, :known] @ np.linalg.pinv(G[:known, :known], rcond=1e-12, hermitian=True) @ G[:known, known:]
-    cross = G[known:, known:] - left
+    def rest(columns: Array) -> float:
+        learnt = refit(before.series.beside(columns), one.fit)
+        values = []
+        for sums in run(state.series.beside(columns), learnt.terms, learnt.theta, (mark, n))[0]:
+            _, inverse, rss = sums.coefficients()
+            fit = sums.n * 2.0 * math.log(learnt.sigma) + sums.D + rss / learnt.sigma**2
+            values.append(0.5 * (ln_det(learnt.sigma**2 * inverse) - fit))
+        return values[1] - values[0]
 
-    def of(k: int, i: int, j: int) -> Array:
-        at = 2 * own * k
-        return cross[at + i * own : at + (i + 1) * own, at + j * own : at + (j + 1) * own]
-
-    noise = sum(of(k, 0, 1) for k in range(1, len(inputs))) / max(1, len(inputs) - 1)
-    found: Array = np.linalg.pinv(of(0, 0, 1) - noise) @ of(0, 0, 0)
-    return found
+    return (rest(one.columns) - rest(np.empty((0, n)))) / max(1, int(np.isfinite(state.y[mark:]).sum()))
 
 
-def source(state: State, u: Array, one: Tried, drawn: Posterior, *, acts_back: bool) -> tuple[str, str]:
-    """Whether the record tells that the input acts: "input first" or "cannot tell", and the reason in words.
-    `acts_back`: the output may act on the input. No axis acts on a temperature or a supply.
+def left_over(state: State, drive: Drive, one: Tried) -> float:
+    """-ln p of residuals that still go with the input, net of the number of looks.
+
+    At any frequency in any phase, so whatever the lag, and with one coefficient: with each column of the structure, the
+    input itself, powers of what the filter makes of it, a coefficient that changes with time, and a filter that is
+    quicker up than down."""
+    number = one.structure.named(one.point)
+    v = behind(drive.u, drive.dt, number)[0]
+    uneven = behind(np.abs(drive.u - v), drive.dt, number)[0]
+    own = one.columns[: len(one.structure.keys)]
+    foreign = np.array([drive.u, v**2, v**3, own[0] * np.linspace(-1.0, 1.0, v.size), uneven])
+    w, columns, q = whitened(replace(state, fits=(one.fit,)), np.vstack([own, foreign]), one.columns)
+    w -= q @ (q.T @ w)
+    found = []
+    for k, column in enumerate(columns):
+        u = column if k < len(own) else column - q @ (q.T @ column)
+        if float(u @ u) > 1e-6 * float(column @ column):
+            chi, bands = agreement(u, w, any_phase=True)
+            found += [net(0.5 * chi, 2 * bands), net(0.5 * float(u @ w) ** 2 / float(u @ u) / float(np.var(w)))]
+    return max(found) - math.log(len(found))
+
+
+def source(
+    state: State, drive: Drive, one: Tried, drawn: Posterior, misfits: Sequence[str], *, acts_back: bool
+) -> tuple[str, str]:
+    """Whether the record tells that the input acts: "input first", "cannot tell" or "no structure", and the reason in
+    words. `misfits`: what contradicts the structure. `acts_back`: the output may act on the input. No axis acts on a
+    temperature or a supply.
 
     A common cause that reaches the input first, and all of it, always looks as the input does."""
     feedback = "feedback, or a common cause" if acts_back else "a common cause"
-    columns = one.structure.columns(one.number)
-    ahead = [late(u[::-1], lag, state.dt)[::-1] for lag in _lags(u.size, state.dt)]
-    both = state.scores([np.vstack([columns, column]) for column in ahead], one.fit)
-    if net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST:
+    lags = state.dt * 2.0 ** np.arange(1 + int(math.log2(max(LONGEST_LAG * drive.u.size, 1.0))))
+    ahead = [late(drive.u[::-1], float(lag), state.dt)[::-1] for lag in lags]
+    both = state.scores([np.vstack([one.columns, column]) for column in ahead], one.fit)
+    back = net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST
+    if misfits and not (back and acts_back):
+        return "no structure", "; ".join(misfits)
+    if back:
         return "cannot tell", f"the input's later values explain the output as well: {feedback}"
-    fitted = replace(state, fits=(one.fit,))
-    if max(inconstancy(fitted, columns[j], np.delete(columns, j, 0)) for j in range(len(drawn.c[0]))) >= NET_LEAST:
-        return "cannot tell", f"the gain depends on the frequency as in no structure: {feedback}"
-    if not one.structure.poles:
+    if not one.structure.late:
         either = "either may act on the other" if acts_back else "the input may act"
         return "cannot tell", f"both move at once: {either}, or a common cause on both"
     own = dict(zip(one.structure.keys, np.abs(drawn.c.T), strict=False))
@@ -369,11 +550,6 @@ def source(state: State, u: Array, one: Tried, drawn: Posterior, *, acts_back: b
         other = "the input the output" if acts_back else "both a common cause"
         return "cannot tell", f"the output may follow the input, or {other}"
     return "input first", "the output follows the input; a common cause that reaches the input first looks the same"
-
-
-def _lags(n: int, dt: float) -> tuple[float, ...]:
-    """Time constants from dt to a third of the record, a factor 2 apart."""
-    return tuple(float(x) for x in dt * 2.0 ** np.arange(1 + int(math.log2(max(LONGEST_LAG * n, 1.0)))))
 
 
 @dataclass(frozen=True)

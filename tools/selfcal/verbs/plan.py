@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ from selfcal.verbs._shared import End, Json, Scheduler, Start, to_stderr
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
+    from selfcal.model.file import Model
 
 
 def plan(
@@ -37,6 +39,25 @@ def plan(
     records: Annotated[int, option("Simulated parts", metavar="N")] = 200,
     seed: Annotated[int, option("Same seed, same parts", metavar="N", min=0)] = 1,
     plot: Annotated[Path | str | None, option("Save what is reached over the length", metavar="FILE")] = None,
+    response: Annotated[
+        str | None,
+        option(
+            "Plan an input for `response`: the gain and lag that are expected, as 0.05:150 (axis' unit per degC or V; "
+            "s). Wishes: 'gain within 5 %', 'lag within 20 %'",
+            metavar="GAIN:LAG",
+        ),
+    ] = None,
+    levels: Annotated[
+        str | None, option("With --response: least and most that the input can be, as 20:45", metavar="LOW:HIGH")
+    ] = None,
+    input_lag_s: Annotated[
+        float, option("With --response: how late the input follows its set point, s", "--input-lag", metavar="S")
+    ] = 60.0,
+    input: Annotated[str, option("With --response: what is switched", metavar="CH")] = "temp",
+    drive: Annotated[
+        Path | str | None,
+        option("With --response: set points over time, to drive a chamber by", "--drive", metavar="FILE.csv"),
+    ] = None,
     json: Json = None,
     scheduler: Scheduler = None,
     start_s: Start = None,
@@ -53,6 +74,9 @@ def plan(
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
     it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
     prior's sd.
+    `response`, `levels`, `input_lag_s`, `input`: the shortest record in which SHARE of the parts have a gain and a lag
+    as wanted, its input switched between the levels; `drive` has the set points. The document has `bit_s`,
+    `duration_s` and `set_points` then.
     Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
@@ -95,6 +119,12 @@ def plan(
     group = loaded.group_of(name)
     columns = {one.name: one for one in loaded.regressors}
     sizes = {key: (coefficient_unit(group.unit, one.unit), one.sd.get(group.name, 1.0)) for key, one in columns.items()}
+    if response is not None:
+        return _response(
+            loaded, name, want, response, levels, input_lag_s, input, drive, records, seed, json, scheduler
+        )
+    if levels is not None or drive is not None:
+        raise UserError("--levels and --drive are for --response GAIN:LAG")
     wishes = [Wish.of(text, group.unit, sizes) for text in want]
     there = {parameter for law in loaded.laws.values() for parameter in law.parameters} | {"", "bias", *columns}
     for wish in wishes:
@@ -140,8 +170,81 @@ def plan(
     return document
 
 
+def _pair(option: str, text: str | None, said: str) -> tuple[float, float]:
+    """Two numbers of an option. Raises UserError."""
+    try:
+        first, second = (float(part) for part in str(text).split(":"))
+    except ValueError:
+        raise UserError(f"{option}: takes {said}") from None
+    if not (math.isfinite(first) and math.isfinite(second)):
+        raise UserError(f"{option}: takes {said}")
+    return first, second
+
+
+def _response(
+    model: Model, axis: str, want: Sequence[str], response: str, levels: str | None, input_lag_s: float, input: str,
+    drive: Path | str | None, records: int, seed: int, json: Path | str | None, scheduler: str | None,
+) -> dict[str, Any]:  # fmt: skip
+    """The document of an input for `response`."""
+    from selfcal.base.output import check_writable, write_json, write_text
+    from selfcal.batch.design import DRAWN, Experiment, designed
+    from selfcal.batch.plan import SCHEMA, SHARE, Wish
+    from selfcal.batch.spread import record_seeds
+    from selfcal.logs.recording import SIDE_CHANNELS
+    from selfcal.model.regressors import coefficient_unit
+
+    check_writable(drive, json)
+    units_of = dict(SIDE_CHANNELS.values())
+    if input not in units_of:
+        raise UserError(f"--input {input}: takes {' or '.join(units_of)}")
+    gain, lag_s = _pair("--response", response, "the gain and the lag that are expected, as 0.05:150")
+    low, high = _pair("--levels", levels, "least and most that the input can be, as 20:45")
+    if gain == 0.0 or lag_s <= 0.0 or low >= high or not 0.0 <= input_lag_s < math.inf:
+        raise UserError("--response takes a gain that is not 0, and a lag above 0; --levels LOW below HIGH")
+    experiment = Experiment(gain, lag_s, (low, high), input_lag_s)
+    sizes = {"gain": (coefficient_unit(model.group_of(axis).unit, units_of[input]), 1.0), "lag": ("s", 1.0)}
+    wishes = [Wish.of(text, model.group_of(axis).unit, sizes) for text in want]
+    for wish in wishes:
+        if wish.parameter not in sizes or not wish.text.endswith("%"):
+            raise UserError(f"--want '{wish.text}': with --response takes 'gain within 5 %' and 'lag within 20 %'")
+    found = designed(model, axis, experiment, wishes, record_seeds(min(records, DRAWN), seed), scheduler)
+    document: dict[str, Any] = {
+        "schema": SCHEMA,
+        "model": str(model.path),
+        "axis": axis,
+        "input": input,
+        "share": SHARE,
+        "rate_hz": model.bank_rate_hz,
+        "levels": [low, high],
+        "wishes": [wish.text for wish in wishes],
+        **found,
+    }
+    if found["duration_s"] is not None:
+        at, points = experiment.set_points(found["bit_s"], found["duration_s"])
+        rows = [*zip(at.tolist(), points.tolist(), strict=True), (found["duration_s"], float(points[-1]))]
+        document["set_points"] = [{"time_s": time_s, "value": value} for time_s, value in rows]
+        if drive is not None:
+            text = "".join(f"{time_s:.10g},{value:.10g}\n" for time_s, value in rows)
+            write_text(drive, f"t[s],{input}[{units_of[input]}]\n{text}")
+    elif drive is not None:
+        raise UserError("no record that can be simulated suffices: wider --levels, or a wider --want")
+    if json is not None:
+        write_json(document, json)
+    return document
+
+
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     """Print how long for each wish."""
+    from selfcal.base.errors import printable
+    from selfcal.base.output import console_of
+
+    if "levels" in document:
+        from selfcal.batch.design import lines_of
+
+        console = console_of(to_stderr=to_stderr(given))
+        for line in lines_of(document):
+            console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+        return 0
     if given.get("tumble"):
         from selfcal.calibration.plan import show as table
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Unpack
 
@@ -15,7 +15,10 @@ from selfcal.verbs._shared import End, Gate, Json, Logs, ModelFile, Start, to_st
 def response(
     log: Logs,
     *,
-    input: Annotated[str, option("What acts: temp, supply or an axis", "--input", metavar="CH", show_default=False)],
+    input: Annotated[
+        Sequence[str],
+        option("What acts: temp, supply or an axis; repeat for several that go together", "--input", metavar="CH"),
+    ],
     output: Annotated[str, option("The axis that answers", metavar="AXIS", show_default=False)],
     model: ModelFile = None,
     decimate: Annotated[
@@ -30,11 +33,12 @@ def response(
     gate: Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
-    """The answer of the axis `output` to the column `input`: temperature, supply or another axis.
+    """The answer of the axis `output` to the column `input`: temperature, supply or another axis. Of several, each
+    answer is beside those to the others.
 
-    Returns the document `selfcal.response/1` and writes it to `json`; `plot`: its picture. `decimate`: rate of the
-    block means, Hz; default: every sample of 20 000, means of a longer record. `start_s`, `end_s`, `gate`, `reading`:
-    as `identify` has them. Raises UserError for what the user can put right.
+    Returns the document `selfcal.response/1` and writes it to `json`; `plot`: its picture, of one input. `decimate`:
+    rate of the block means, Hz; default: every sample of 20 000, means of a longer record. `start_s`, `end_s`, `gate`,
+    `reading`: as `identify` has them. Raises UserError for what the user can put right.
     """
     from selfcal.adequacy.document import recording_entry
     from selfcal.adequacy.identify import stretch_of
@@ -46,7 +50,7 @@ def response(
         REFUSED_FROM,
         SAMPLES_MOST,
         SCHEMA,
-        answer_of,
+        answers_of,
         inputs_of,
         plot_response,
     )
@@ -58,14 +62,17 @@ def response(
         check_picture(plot)
     loaded = Model.load(model)
     recording = stretch_of(load(log, **reading), loaded, start_s, end_s, gate)
-    for asked, name in (("--input", input), ("--output", output)):
+    names = [input] if isinstance(input, str) else list(dict.fromkeys(input))
+    if plot is not None and len(names) > 1:
+        raise UserError("--plot is of one input: leave it out, or give one --input")
+    for asked, name in (*(("--input", name) for name in names), ("--output", output)):
         if name not in recording.columns:
             there = ", ".join(recording.columns)
             raise UserError(f"{recording.path}: {asked}: there is no column '{name}' (there are {there})")
-    if input == output:
-        raise UserError(f"--input and --output are both {input}: give two columns")
+    if output in names:
+        raise UserError(f"--input and --output are both {output}: give two columns")
     loaded.group_of(output)
-    axes = [name for name in (output, input) if name in loaded.axes]
+    axes = [name for name in (output, *names) if name in loaded.axes]
     rate_hz = min(recording.clock_of(name).rate_hz for name in axes)
     if decimate is None and recording.duration_s * rate_hz > SAMPLES_MOST:
         decimate = SAMPLES_MOST / recording.duration_s
@@ -77,24 +84,29 @@ def response(
         raise UserError(f"{recording.path}: more than {REFUSED_FROM:,} samples at this rate: take a lower --decimate")
     if record.axes[output].below_lattice:
         raise UserError(f"{recording.path}: {output}: {BELOW_LATTICE}")
-    inputs = inputs_of(recording, record, input)
+    inputs = {name: inputs_of(recording, record, name) for name in names}
     state = record.axes[output]
-    # The model file may state the input's influence: it is the question here.
-    state = state.refit(regressors=tuple(one for one in state.regressors if one.entry.get("column") != input))
-    answer, given = answer_of(state, inputs)
+    # The model file may state an input's influence: it is the question here.
+    state = state.refit(regressors=tuple(one for one in state.regressors if one.entry.get("column") not in names))
+    parts = [
+        {
+            "input": {
+                "column": name,
+                "unit": given.unit,
+                "reference": given.reference,
+                **({"held_s": given.held_s, "taken": given.taken} if given.taken else {}),
+            },
+            "delay_resolution_s": max(state.dt, given.held_s if given.taken == LINES else 0.0),
+            **answer,
+        }
+        for name, (answer, given) in answers_of(state, inputs).items()
+    ]
     document = {
         "schema": SCHEMA,
         "recording": recording_entry(recording),
-        "input": {
-            "column": input,
-            "unit": given.unit,
-            "reference": given.reference,
-            **({"held_s": given.held_s, "taken": given.taken} if given.taken else {}),
-        },
         "output": {"axis": output, "unit": state.unit},
         "judged_at_hz": record.rate_hz,
-        "delay_resolution_s": max(state.dt, given.held_s if given.taken == LINES else 0.0),
-        **answer,
+        **(parts[0] if len(parts) == 1 else {"inputs": parts}),
     }
     if plot is not None:
         plot_response(document, plot)
@@ -108,6 +120,7 @@ def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     from selfcal.base.ending import Held
     from selfcal.diagnosis.response import show as table
 
-    table(document, to_stderr=to_stderr(given))
+    for part in document.get("inputs", [document]):
+        table({**document, **part}, to_stderr=to_stderr(given))
     Held().check()
     return 0
