@@ -273,7 +273,11 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     for at in dict.fromkeys(places):
         f = _sharpest(weights, known[place[at]], at / padded, 0.5 / padded)
         pair = np.array([np.cos(2.0 * math.pi * f * t), np.sin(2.0 * math.pi * f * t)])
-        found = act(pair @ weights, known[place[at]])
+        own_noise = np.outer(own[place[at]], own[place[at]])
+        there = (
+            information(seen.model, seen.y, pair).mean(axis=0) * own_noise
+        )  # the spectra's ends are no ends of theirs
+        found = act(pair @ weights, there)
         yield Candidate("periodic", (f / seen.dt,), found, ln_lines(n, max(1.0, found.evidence)), pair)
 
 
