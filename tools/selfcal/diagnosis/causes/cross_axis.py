@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -52,7 +53,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
 
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
     coupling is kept: a mechanical one is below 1. Returns the axes whose model changed."""
-    changed = _own_ramps(record, found)
+    changed = [*_own_ramps(record, found), *_star(record, found)]
     pairs = {
         (name, str(finding.look.estimate["other"])): finding
         for name, one in found.items()
@@ -102,6 +103,36 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                 one.findings.remove(finding)
                 one.state = free
                 changed.append(name)
+    return changed
+
+
+def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    """Turn a leak about, where the axis that follows is the source of more axes than its own is, and the other way
+    round explains it nearly as well: one source of several axes is likelier than several. Returns the axes whose model
+    changed."""
+    changed: list[str] = []
+    followed = Counter(
+        str(finding.look.estimate["other"])
+        for one in found.values()
+        for finding in one.findings
+        if finding.look.cause == "cross_axis"
+    )
+    for name, one in found.items():
+        for finding in [each for each in one.findings if each.look.cause == "cross_axis"]:
+            other = str(finding.look.estimate["other"])
+            if followed[name] <= followed[other] or other not in found:
+                continue
+            free, source = without(one.state, other), found[other]
+            back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
+            lost = one.state.best.ln_likelihood - free.best.ln_likelihood
+            if back and back[0].net >= NET_LEAST and back[0].gain > lost - ALIKE:
+                one.findings.remove(finding)
+                one.state = free
+                after = source.state.refit(**back[0].changes)
+                source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
+                source.state = after
+                followed += Counter({name: 1, other: -1})
+                changed += [name, other]
     return changed
 
 
