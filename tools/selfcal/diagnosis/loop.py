@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from types import MappingProxyType
 
+import numpy as np
+
 from selfcal.base.ending import Stopped
-from selfcal.base.grid import regridded
+from selfcal.base.grid import regridded, runs
 from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, step, tilt
@@ -19,7 +22,7 @@ from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import work
 from selfcal.likelihood.heldout import harmful
-from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, Regressor, State
+from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, Regressor, State, interval
 from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
@@ -33,6 +36,8 @@ INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/README.md): there may be more causes"
 #: A look that predicts held-out time worse is no cause. From this worth on it is no chance either.
 UNLASTING = 2.0 * NET_LEAST
+#: Means that hold a jump: the one in which it lies, and the one beside it that may be that.
+HOLDS = 2
 #: From this finding on, a cause that is not worth telling waits until none of the others is.
 BUSY = 3
 
@@ -197,14 +202,15 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
         theta = event.theta
         if event.cause in module.JUMPS:
             theta = module.sharpened(theta, [states[name] for name in names], seen.dt)
-        looks = {name: CAUSES[event.cause].located(states[name], record, theta) for name in names}
-        looks = tilt.of_steps(looks, states)
+        own = {name: _between(states[name], event.passing, seen.dt) for name in names}
+        looks = {name: CAUSES[event.cause].located(own[name], record, theta) for name in names}
+        looks = tilt.of_steps(looks, {**states, **own})
         findings = {}
         for name, look in looks.items():
-            after = states[name].refit(**look.changes)
+            after = own[name].refit(**look.changes)
             known = replace(look, net=max(look.net, event.evidence))
-            held_out = score.gain(known, states[name], after, record, located=True)
-            findings[name] = Finding(known, 0, states[name], after, held_out=held_out, event=number)
+            held_out = score.gain(known, own[name], after, record, located=True)
+            findings[name] = Finding(known, 0, own[name], after, held_out=held_out, event=number)
         if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
             continue
         for name, finding in findings.items():
@@ -214,6 +220,16 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
     for name, one in found.items():
         one.state = states[name]
     return replace(record, axes=states)
+
+
+def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> State:
+    """The state less the samples in which a jump passes from one level to the other, known to means of `span` s. A
+    sample that is shorter than half a mean lies on one of the two, unless it takes several means."""
+    gone = np.zeros(state.y.size, bool)
+    for begin, end in passing:
+        if state.dt > 0.5 * span or end - begin > HOLDS:
+            gone[round(begin * span / state.dt) : round(end * span / state.dt)] = True
+    return integrity.masked(state, gone).refit() if gone.any() else state
 
 
 def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str, Diagnosed]) -> Record:
@@ -226,6 +242,8 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
         kept = [finding for finding in one.findings if CAUSES[finding.look.cause].of_means]
         known = one.state.extras
         extras = replace(state.extras, flicker=known.flicker, oscillation=known.oscillation)
+        left_out = np.isfinite(one.first.y) & ~np.isfinite(one.state.y)
+        state = _between(state, runs(left_out), 1.0 / one.record.rate_hz)
         columns = [
             _stretched(column, one.record, state)
             for column in one.state.regressors
@@ -233,7 +251,7 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
         ]
         if name in found:
             found[name].hidden = one.hidden
-            found[name].findings += [replace(finding, record=one.record, round=0) for finding in kept]
+            found[name].findings += [_sharper(finding, one.record, columns, state) for finding in kept]
         if not columns and extras == state.extras:
             return state
         return state.refit(regressors=(*state.regressors, *columns), extras=extras)
@@ -252,7 +270,26 @@ def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
         return replace(column, values=regridded(column.values, span, n, state.dt))
     edges = module.sharpened(times, [state], span)
     begin, end = round(edges[0] / state.dt), round(edges[1] / state.dt) if len(edges) > 1 else n
-    return replace(column, values=step.raised(n, begin, end))
+    keys = [key for key in TIMES if key in column.entry]
+    entry = {**column.entry, **dict(zip(keys, edges, strict=True))}
+    return replace(column, values=step.raised(n, begin, end), entry=entry)
+
+
+def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], state: State) -> Finding:
+    """A finding of means with the times of its jumps that the samples show, where none is left out about them."""
+    finding = replace(finding, record=means, round=0)
+    of_name = {column.name: column.entry for column in columns}
+    entry = next((of_name[own.name] for own in finding.columns if own.name in of_name), {})
+    edges = [float(entry[key]) for key in TIMES if key in entry]
+    places = np.array([round(edge / state.dt) for edge in edges], int)
+    if not edges or not np.isfinite(state.y[np.concatenate([places - 1, np.minimum(places, state.y.size - 1)])]).all():
+        return finding
+    width = state.dt / math.sqrt(12.0)
+    times = {"time_s": interval(edges[0] - 0.5 * state.dt / state.block, width, "s")}
+    if len(edges) > 1:
+        times["duration_s"] = interval(edges[1] - edges[0], math.sqrt(2.0) * width, "s")
+    estimate = {**finding.look.estimate, **times}
+    return replace(finding, look=replace(finding.look, estimate=estimate))
 
 
 def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], quick: bool = False) -> None:

@@ -48,6 +48,8 @@ LEAST, GAPS = 600, 0.3
 CERTAIN = 25.0
 #: A mean so many deviations of the noise off the median of this many is left out: a spike is no event that lasts.
 SPIKE, SPIKE_OF = 7.0, 5
+#: Means on either side of a jump that may be on neither level; the levels are those of twice as many farther off.
+PASSING = 6
 #: Events of a module at most, those of one axis among them.
 MOST = 16
 #: Candidates of a search beside which the drifts are fitted anew: those fitted without have swallowed a part of them.
@@ -87,7 +89,8 @@ Shape = tuple[str, tuple[float, ...], Array, float]
 @dataclass(frozen=True)
 class Candidate:
     """A column of a `cause` with its shape `theta`; what it is worth on the axes, `price` the ln of the number of
-    independent looks of its search. `columns` [p, n]: of means."""
+    independent looks of its search. `columns` [p, n]: of means. `passing`: from and before which means it passes from
+    one level to the other, of a jump."""
 
     cause: str
     theta: tuple[float, ...]
@@ -95,6 +98,7 @@ class Candidate:
     price: float
     columns: Array
     more: float = 0.0
+    passing: tuple[tuple[int, int], ...] = ()
 
     @property
     def evidence(self) -> float:
@@ -412,8 +416,14 @@ class Search:
             if found is None or found.evidence < least:
                 return
             if not self._is_own(found):
-                (self.several if len(found.act.axes) > 1 else self.single).append(found)
-                self.rest = self.rest - found.effect
+                named = self._passed(seen, found) if found.cause in JUMPS else found
+                if named.evidence < least:
+                    known = {k: [one for one in each if one is not found] for k, each in known.items()}
+                    continue
+                (self.several if len(named.act.axes) > 1 else self.single).append(named)
+                self.rest = self.rest - named.effect
+                for begin, end in named.passing:
+                    self.rest[:, begin:end] = np.nan
                 self.model = refitted(self.model, self.rest, self.dt)
                 seen = None
             elif found.cause in JUMPS:
@@ -423,6 +433,29 @@ class Search:
                 known |= {k: list(family(seen)) for k, family in enumerate(FAMILIES) if family in OF_JUMPS}
             else:
                 known = {k: [one for one in each if one is not found] for k, each in known.items()}
+
+    def _passed(self, seen: Seen, one: Candidate) -> Candidate:
+        """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one
+        that a jump widens takes a half for the whole."""
+        passing = []
+        for time in one.theta:
+            at = round(time / self.dt)
+            before, after, about = (
+                self.rest[:, max(0, at - high) : max(0, at - low)]
+                for low, high in ((PASSING, 3 * PASSING), (-3 * PASSING, -PASSING), (-PASSING, PASSING))
+            )
+            if min(before.shape[1], after.shape[1]) < PASSING:
+                continue
+            with np.errstate(invalid="ignore"):
+                off = [np.abs(about - np.nanmedian(level, axis=1)[:, None]) > SPIKE / 2.0 for level in (before, after)]
+            places = np.flatnonzero((off[0] & off[1])[one.act.axes].any(axis=0)) + max(0, at - PASSING)
+            if places.size:
+                slow = int(places.size > 1)  # where it begins and ends it is near a level
+                passing.append((int(places[0]) - slow, int(places[-1]) + 1 + slow))
+        rest = self.rest.copy()
+        for begin, end in passing:
+            rest[:, begin:end] = np.nan
+        return replace(beside(replace(seen, y=rest), one), passing=tuple(passing))
 
     def _is_own(self, one: Candidate) -> bool:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
@@ -464,7 +497,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     search.go(EVIDENT)
     of = None
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
-        y = y - sum(one.effect for one in search.several)
+        y = np.where(np.isfinite(search.rest), y, np.nan) - sum(one.effect for one in search.several)
         model = refitted(search.model, y, span)
         of = Hidden(tuple(found), model, y, scale, span)
     return Module(tuple(found), span, tuple(search.several), of, scale)
@@ -493,7 +526,7 @@ def sharpened(times: Sequence[float], states: Sequence[State], span: float) -> t
     if dt > 0.5 * span:
         return tuple(times)
     gain = np.sum([scan(state.series, state.best).gain for state in states], axis=0)
-    reach = round(1.5 * span / dt)
+    reach = round(3.0 * span / dt)  # two means may hold a jump
     found = []
     for time in times:
         low = max(0, round(time / dt) - reach)

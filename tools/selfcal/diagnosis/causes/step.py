@@ -113,10 +113,14 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
 
 def _look(state: State, record: Record, place: int, gain: float, worth: float, chosen: Fit) -> Look:
     n = state.y.size
+    there = np.flatnonzero(np.isfinite(state.y))
+    k = int(np.searchsorted(there, place))
+    first, last = int(there[k - 1]) + 1 if k else place, int(there[k]) if k < there.size else place
+    place, width = (first + last) // 2, (last - first + 1) * state.dt  # in a gap any place may be the one
     time = float(record.time_s[place])
     column = Regressor(f"step_{time:.6g}s", "step", raised(n, place), "1", {"kind": "step", "time_s": time})
     estimate = {
-        "time_s": mixture(np.ones(1), np.array([time - 0.5 * state.dt / state.block]), state.dt / math.sqrt(12.0), "s"),
+        "time_s": mixture(np.ones(1), np.array([time - 0.5 * state.dt / state.block]), width / math.sqrt(12.0), "s"),
         "amplitude": mixture(np.ones(1), chosen.c[-1:], chosen.sd[-1:], state.unit),
     }
     changes = {"regressors": (*state.regressors, column)}
