@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -77,6 +77,7 @@ def diagnose_record(
             found[name] = Diagnosed(spoilt.get(name, states[name]), states[name], record, unfinished=INTERRUPTED)
     record = _integrity(record, found, handled)
     record = _of_means(record, found, means) if means else _together(record, found, advance)
+    record = _fast(record, found)
 
     def walk(name: str) -> None:
         one, spent = found[name], ""
@@ -203,23 +204,41 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
         if event.cause in module.JUMPS:
             theta = module.sharpened(theta, [states[name] for name in names], seen.dt)
         own = {name: _between(states[name], event.passing, seen.dt) for name in names}
-        looks = {name: CAUSES[event.cause].located(own[name], record, theta) for name in names}
-        looks = tilt.of_steps(looks, {**states, **own})
-        findings = {}
-        for name, look in looks.items():
-            after = own[name].refit(**look.changes)
-            known = replace(look, net=max(look.net, event.evidence))
-            held_out = score.gain(known, own[name], after, record, located=True)
-            findings[name] = Finding(known, 0, own[name], after, held_out=held_out, event=number)
-        if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
-            continue
-        for name, finding in findings.items():
-            states[name] = finding.after
-            if name in found:
-                found[name].findings.append(finding)
+        _give(record, found, states, own, Event(number, event.cause, theta, event.evidence))
     for name, one in found.items():
         one.state = states[name]
     return replace(record, axes=states)
+
+
+@dataclass(frozen=True)
+class Event:
+    """What several axes have in common: its `number` in the module, and what it is worth, nats."""
+
+    number: int
+    cause: str
+    theta: Sequence[float]
+    evidence: float
+
+
+def _give(
+    record: Record, found: Mapping[str, Diagnosed], states: dict[str, State], own: Mapping[str, State], event: Event
+) -> None:
+    """Put an event into the models of the axes that have it, from their `own` states on, unless it predicts held-out
+    time worse on all."""
+    looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
+    looks = tilt.of_steps(looks, {**states, **own})
+    findings = {}
+    for name, look in looks.items():
+        after = own[name].refit(**look.changes)
+        known = replace(look, net=max(look.net, event.evidence))
+        held_out = score.gain(known, own[name], after, record, located=True)
+        findings[name] = Finding(known, 0, own[name], after, held_out=held_out, event=event.number)
+    if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
+        return
+    for name, finding in findings.items():
+        states[name] = finding.after
+        if name in found:
+            found[name].findings.append(finding)
 
 
 def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> State:
@@ -230,6 +249,17 @@ def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> S
         if state.dt > 0.5 * span or end - begin > HOLDS:
             gone[round(begin * span / state.dt) : round(end * span / state.dt)] = True
     return integrity.masked(state, gone).refit() if gone.any() else state
+
+
+def _fast(record: Record, found: Mapping[str, Diagnosed]) -> Record:
+    """What acts on several axes faster than means show."""
+    states = dict(record.axes)
+    for number, line in enumerate(module.fast_lines(states, 0.5 / module.MEANS_S), 1 + module.MOST):
+        own = {name: states[name] for name in line.names}
+        _give(record, found, states, own, Event(number, line.cause, line.theta, line.evidence))
+    for name, one in found.items():
+        one.state = states[name]
+    return replace(record, axes=states)
 
 
 def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str, Diagnosed]) -> Record:

@@ -23,7 +23,9 @@ from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SLOW, LN_SMOOTHINGS, LONGEST_LAG
 from selfcal.diagnosis.hidden import Hidden, weighed
+from selfcal.likelihood import work
 from selfcal.likelihood.joint import (
+    CLEAR_LINE,
     Act,
     Course,
     Joint,
@@ -58,6 +60,8 @@ REFITTED = 3
 NEAR = 30
 #: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
 PLACES = 4
+#: Lines above the means' band that are looked at.
+FAST_LINES = 6
 #: Samples at each end in which no step is looked for, and of a pulse at least.
 EDGE, SHORTEST = 4, 4
 #: Share of the information of a step far from the ends, from which on two of them are taken as there.
@@ -283,6 +287,52 @@ def lines(seen: Seen) -> Iterator[Candidate]:
         )  # the spectra's ends are no ends of theirs
         found = act(pair @ weights, there)
         yield Candidate("periodic", (f / seen.dt,), found, ln_lines(n, max(1.0, found.evidence)), pair)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line of several axes `names`, of theta Hz."""
+
+    names: tuple[str, ...]
+    theta: tuple[float]
+    evidence: float
+    cause: str = "periodic"
+
+
+def fast_lines(states: Mapping[str, State], above_hz: float) -> list[Line]:
+    """Lines of several axes above a frequency: means do not show them. They are looked for in the innovations of every
+    sample, over the level of their neighbours. One that an axis shows beyond doubt is left to it."""
+    names = [name for name, state in states.items() if not state.below_lattice]
+    sizes_of = {states[name].y.size for name in names}
+    if len(names) < 2 or len(sizes_of) > 1:
+        return []
+    n, dt = sizes_of.pop(), states[names[0]].dt
+    w = np.array([np.nan_to_num(states[name].whitened) for name in names])
+    work.count(n, 2 * len(names))
+    inverse = np.linalg.inv(np.corrcoef(w))
+    padded = 2 * next_fast_len(n, real=True)
+    power = rfft(w, padded, axis=1).astype(np.complex64)
+    own = np.abs(power) ** 2 / n
+    own = np.maximum(uniform_filter1d(np.minimum(own, 4.0), 4 * BESIDE + 1, axis=1, mode="reflect"), 0.5)
+    power /= np.sqrt(own)
+    gain = (power.conj() * (inverse.astype(np.float32) @ power)).sum(axis=0).real / n
+    gain[(np.abs(power) ** 2).max(axis=0) > CLEAR_LINE * n] = 0.0
+    gain[: 1 + int(above_hz * padded * dt)] = gain[-4:] = 0.0
+    found = []
+    for _ in range(FAST_LINES):
+        at = int(np.argmax(gain))
+        if gain[at] < ln_lines(n, 1.0) or not 0 < at < gain.size - 1:
+            break
+        left, top, right = (float(value) for value in gain[at - 1 : at + 2])
+        turn = (at + 0.5 * (left - right) / min(left + right - 2.0 * top, -1e-9)) / padded
+        wave = np.exp(2j * math.pi * np.mod(turn * np.arange(n), 1.0))
+        score = (w @ wave / np.sqrt(own[:, at])) @ inverse
+        one = act(np.array([score.real, score.imag]), 0.5 * n * inverse)
+        evidence = one.evidence - ln_lines(n, max(1.0, one.evidence))
+        if evidence >= EVIDENT and len(one.axes) > 1:
+            found.append(Line(tuple(names[k] for k in one.axes), (turn / dt,), evidence))
+        gain[max(0, at - 8) : at + 9] = 0.0
+    return found
 
 
 def _sharpest(weights: Array, known: Array, f: float, reach: float) -> float:
