@@ -23,6 +23,7 @@ from selfcal.likelihood.state import Look, State, interval, log_normal
 from selfcal.logs.recording import load, save
 from selfcal.show import identification
 from selfcal.show.findings import show
+from selfcal.verbs import identify as identify_verb
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 
@@ -274,6 +275,17 @@ def test_identify_tells_an_event_in_one_line() -> None:
         "not adequate: ax: allan_8s model -21 %, 16s +7 %",
         "not adequate: statistics of gx, gy (allan_4s model +40 %) as well",
     ]
+
+
+def test_what_is_left_out_is_suspected_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Motion is left out and has its line. The suspicion is what is left: a look, or a test of the other readings."""
+    motion = {"value": 0.01, "passed": False}
+    document = {"axes": {name: {"checks": {"motion": motion}} for name in ("gx", "gy", "gz")}}
+    document["axes"]["gy"]["checks"] |= {"saturation": motion}
+    look = Look("pulse", 30.0, 20.0, {}, {})
+    monkeypatch.setattr("selfcal.diagnosis.suspicion.suspicions", lambda *_: {"gx": look})
+    identify_verb._suspect(document, cast(Any, None), cast(Any, None), ["gx", "gy", "gz"])
+    assert [axis.get("suspicion") for axis in document["axes"].values()] == ["pulse", "saturation", None]
 
 
 def test_a_noisy_axis_is_told_beside_its_siblings() -> None:

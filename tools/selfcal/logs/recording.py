@@ -80,6 +80,10 @@ def load(
     if isinstance(path, Recording):
         return path
     rate = _rate(rate if rate_hz is None else rate_hz)
+    if not isinstance(units, str | Mapping | None):
+        raise UserError(
+            f"units={units!r}: one text for all axes, or by name, as units={{'gyro': 'deg/s', 'accel': 'g'}}"
+        )
     columns, units, tables = columns or {}, units or {}, None
     paths = list_of(path)
     if not paths and not arrays.in_memory(path):

@@ -22,6 +22,9 @@ if TYPE_CHECKING:
 #: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
 LARGEST_OVERBOUND = 0.99999
 
+#: Checks whose readings are left out already: what is left is judged, and suspected.
+LEFT_OUT = {"motion"}
+
 
 @shared.on_a_line
 def identify(
@@ -150,10 +153,10 @@ def identify(
         with_reasons(identified, recording, loaded_model)
         document = to_document(recording, identified, all_failed=json if fail_on is not None else None)
         add_sources(document, of_file, loaded_model)
-        doubtful = [  # motion is left out already: what is left is judged
+        doubtful = [
             name
             for name, axis in identified.items()
-            if isinstance(axis, Identified) and against(axis.judged.checks).keys() - {"motion"}
+            if isinstance(axis, Identified) and against(axis.judged.checks).keys() - LEFT_OUT
         ]
         if doubtful and suspicion:
             from selfcal.diagnosis.suspicion import weigh_more_laws, with_added_laws
@@ -179,8 +182,8 @@ def identify(
 
 
 def _suspect(document: dict[str, Any], recording: Recording, model: Model, names: Sequence[str]) -> dict[str, Look]:
-    """Name the strongest suspicion of each axis in the document: a test of the readings, else the look that explains
-    most. The looks by axis."""
+    """Name the strongest suspicion of each axis in the document: a test of the readings that are not left out, else the
+    look that explains most. The looks by axis."""
     from selfcal.diagnosis.suspicion import suspicions
     from selfcal.readings.tests import TESTS
 
@@ -188,7 +191,7 @@ def _suspect(document: dict[str, Any], recording: Recording, model: Model, names
     for name in names:
         axis = document["axes"][name]
         causes = [suspected[name].cause] if name in suspected else []
-        causes += [test.name for test in TESTS if test.name in axis["checks"]]
+        causes += [test.name for test in TESTS if test.name in axis["checks"].keys() - LEFT_OUT]
         axis |= {"suspicion": causes[-1]} if causes else {}
     return suspected
 
