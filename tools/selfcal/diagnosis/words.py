@@ -237,8 +237,10 @@ def _sure(coefficient: Mapping[str, Any] | None) -> bool:
 
 def small(findings: Sequence[Mapping[str, Any]]) -> str:
     """One line on the findings that matter little: they move no number by more than it is known."""
-    count, none = (f"{len(findings)} small findings", "none moves") if len(findings) > 1 else ("1 small finding", "not")
+    several = len(findings) > 1
+    count = f"{len(findings)} small findings" if several else "1 small finding"
     causes = ", ".join(dict.fromkeys(str(one["cause"]).replace("_", " ") for one in findings))
+    none = "none moves" if several else "it moves none of"
     return f"{count} ({causes}): {none} N, K, B or the bias by more than half of its interval"
 
 
