@@ -143,6 +143,15 @@ def test_a_temperature_is_known_by_its_name_and_unit(heading: str) -> None:
     assert recording.columns["temp"].values[4] == 304.0
 
 
+def test_what_is_no_keyword_has_one_line() -> None:
+    """A word that is nearly one, and a list where a name or a mapping stands."""
+    readings = np.random.default_rng(0).standard_normal((800, 3))
+    with pytest.raises(UserError, match="no keyword colums: columns"):
+        selfcal.identify(readings, rate_hz=25.0, colums={"gx": "x"})
+    with pytest.raises(UserError, match="one text for all axes, or by name"):
+        selfcal.identify(readings, rate_hz=25.0, units=["rad/s", "g"])
+
+
 @pytest.mark.parametrize(
     ("typed", "meant"),
     [

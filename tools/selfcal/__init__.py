@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Callable
+from difflib import get_close_matches
 from functools import wraps
 from importlib import import_module
 from importlib.util import find_spec
@@ -93,6 +94,11 @@ def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*arguments: Any, **options: Any) -> Any:
         from selfcal.base.errors import UserError, in_python
 
+        known: Any = getattr(call, "__signature__", None)
+        for name in options if known is not None else ():
+            if name not in known.parameters:
+                near = get_close_matches(name, list(known.parameters), 1)
+                raise UserError(f"{function.__name__}() has no keyword {name}" + "".join(f": {one}?" for one in near))
         try:
             return function(*arguments, **options)
         except UserError as error:
