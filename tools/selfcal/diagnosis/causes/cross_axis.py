@@ -95,9 +95,9 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         for finding in [each for each in one.findings if each.look.cause == "cross_axis"]:
             other = str(finding.look.estimate["other"])
             source = found[other].state if other in found else record.axes[other]
-            if not source.regressors:
+            if all(column.cause == "cross_axis" for column in source.regressors):
                 continue
-            free = without(one.state, other)
+            source, free = without(source, name), without(one.state, other)
             rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
             if not any(look.net >= NET_LEAST for look in rest):
                 one.findings.remove(finding)
