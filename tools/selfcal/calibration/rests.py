@@ -95,11 +95,14 @@ class Tumble:
 
 @dataclass(frozen=True)
 class _Log:
-    """A log on the clock of its fastest axes: its columns in the units used here and the rows of its rests."""
+    """A log on the clock of its fastest axes: its columns in the units used here, the step of the lattice of each (0:
+    none), its temperature, degC, NaN without one, and the rows of its rests."""
 
     recording: Recording
     begin_s: float
     own: dict[str, Array]
+    steps: dict[str, float]
+    temp: Array
     rests: tuple[slice, ...]
 
 
@@ -123,7 +126,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
         end = -1  # the row behind the rest before, if that one counts
         for rows in log.rests:
             rest = _rest(k, log, rows)
-            if reason := _clipped_at_rest(log.own, rows, ranges, typical):
+            if reason := _clipped_at_rest(log, rows, ranges, typical):
                 where = f"{recordings[k].path}, " if len(logs) > 1 else ""
                 left_out.append(f"rest of {where}{rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s: {reason}")
                 end = -1
@@ -145,6 +148,9 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
     kinds = [names for names in (ACCEL, GYRO) if names[0] in axes]
     recording = whole.along(*max(kinds, key=lambda names: whole.clock_of(names[0]).rate_hz))
     own = {name: recording.in_unit(name, UNITS[name]) for name in axes}
+    steps = {name: step_of(values[np.isfinite(values)])[0] for name, values in own.items()}
+    has_temp = "temp" in recording.columns
+    temp = recording.in_unit("temp", "degC") if has_temp else np.full(recording.samples, math.nan)
     found = rest_of(recording, axes)
     time = recording.time_s + recording.start_s
     still = found.still or ((float(time[0]), float(time[-1])),)
@@ -155,7 +161,7 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
         if end - begin >= LEAST_S and behind - first > 2:
             rests.append(slice(first, behind))
-    return _Log(recording, begin_s, own, tuple(rests))
+    return _Log(recording, begin_s, own, steps, temp, tuple(rests))
 
 
 def _noise(logs: Sequence[_Log], name: str, model: Model, *, part_stated: bool) -> Noise:
@@ -216,11 +222,10 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
 
     rounded = []
     for name in ACCEL + GYRO:
-        step = step_of(own[name][np.isfinite(own[name])])[0] if name in own else 0.0
+        step = log.steps.get(name, 0.0)
         scatter = float(np.nanvar(own[name][rows])) if name in own else 0.0
         rounded.append(rounding(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
     begin, end = float(time[rows.start]), float(time[rows.stop - 1]) + 1.0 / recording.rate_hz
-    temp = recording.in_unit("temp", "degC")[rows] if "temp" in recording.columns else np.full(1, math.nan)
     return Rest(
         number,
         (begin + recording.start_s, end + recording.start_s),
@@ -229,18 +234,18 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
         (rows.stop - rows.start) / recording.rate_hz,
         means(ACCEL, rows),
         means(GYRO, rows),
-        float(np.mean(temp)),
+        float(np.mean(log.temp[rows])),
         np.array(rounded),
         means(ACCEL, slice(half, rows.stop)) - means(ACCEL, slice(rows.start, half)),
     )
 
 
-def _clipped_at_rest(own: dict[str, Array], rows: slice, ranges: dict[str, float], typical: dict[str, float]) -> str:
+def _clipped_at_rest(log: _Log, rows: slice, ranges: dict[str, float], typical: dict[str, float]) -> str:
     """Why a rest does not count: an axis at its range, or without the scatter that it has in the other rests."""
     for name in ACCEL:
-        part = own[name][rows]
-        step = step_of(own[name][np.isfinite(own[name])])[0]
-        if abs(float(np.nanmean(part))) >= ranges[name] or (typical[name] > 0.5 * step and not np.nanstd(part) > 0.0):
+        part = log.own[name][rows]
+        stuck = typical[name] > 0.5 * log.steps[name] and not np.nanstd(part) > 0.0
+        if stuck or abs(float(np.nanmean(part))) >= ranges[name]:
             return f"{name} is clipped at {part[0]:.6g} m/s^2"
     return ""
 
@@ -254,16 +259,14 @@ def _turn(log: _Log, begin: int, end: int, rest: int, ranges: dict[str, float]) 
         part = own[name][rows]
         if not np.isfinite(part).all():
             reason = reason or f"samples of {name} are missing in it"
-        elif np.abs(part).max() >= ranges[name] or _flat(part, own[name]):
+        elif np.abs(part).max() >= ranges[name] or _flat(part, own[name], log.steps[name]):
             reason = reason or f"{name} clips in it"
     accel, gyro = (np.column_stack([own[name][rows] for name in names]) for names in (ACCEL, GYRO))
-    temp = recording.in_unit("temp", "degC")[rows] if "temp" in recording.columns else np.full(1, math.nan)
-    return Turn(rest, 1.0 / recording.rate_hz, accel, gyro, float(np.mean(temp)), reason)
+    return Turn(rest, 1.0 / recording.rate_hz, accel, gyro, float(np.mean(log.temp[rows])), reason)
 
 
-def _flat(part: Array, values: Array) -> bool:
+def _flat(part: Array, values: Array, step: float) -> bool:
     """Whether readings of a turn [n] stop at the record's extreme: equal there, and the readings beside far off."""
-    step = step_of(values[np.isfinite(values)])[0]
     for extreme in (float(np.nanmax(values)), float(np.nanmin(values))):
         for first, behind in runs(part == extreme):
             beside = part[[max(first - 1, 0), min(behind, part.size - 1)]]
