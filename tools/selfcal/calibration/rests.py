@@ -105,6 +105,10 @@ class _Log:
     temp: Array
     rests: tuple[slice, ...]
 
+    def seconds(self, rows: slice) -> float:
+        """Seconds of readings in rows."""
+        return float(rows.stop - rows.start) / self.recording.rate_hz
+
 
 def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: bool) -> Tumble:
     """Rests and turns of logs in order of time. `part_stated`: the model is the part's own, and so is its range.
@@ -135,7 +139,8 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
                 turns.append(_turn(log, end, rows.start, len(rests) - 1, ranges))
             rests.append(rest)
             end = rows.stop
-    noise = {name: _noise(logs, name, model, part_stated=part_stated) for name in axes}
+    long_rest = None if part_stated else _long_rest(logs)
+    noise = {name: _noise(logs, name, model, long_rest) for name in axes}
     return Tumble(tuple(rests), tuple(turns), noise, tuple(left_out), tuple(notes))
 
 
@@ -164,25 +169,27 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
     return _Log(recording, begin_s, own, steps, temp, tuple(rests))
 
 
-def _noise(logs: Sequence[_Log], name: str, model: Model, *, part_stated: bool) -> Noise:
-    """White noise and drift of an axis: of the part's own model, of a long rest, or of a prior about the noise that the
-    rests show."""
+def _long_rest(logs: Sequence[_Log]) -> Recording | None:
+    """The longest rest, if it identifies the law of the part."""
+    long = [(log, rows) for log in logs for rows in log.rests if log.seconds(rows) >= LONG_S]
+    if not long:
+        return None
+    log, rows = max(long, key=lambda one: one[0].seconds(one[1]))
+    kept = np.zeros(log.recording.samples, bool)
+    kept[rows] = True
+    return log.recording.with_rows(kept)
+
+
+def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording | None) -> Noise:
+    """White noise and drift of an axis: of a long rest, or of the model about the noise that the rests show. A model of
+    the part itself needs no long rest."""
+    if long_rest is not None and (found := of_rest(long_rest, name, model, UNITS[name])) is not None:
+        return found
     pieces = []
-    longest: tuple[float, Recording, slice] | None = None
     for log in logs:
         size = max(1, round(PIECE_S * log.recording.rate_hz))
         pieces += [block_means(log.own[name][rows], size) for rows in log.rests]
-        for rows in log.rests:
-            seconds = (rows.stop - rows.start) / log.recording.rate_hz
-            if seconds >= LONG_S and (longest is None or seconds > longest[0]):
-                longest = seconds, log.recording, rows
     white = measured(pieces, PIECE_S)
-    if not part_stated and longest is not None:
-        _, recording, rows = longest
-        kept = np.zeros(recording.samples, bool)
-        kept[rows] = True
-        if (found := of_rest(recording.with_rows(kept), name, model, UNITS[name])) is not None:
-            return found
     return of_model(model, name, UNITS[name], None if white is None else math.sqrt(white))
 
 
@@ -231,7 +238,7 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
         (begin + recording.start_s, end + recording.start_s),
         log.begin_s + begin,
         log.begin_s + end,
-        (rows.stop - rows.start) / recording.rate_hz,
+        log.seconds(rows),
         means(ACCEL, rows),
         means(GYRO, rows),
         float(np.mean(log.temp[rows])),
