@@ -197,7 +197,7 @@ def _innovations(seed: int, sizes: tuple[float, ...]) -> dict[str, Any]:
 
 def test_a_line_that_means_do_not_show_is_of_all_its_axes() -> None:
     """13 nats on each of three axes of four; means of 1 s hold a line of 2.81 Hz below a ninth."""
-    named = [module.fast_lines(_innovations(seed, (13.0, 13.0, 0.0, 13.0)), 0.5) for seed in range(12)]
+    named = [module.fast_lines(_innovations(seed, (13.0, 13.0, 0.0, 13.0))) for seed in range(12)]
     assert all(len(each) == 1 for each in named)
     assert all(abs(each[0].theta[0] - 2.81) < 1.0 / 800.0 for each in named)
     # A draw of 13 expected nats lies below 4 in 3 of 100, and an axis without it shows 2 in 13.
@@ -206,7 +206,7 @@ def test_a_line_that_means_do_not_show_is_of_all_its_axes() -> None:
 
 def test_noise_has_no_such_line() -> None:
     """A Bayes factor of EVIDENT nats in 1 of 100 records at most: 3 of 60 have a probability of 0.02."""
-    assert sum(bool(module.fast_lines(_innovations(seed, (0.0,) * 6), 0.5)) for seed in range(60)) < 3
+    assert sum(bool(module.fast_lines(_innovations(seed, (0.0,) * 6))) for seed in range(60)) < 3
 
 
 def _gained(finding: Finding) -> float:

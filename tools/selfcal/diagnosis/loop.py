@@ -6,7 +6,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from types import MappingProxyType
 
 import numpy as np
@@ -198,33 +198,33 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
                 found[name].hidden = seen.hidden
             if on.probability >= 0.5:
                 states[name] = states[name].refit(regressors=(*states[name].regressors, on.column))
-    for number, event in enumerate(seen.events, 1):
-        names = [seen.names[k] for k in event.act.axes]
-        theta = event.theta
+    for number, candidate in enumerate(seen.events, 1):
+        event = candidate.of(seen.names)
         if event.cause in module.JUMPS:
-            theta = module.sharpened(theta, [states[name] for name in names], seen.dt)
-        own = {name: _between(states[name], event.passing, seen.dt) for name in names}
-        _give(record, found, states, own, Event(number, event.cause, theta, event.evidence))
+            times = module.sharpened(event.theta, [states[name] for name in event.names], seen.dt)
+            event = replace(event, theta=times)
+        _give(record, found, states, event, number, seen.dt)
+    return _with(record, found, states)
+
+
+def _with(record: Record, found: Mapping[str, Diagnosed], states: Mapping[str, State]) -> Record:
+    """The record with new states of its axes, which those in `found` take."""
     for name, one in found.items():
         one.state = states[name]
     return replace(record, axes=states)
 
 
-@dataclass(frozen=True)
-class Event:
-    """What several axes have in common: its `number` in the module, and what it is worth, nats."""
-
-    number: int
-    cause: str
-    theta: Sequence[float]
-    evidence: float
-
-
 def _give(
-    record: Record, found: Mapping[str, Diagnosed], states: dict[str, State], own: Mapping[str, State], event: Event
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    states: dict[str, State],
+    event: module.Event,
+    number: int,
+    span: float,
 ) -> None:
-    """Put an event into the models of the axes that have it, from their `own` states on, unless it predicts held-out
-    time worse on all."""
+    """Put an event into the models of the axes that have it, unless it predicts held-out time worse on all. `number`:
+    of the event in the module; `span`: of the means that show it, s."""
+    own = {name: _between(states[name], event.passing, span) for name in event.names}
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     looks = tilt.of_steps(looks, {**states, **own})
     findings = {}
@@ -232,7 +232,7 @@ def _give(
         after = own[name].refit(**look.changes)
         known = replace(look, net=max(look.net, event.evidence))
         held_out = score.gain(known, own[name], after, record, located=True)
-        findings[name] = Finding(known, 0, own[name], after, held_out=held_out, event=event.number)
+        findings[name] = Finding(known, 0, own[name], after, held_out=held_out, event=number)
     if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
         return
     for name, finding in findings.items():
@@ -254,12 +254,9 @@ def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> S
 def _fast(record: Record, found: Mapping[str, Diagnosed]) -> Record:
     """What acts on several axes faster than means show."""
     states = dict(record.axes)
-    for number, line in enumerate(module.fast_lines(states, 0.5 / module.MEANS_S), 1 + module.MOST):
-        own = {name: states[name] for name in line.names}
-        _give(record, found, states, own, Event(number, line.cause, line.theta, line.evidence))
-    for name, one in found.items():
-        one.state = states[name]
-    return replace(record, axes=states)
+    for number, line in enumerate(module.fast_lines(states), 1 + module.MOST):
+        _give(record, found, states, line, number, module.MEANS_S)
+    return _with(record, found, states)
 
 
 def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str, Diagnosed]) -> Record:
@@ -286,22 +283,18 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
             return state
         return state.refit(regressors=(*state.regressors, *columns), extras=extras)
 
-    states = dict(zip(record.axes, work.each(taken_over, record.axes), strict=True))
-    for name, one in found.items():
-        one.state = states[name]
-    return replace(record, axes=states)
+    return _with(record, found, dict(zip(record.axes, work.each(taken_over, record.axes), strict=True)))
 
 
 def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
     """A column of means on the grid of a state. The edges of an event are moved to where the samples have them."""
     n, span = state.y.size, 1.0 / means.rate_hz
-    times = [float(column.entry[key]) for key in TIMES if key in column.entry]
+    times = {key: float(column.entry[key]) for key in TIMES if key in column.entry}
     if not times:
         return replace(column, values=regridded(column.values, span, n, state.dt))
-    edges = module.sharpened(times, [state], span)
+    edges = module.sharpened([*times.values()], [state], span)
     begin, end = round(edges[0] / state.dt), round(edges[1] / state.dt) if len(edges) > 1 else n
-    keys = [key for key in TIMES if key in column.entry]
-    entry = {**column.entry, **dict(zip(keys, edges, strict=True))}
+    entry = {**column.entry, **dict(zip(times, edges, strict=True))}
     return replace(column, values=step.raised(n, begin, end), entry=entry)
 
 

@@ -91,6 +91,18 @@ Shape = tuple[str, tuple[float, ...], Array, float]
 
 
 @dataclass(frozen=True)
+class Event:
+    """What the axes `names` have in common, of the shape `theta`, and what it is worth, nats. `passing`: from and
+    before which means it passes from one level to the other."""
+
+    names: tuple[str, ...]
+    cause: str
+    theta: tuple[float, ...]
+    evidence: float
+    passing: tuple[tuple[int, int], ...] = ()
+
+
+@dataclass(frozen=True)
 class Candidate:
     """A column of a `cause` with its shape `theta`; what it is worth on the axes, `price` the ln of the number of
     independent looks of its search. `columns` [p, n]: of means. `passing`: from and before which means it passes from
@@ -113,6 +125,11 @@ class Candidate:
     def effect(self) -> Array:
         """[m, n]: what it adds to each axis."""
         return np.asarray(self.act.size.T @ self.columns)
+
+    def of(self, names: Sequence[str]) -> Event:
+        """As an event of the axes `names` that have it."""
+        held = tuple(names[k] for k in self.act.axes)
+        return Event(held, self.cause, self.theta, self.evidence, self.passing)
 
     def share_of(self, loading: Array) -> float:
         """Share of its information that one size of a quantity with these loadings explains."""
@@ -261,9 +278,7 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     turn = 2.0 * math.pi * np.maximum(np.arange(U.shape[0]), 1) / n
     level = seen.model.precision(turn) * (2.0 - 2.0 * np.cos(turn))[:, None, None]
     ratio = np.abs(U) ** 2 / n / np.maximum(np.diagonal(level, axis1=1, axis2=2), 1e-300)
-    ratio = np.minimum(ratio, 4.0)
-    beside = max(4, min(BESIDE, U.shape[0] // 8))
-    own = np.sqrt(np.maximum(uniform_filter1d(ratio, 2 * beside + 1, axis=0, mode="reflect"), 0.5))
+    own = np.sqrt(_level(ratio, max(4, min(BESIDE, U.shape[0] // 8)), 0))
     known = 0.5 * n * level * own[:, :, None] * own[:, None, :]
     low = max(1, math.ceil(TURNS_LEAST))
     hz = np.arange(U.shape[0])
@@ -281,43 +296,39 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     for at in dict.fromkeys(places):
         f = _sharpest(weights, known[place[at]], at / padded, 0.5 / padded)
         pair = np.array([np.cos(2.0 * math.pi * f * t), np.sin(2.0 * math.pi * f * t)])
-        own_noise = np.outer(own[place[at]], own[place[at]])
-        there = (
-            information(seen.model, seen.y, pair).mean(axis=0) * own_noise
-        )  # the spectra's ends are no ends of theirs
+        # Of few turns: the record ends, and a spectrum does not.
+        there = information(seen.model, seen.y, pair).mean(axis=0) * np.outer(own[place[at]], own[place[at]])
         found = act(pair @ weights, there)
         yield Candidate("periodic", (f / seen.dt,), found, ln_lines(n, max(1.0, found.evidence)), pair)
 
 
-@dataclass(frozen=True)
-class Line:
-    """A line of several axes `names`, of theta Hz."""
-
-    names: tuple[str, ...]
-    theta: tuple[float]
-    evidence: float
-    cause: str = "periodic"
+def _level(ratio: Array, beside: int, axis: int) -> Array:
+    """How much louder or quieter than expected the bins of spectra are, by so many on either side along an axis. A line
+    among them counts as little."""
+    found: Array = uniform_filter1d(np.minimum(ratio, 4.0), 2 * beside + 1, axis=axis, mode="reflect")
+    return np.maximum(found, 0.5)
 
 
-def fast_lines(states: Mapping[str, State], above_hz: float) -> list[Line]:
-    """Lines of several axes above a frequency: means do not show them. They are looked for in the innovations of every
-    sample, over the level of their neighbours. One that an axis shows beyond doubt is left to it."""
+def fast_lines(states: Mapping[str, State]) -> list[Event]:
+    """Lines of several axes above the band of means. They are looked for in the innovations of every sample, over the
+    level of their neighbours. One that an axis shows beyond doubt is left to it."""
     names = [name for name, state in states.items() if not state.below_lattice]
-    sizes_of = {states[name].y.size for name in names}
-    if len(names) < 2 or len(sizes_of) > 1:
+    grids = {(states[name].y.size, states[name].dt) for name in names}
+    if len(names) < 2 or len(grids) > 1:
         return []
-    n, dt = sizes_of.pop(), states[names[0]].dt
+    ((n, dt),) = grids
+    if dt >= MEANS_S:
+        return []
     w = np.array([np.nan_to_num(states[name].whitened) for name in names])
     work.count(n, 2 * len(names))
     inverse = np.linalg.inv(np.corrcoef(w))
     padded = 2 * next_fast_len(n, real=True)
     power = rfft(w, padded, axis=1).astype(np.complex64)
-    own = np.abs(power) ** 2 / n
-    own = np.maximum(uniform_filter1d(np.minimum(own, 4.0), 4 * BESIDE + 1, axis=1, mode="reflect"), 0.5)
+    own = _level(np.abs(power) ** 2 / n, 2 * BESIDE, 1)
     power /= np.sqrt(own)
     gain = (power.conj() * (inverse.astype(np.float32) @ power)).sum(axis=0).real / n
     gain[(np.abs(power) ** 2).max(axis=0) > CLEAR_LINE * n] = 0.0
-    gain[: 1 + int(above_hz * padded * dt)] = gain[-4:] = 0.0
+    gain[: 1 + int(0.5 / MEANS_S * padded * dt)] = gain[-4:] = 0.0
     found = []
     for _ in range(FAST_LINES):
         at = int(np.argmax(gain))
@@ -330,7 +341,7 @@ def fast_lines(states: Mapping[str, State], above_hz: float) -> list[Line]:
         one = act(np.array([score.real, score.imag]), 0.5 * n * inverse)
         evidence = one.evidence - ln_lines(n, max(1.0, one.evidence))
         if evidence >= EVIDENT and len(one.axes) > 1:
-            found.append(Line(tuple(names[k] for k in one.axes), (turn / dt,), evidence))
+            found.append(Event(tuple(names[k] for k in one.axes), "periodic", (turn / dt,), evidence))
         gain[max(0, at - 8) : at + 9] = 0.0
     return found
 
@@ -420,6 +431,32 @@ def beside(seen: Seen, one: Candidate) -> Candidate:
     return replace(one, act=act(one.columns @ found.weights, known), more=less)
 
 
+def between_levels(seen: Seen, one: Candidate) -> Candidate:
+    """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one that a
+    jump widens takes a half for the whole."""
+    passing = []
+    for time in one.theta:
+        at = round(time / seen.dt)
+        before, after, about = (
+            seen.y[:, max(0, at - high) : max(0, at - low)]
+            for low, high in ((PASSING, 3 * PASSING), (-3 * PASSING, -PASSING), (-PASSING, PASSING))
+        )
+        if min(before.shape[1], after.shape[1]) < PASSING:
+            continue
+        with np.errstate(invalid="ignore"):
+            off = [np.abs(about - np.nanmedian(level, axis=1)[:, None]) > SPIKE / 2.0 for level in (before, after)]
+        places = np.flatnonzero((off[0] & off[1])[one.act.axes].any(axis=0)) + max(0, at - PASSING)
+        if places.size:
+            slow = int(places.size > 1)  # where it begins and ends it is near a level
+            passing.append((int(places[0]) - slow, int(places[-1]) + 1 + slow))
+    if not passing:
+        return beside(seen, one)
+    y = seen.y.copy()
+    for begin, end in passing:
+        y[:, begin:end] = np.nan
+    return replace(beside(replace(seen, y=y), one), passing=tuple(passing))
+
+
 #: The searches, each with the columns that it looks for.
 FAMILIES: tuple[Callable[[Seen], Iterator[Candidate]], ...] = (steps, pulses, lines, transients, channels)
 OF_JUMPS = (steps, pulses)
@@ -436,10 +473,9 @@ def _best_of(found: Iterable[Candidate]) -> Candidate | None:
 
 @dataclass
 class Search:
-    """What was found so far in records `y` [m, n]: candidates of `several` axes, and those of one, which are left to
-    it; `rest` [m, n] less all of them, and the `model` of that."""
+    """What was found so far: candidates of `several` axes, and those of one, which are left to it; the records less all
+    of them, `rest` [m, n], and the `model` of that."""
 
-    y: Array
     dt: float
     channels: Mapping[str, Array]
     kept_out: Mask
@@ -452,7 +488,7 @@ class Search:
     def go(self, least: float) -> None:
         """Look until nothing is worth `least`, nats. A candidate with the pattern of the quantity in the model is that
         one's own."""
-        passed = np.zeros(self.y.shape[1], bool)
+        passed = np.zeros(self.rest.shape[1], bool)
         seen: Seen | None = None
         known: dict[int, list[Candidate]] = {}
         for _ in range(MOST - len(self.several) - len(self.single)):
@@ -460,52 +496,31 @@ class Search:
                 seen = Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s, passed)
                 known = {k: list(family(seen)) for k, family in enumerate(FAMILIES)}
             found = _best_of(one for each in known.values() for one in each)
-            if found is None or found.evidence < least:
+            last = found is None or found.evidence < least
+            if last:
                 jumps = [_ranked(known[k])[:REFITTED] for k, family in enumerate(FAMILIES) if family in OF_JUMPS]
                 found = _best_of(beside(seen, one) for each in jumps for one in each)
             if found is None or found.evidence < least:
                 return
-            if not self._is_own(found):
-                named = self._passed(seen, found) if found.cause in JUMPS else found
-                if named.evidence < least:
-                    known = {k: [one for one in each if one is not found] for k, each in known.items()}
-                    continue
-                (self.several if len(named.act.axes) > 1 else self.single).append(named)
-                self.rest = self.rest - named.effect
-                for begin, end in named.passing:
-                    self.rest[:, begin:end] = np.nan
-                self.model = refitted(self.model, self.rest, self.dt)
-                seen = None
-            elif found.cause in JUMPS:
+            own = self._is_own(found)
+            if own and found.cause in JUMPS:
                 for time in found.theta:
                     at = round(time / self.dt)
                     passed[max(0, at - 3) : at + 4] = True
                 known |= {k: list(family(seen)) for k, family in enumerate(FAMILIES) if family in OF_JUMPS}
-            else:
-                known = {k: [one for one in each if one is not found] for k, each in known.items()}
-
-    def _passed(self, seen: Seen, one: Candidate) -> Candidate:
-        """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one
-        that a jump widens takes a half for the whole."""
-        passing = []
-        for time in one.theta:
-            at = round(time / self.dt)
-            before, after, about = (
-                self.rest[:, max(0, at - high) : max(0, at - low)]
-                for low, high in ((PASSING, 3 * PASSING), (-3 * PASSING, -PASSING), (-PASSING, PASSING))
-            )
-            if min(before.shape[1], after.shape[1]) < PASSING:
                 continue
-            with np.errstate(invalid="ignore"):
-                off = [np.abs(about - np.nanmedian(level, axis=1)[:, None]) > SPIKE / 2.0 for level in (before, after)]
-            places = np.flatnonzero((off[0] & off[1])[one.act.axes].any(axis=0)) + max(0, at - PASSING)
-            if places.size:
-                slow = int(places.size > 1)  # where it begins and ends it is near a level
-                passing.append((int(places[0]) - slow, int(places[-1]) + 1 + slow))
-        rest = self.rest.copy()
-        for begin, end in passing:
-            rest[:, begin:end] = np.nan
-        return replace(beside(replace(seen, y=rest), one), passing=tuple(passing))
+            named = between_levels(seen, found) if found.cause in JUMPS else found
+            if own or named.evidence < least:
+                if last:
+                    return
+                known = {k: [one for one in each if one is not found] for k, each in known.items()}
+                continue
+            (self.several if len(named.act.axes) > 1 else self.single).append(named)
+            self.rest = self.rest - named.effect
+            for begin, end in named.passing:
+                self.rest[:, begin:end] = np.nan
+            self.model = refitted(self.model, self.rest, self.dt)
+            seen = None
 
     def _is_own(self, one: Candidate) -> bool:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
@@ -539,7 +554,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     y, kept_out = without_lines(y)
     side = {cause: half_means(values, block)[0] for cause, values in channels.items()}
     null = fitted(bins_of(y), span, False)
-    search = Search(y, span, side, kept_out, since_s, null, y)
+    search = Search(span, side, kept_out, since_s, null, y)
     search.go(CERTAIN)
     model = weighed(search.model, search.rest, span)
     if model is not None:

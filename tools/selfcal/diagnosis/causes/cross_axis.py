@@ -54,12 +54,8 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
     coupling is kept: a mechanical one is below 1. Returns the axes whose model changed."""
     changed = [*_own_ramps(record, found), *_star(record, found)]
-    pairs = {
-        (name, str(finding.look.estimate["other"])): finding
-        for name, one in found.items()
-        for finding in one.findings
-        if finding.look.cause == "cross_axis" and finding.look.estimate["form"] == "static"
-    }
+    static = [leak for leak in _leaks(found) if leak[2].look.estimate["form"] == "static"]
+    pairs = {(name, other): finding for name, other, finding in static}
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
         if back is None:
@@ -69,9 +65,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             sizes = [abs(float(one.look.estimate["coefficient"]["median"])) for one in (finding, back)]
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
-            one = found[name]
-            one.findings.remove(finding)
-            one.state = without(one.state, other)
+            _drop(found[name], finding, without(found[name].state, other))
             changed.append(name)
     for name, one in found.items():
         of_other: dict[str, list[int]] = {}
@@ -87,22 +81,34 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     return changed
 
 
+def _leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
+    """Of each leak the axis that follows, the other one, and the finding."""
+    return [
+        (name, str(finding.look.estimate["other"]), finding)
+        for name, one in found.items()
+        for finding in one.findings
+        if finding.look.cause == "cross_axis"
+    ]
+
+
+def _drop(one: Diagnosed, finding: Finding, free: State) -> None:
+    one.findings.remove(finding)
+    one.state = free
+
+
 def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     """Drop an axis that shows in another by nothing but what its own model explains: a step or a ramp, of which both
     may have their own. Returns the axes whose model changed."""
     changed = []
-    for name, one in found.items():
-        for finding in [each for each in one.findings if each.look.cause == "cross_axis"]:
-            other = str(finding.look.estimate["other"])
-            source = found[other].state if other in found else record.axes[other]
-            if all(column.cause == "cross_axis" for column in source.regressors):
-                continue
-            source, free = without(source, name), without(one.state, other)
-            rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
-            if not any(look.net >= NET_LEAST for look in rest):
-                one.findings.remove(finding)
-                one.state = free
-                changed.append(name)
+    for name, other, finding in _leaks(found):
+        source = found[other].state if other in found else record.axes[other]
+        if all(column.cause == "cross_axis" for column in source.regressors):
+            continue
+        source, free = without(source, name), without(found[name].state, other)
+        rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
+        if not any(look.net >= NET_LEAST for look in rest):
+            _drop(found[name], finding, free)
+            changed.append(name)
     return changed
 
 
@@ -111,28 +117,21 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     round explains it nearly as well: one source of several axes is likelier than several. Returns the axes whose model
     changed."""
     changed: list[str] = []
-    followed = Counter(
-        str(finding.look.estimate["other"])
-        for one in found.values()
-        for finding in one.findings
-        if finding.look.cause == "cross_axis"
-    )
-    for name, one in found.items():
-        for finding in [each for each in one.findings if each.look.cause == "cross_axis"]:
-            other = str(finding.look.estimate["other"])
-            if followed[name] <= followed[other] or other not in found:
-                continue
-            free, source = without(one.state, other), found[other]
-            back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
-            lost = one.state.best.ln_likelihood - free.best.ln_likelihood
-            if back and back[0].net >= NET_LEAST and back[0].gain > lost - ALIKE:
-                one.findings.remove(finding)
-                one.state = free
-                after = source.state.refit(**back[0].changes)
-                source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
-                source.state = after
-                followed += Counter({name: 1, other: -1})
-                changed += [name, other]
+    followed = Counter(other for _, other, _ in _leaks(found))
+    for name, other, finding in _leaks(found):
+        if followed[name] <= followed[other] or other not in found:
+            continue
+        one, source = found[name], found[other]
+        free = without(one.state, other)
+        back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
+        lost = one.state.best.ln_likelihood - free.best.ln_likelihood
+        if back and back[0].net >= NET_LEAST and back[0].gain > lost - ALIKE:
+            _drop(one, finding, free)
+            after = source.state.refit(**back[0].changes)
+            source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
+            source.state = after
+            followed += Counter({name: 1, other: -1})
+            changed += [name, other]
     return changed
 
 
