@@ -20,8 +20,10 @@ from scipy.special import chdtrc
 from selfcal.base.units import power
 from selfcal.diagnosis.cause import Channels, Key, medians, positive
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.likelihood.fit import Fit, run
-from selfcal.likelihood.state import ALIKE, NET_LEAST, SCREEN, Look, Regressor, State, interval, mixture, net
+from selfcal.likelihood import columns
+from selfcal.likelihood.columns import LN_SLOW, Number, Shape, Tried
+from selfcal.likelihood.fit import run
+from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, POWER, formed, slope
@@ -49,21 +51,10 @@ PLAYS = (0.05, 0.1, 0.2, 0.35, 0.55, 0.8)
 LONGEST_LAG = 1.0 / 3.0
 #: A lag or a play that changes the column by less than this share of it is none.
 ALIKE_COLUMN = 0.1
-#: Forms that are refitted: those that score best. After the first one only forms whose score is within so many nats of
-#: what a form needs to be taken, or to be as likely as the best.
-REFITTED, REFIT_ADDS = 3, 3.0
-#: A drift of less: where a form has pulled the drift up, its score is too small there.
-STIFFER = 1.5
 #: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
 LN_FORMS = {"static": 0.0, "lag": 3.0, "rate": 2.5, "square": 2.0, "first_order": 3.0, "cube": 2.0, "play": 3.0}
-#: Numbers of a lag or a play that stand for its posterior.
-FINE = 15
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
 LN_SMOOTHINGS = math.log(2.0)
-#: A drift that is known from few of its own turns leaves slow columns a longer tail. Of 2267 clean axes at 1 and 10 Hz
-#: 7 showed 7 nats of a supply or a temperature and 2 of a ramp at a price of 0.8, where 4 and 2 were due; the tail ran
-#: on to 10.2. With 1.8 two show 7.6 of any.
-LN_SLOW = 1.8
 #: Bands of equal information that must agree on another axis' coefficient.
 BANDS = 16
 #: Drawn records of a channel's own noise, and the share of a coefficient that it leaves at least.
@@ -98,25 +89,6 @@ class Channel:
         return power(self.unit, 2) if self.input == "variance" else self.unit
 
 
-@dataclass(frozen=True)
-class Option:
-    """One form with its number: a time constant, s, or a width; `regressors` are its columns in the model file."""
-
-    form: str
-    number: float
-    regressors: tuple[Regressor, ...]
-    window: int = 1
-
-    @property
-    def columns(self) -> Array:
-        """Those whose coefficients are the estimate's; they span the same."""
-        columns = np.array([one.values for one in self.regressors])
-        if self.form == "first_order":
-            value, late = columns
-            return np.array([late, (value - late) / self.number])
-        return columns
-
-
 def side_looks(state: State, record: Record, cause: str) -> list[Look]:
     """The look at a side channel, if it was recorded."""
     return look(state, [_side(record, cause)]) if cause in record.channels else []
@@ -125,14 +97,10 @@ def side_looks(state: State, record: Record, cause: str) -> list[Look]:
 def side_at(state: State, record: Record, cause: str, theta: Sequence[float]) -> Look:
     """The look at a side channel that is known to act, in the form `theta`: its place in FORMS, and its number or the
     width of its means, s."""
-    channel, form, number = _side(record, cause), FORMS[int(theta[0])], float(theta[1])
-    means = form not in NUMBER
-    option = column_of(channel, state, form, math.nan if means else number, number if means else 0.0)
-    gain, fit = state.with_columns(option.columns)
-    chosen = _Tried(option, gain, net(gain, len(option.regressors)), fit)
-    changes = {"regressors": (*state.regressors, *option.regressors)}
-    estimate = _estimate(state, channel, chosen)
-    return Look(cause, gain, chosen.net, estimate, changes, measure=partial(_measured, channel, chosen))
+    form, number = FORMS[int(theta[0])], float(theta[1])
+    shape = shape_of(_side(record, cause), state, form, *((number, 0.0) if form in NUMBER else (math.nan, number)))
+    found = columns.located(state, cause, shape)
+    return replace(found, measure=partial(_noiseless, _side(record, cause), shape))
 
 
 def _side(record: Record, cause: str) -> Channel:
@@ -155,8 +123,8 @@ def look(state: State, channels: Sequence[Channel]) -> list[Look]:
     return [one for channel in channels for one in _look(state, channel)]
 
 
-def column_of(channel: Channel, state: State, form: str, number: float, width_s: float) -> Option:
-    """A form's columns as the diagnosis takes them: of centred means and slopes, which have no lag of their own."""
+def shape_of(channel: Channel, state: State, form: str, number: float, width_s: float) -> Shape:
+    """A form of a channel as the diagnosis takes it: of centred means and slopes, which have no lag of their own."""
     window = max(1, round(width_s / state.dt))
     about = smoothed(channel.values, window) - channel.reference
     entry: dict[str, Any] = {"kind": "column", "column": channel.column, "unit": channel.unit}
@@ -178,7 +146,34 @@ def column_of(channel: Channel, state: State, form: str, number: float, width_s:
         return slope(about, number, state.dt) if part == "rate" else formed(about, part, number, 0.0, state.dt)
 
     numbers = {part: {NUMBER[part]: number} if part in NUMBER else {} for part in parts}
-    return Option(form, number, tuple(regressor(part, values(part), **numbers[part]) for part in parts), window)
+    found = tuple(regressor(part, values(part), **numbers[part]) for part in parts)
+    keys = tuple((KEYS.get(form_of(one)[2], "coefficient"), coefficient_unit(state.unit, one.unit)) for one in found)
+    rows = np.array([one.values for one in found])
+    if form == "first_order":
+        value, late = rows
+        rows = np.array([late, (value - late) / number])
+        keys = (keys[0], ("rate", coefficient_unit(state.unit, f"{found[0].unit}/s")))
+    own = {NUMBER["rate"]: number} if form == "rate" else {}
+    shape = Shape(
+        form,
+        rows,
+        found,
+        keys,
+        channel.ln_looks + LN_FORMS[form],
+        len(found),
+        stated={"form": form, **own, "input": channel.input, **channel.extra},
+    )
+    if form not in (*LATE, "play"):
+        return shape
+    if form == "play":
+        theta = Number(NUMBER["play"], number, channel.of, 0.02 * _span(channel), _span(channel))
+    else:
+        theta = Number(NUMBER["lag"], number, "s", state.dt, LONGEST_LAG * channel.values.size * state.dt)
+    return replace(shape, numbers=(theta,), moved=lambda other: shape_of(channel, state, form, other[0], width_s))
+
+
+def _span(channel: Channel) -> float:
+    return float(np.ptp(channel.values))
 
 
 def form_of(column: Regressor) -> tuple[str, str, str]:
@@ -204,7 +199,7 @@ def _windows(channel: Channel, state: State) -> list[int]:
     return [max(1, round(width / state.dt)) for width in _widths(channel, state)]
 
 
-def options_of(channel: Channel, state: State) -> Iterator[Option]:
+def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
     """Every form over its grid of numbers and smoothing means."""
     n, dt = channel.values.size, state.dt
     widths = _widths(channel, state)
@@ -215,15 +210,15 @@ def options_of(channel: Channel, state: State) -> Iterator[Option]:
         if any((channel.column, channel.input, part) in known for part in parts):
             continue
         if form in LATE:
-            yield from (column_of(channel, state, form, lag, 0.0) for lag in _lags(channel, state))
+            yield from (shape_of(channel, state, form, lag, 0.0) for lag in _lags(channel, state))
         elif form == "rate":
             windows = [max(window, dt) for window in channel.rate_windows_s if window <= n * dt / 6.0]
-            yield from (column_of(channel, state, form, window, 0.0) for window in dict.fromkeys(windows))
+            yield from (shape_of(channel, state, form, window, 0.0) for window in dict.fromkeys(windows))
         elif form == "play":
             span = float(np.ptp(smoothed(channel.values, max(1, round(middle / dt)))))
-            yield from (column_of(channel, state, form, share * span, middle) for share in PLAYS)
+            yield from (shape_of(channel, state, form, share * span, middle) for share in PLAYS)
         else:
-            yield from (column_of(channel, state, form, math.nan, width) for width in widths)
+            yield from (shape_of(channel, state, form, math.nan, width) for width in widths)
 
 
 def _lags(channel: Channel, state: State) -> list[float]:
@@ -246,124 +241,80 @@ def _differs(column: Array, plain: Array, spread: float) -> bool:
     return float(left.std()) > ALIKE_COLUMN * spread
 
 
-@dataclass(frozen=True)
-class _Tried:
-    """A form's best option: gain, worth net of its search, and the fit with its columns where that was made."""
-
-    option: Option
-    gain: float
-    net: float
-    fit: Fit
-
-
 def _look(state: State, channel: Channel) -> list[Look]:
-    tried = _tried(state, channel)
-    if not tried:
+    found = columns.tried(state, list(shapes_of(channel, state)), slow=channel.slow)
+    if not found or max(one.net for one in found.values()) < 1.0:
         return []
-    best = max(one.net for one in tried.values())
-    if best < 1.0:
-        return []
-    alike = [form for form in FORMS if form in tried and tried[form].net > best - ALIKE]
-    for form in LATE:
-        if form in alike and tried[form].option.number > LONGEST_LAG / 2.0 * channel.values.size * state.dt:
-            # The longest lag that is looked at sums the channel up: any slower change of it looks so.
-            alike.append(alike.pop(alike.index(form)))
-    chosen = tried[alike[0]]
+    alike = columns.alike(found)
+    chosen = alike[0]
     if not channel.slow:
-        constant = [form for form in alike if _constant(state, tried[form])]
+        constant = [one for one in alike if _constant(state, one)]
         if not constant:
             # The coefficient depends on the frequency, and no form explains it: no cause, and not nothing either.
-            if best < NET_LEAST:
+            if max(one.net for one in found.values()) < NET_LEAST:
                 return []
             estimate = {"statistic": f"dependence on {channel.column}", "measured": _inconstant(state, chosen)}
             return [Look("unexplained", chosen.gain, chosen.net, estimate, {}, shown_by=channel.column)]
-        chosen = tried[constant[0]]
+        chosen = constant[0]
     if channel.noisy and chosen.net >= NET_LEAST and (channel.column, channel.input, "static") in _known(state):
         # What other means of the channel explain as well is its own noise in the column that the model has.
         plain = max(state.with_columns(smoothed(channel.values, window))[0] for window in _windows(channel, state))
-        chosen = replace(chosen, gain=chosen.gain - plain, net=_worth(channel, chosen.option, chosen.gain - plain))
+        chosen = replace(chosen, gain=chosen.gain - plain)
         if chosen.net < 1.0:
             return []
-    rivals = [form for form in alike if form != chosen.option.form]
-    estimate = _estimate(state, channel, chosen) | ({"form_also_possible": rivals} if rivals else {})
+    rivals = [one.shape.form for one in alike if one.shape.form != chosen.shape.form]
     before, chosen = _whole(state, channel, chosen)
-    if before is not state:
-        estimate = _estimate(state, channel, chosen)
-    changes = {"regressors": (*before.regressors, *chosen.option.regressors)}
-    measure = partial(_measured, channel, chosen)
-    look = Look(channel.cause, chosen.gain, chosen.net, estimate, changes, measure=measure)
-    return [look if before is state else replace(look, before=before)]
+    if before is state:
+        return [_of_shape(state, channel, chosen, {"form_also_possible": rivals} if rivals else {})]
+    return [replace(_of_shape(before, channel, chosen, {}), before=before)]
 
 
-def _whole(state: State, channel: Channel, chosen: _Tried) -> tuple[State, _Tried]:
+def _of_shape(state: State, channel: Channel, chosen: Tried, more: Mapping[str, Any]) -> Look:
+    """The look at a form; of a channel with noise of its own the size is of the channel without it."""
+    shape = replace(chosen.shape, stated={**chosen.shape.stated, **more})
+    found = columns.look(state, channel.cause, replace(chosen, shape=shape))
+    return replace(found, measure=partial(_noiseless, channel, shape)) if channel.noisy else found
+
+
+def _noiseless(channel: Channel, shape: Shape, state: State) -> dict[str, Any]:
+    """The posterior of the sizes, a static one over the share that the channel's own noise leaves of it."""
+    sizes = columns.measured(shape, state)
+    if shape.form != "static":
+        return sizes
+    (key, _), window = shape.keys[0], max(1, round(float(shape.regressors[0].entry.get("window_s", 0.0)) / state.dt))
+    kept = _kept(state, shape.columns[0], channel, window)
+    return {key: {part: value / kept if part != "unit" else value for part, value in sizes[key].items()}}
+
+
+def _whole(state: State, channel: Channel, chosen: Tried) -> tuple[State, Tried]:
     """`first_order` in the place of its parts that were found and the one chosen, if it explains no less than they
     together, and the state without; else both as they are. A column of the model file, whose entry here has no unit,
     stays."""
     parts = {(channel.column, channel.input, part) for part in FIRST_ORDER}
     own = {one.name for one in state.regressors if form_of(one) in parts and "unit" in one.entry}
-    if not own or chosen.option.form not in FIRST_ORDER or "first_order" not in channel.forms:
+    if not own or chosen.shape.form not in FIRST_ORDER or "first_order" not in channel.forms:
         return state, chosen
     before = state.without(own).refit()
-    tried = _tried(before, replace(channel, forms=("first_order",)))
-    if not tried:
+    found = columns.tried(before, list(shapes_of(replace(channel, forms=("first_order",)), before)), slow=channel.slow)
+    if not found:
         return state, chosen
-    whole = tried["first_order"]
+    whole = found["first_order"]
     gain = before.best.ln_likelihood + whole.gain - state.best.ln_likelihood
     if gain < chosen.gain:
         return state, chosen
-    return before, replace(whole, gain=gain, net=_worth(channel, chosen.option, gain))
+    price = replace(whole.shape, price=chosen.shape.price, free=chosen.shape.free)
+    return before, replace(whole, gain=gain, shape=price)
 
 
-def _tried(state: State, channel: Channel) -> dict[str, _Tried]:
-    """The best option of each form. Scores rank them at the drift without the channel and at a stiffer one; each refit
-    gives a drift at which all are scored again."""
-    options = [one for one in options_of(channel, state) if all(np.ptp(column) > 0.0 for column in one.columns)]
-    if not options:
-        return {}
-    blocks = [one.columns for one in options]
-    drifts = [state.best, *state.stiffer(STIFFER)]
-    gains = np.max([state.scores(blocks, at) for at in drifts], axis=0)
-    if gains.max() < SCREEN:
-        return {}
-    done: dict[str, tuple[float, Option, Fit]] = {}
-    for _ in range(REFITTED):
-        left = [k for k, one in enumerate(options) if one.form not in done]
-        if not left:
-            break
-        k = max(left, key=lambda k: _worth(channel, options[k], gains[k]))
-        known = max((_worth(channel, option, gain) for gain, option, _ in done.values()), default=-math.inf)
-        if done and _worth(channel, options[k], gains[k]) < max(known - ALIKE, NET_LEAST) - REFIT_ADDS:
-            break
-        gain, fit = state.with_columns(blocks[k])
-        gains = np.maximum(gains, state.scores(blocks, fit))
-        of_form = [j for j, one in enumerate(options) if one.form == options[k].form]
-        better = max(of_form, key=lambda j: gains[j])
-        if better != k and gains[better] > gain:
-            k = better
-            gain, fit = state.with_columns(blocks[k])
-        if channel.slow:
-            gain = min(gain, state.rich_gain(options[k].columns))
-        done[options[k].form] = (gain, options[k], fit)
-    # A form whose score alone is known is refitted by who takes it: only a finding needs that.
-    return {
-        form: _Tried(option, gain, _worth(channel, option, gain), fit)
-        for form, (gain, option, fit) in ((form, done[form]) for form in channel.forms if form in done)
-    }
-
-
-def _worth(channel: Channel, option: Option, gain: float) -> float:
-    return net(float(gain), len(option.regressors), channel.ln_looks + LN_FORMS[option.form])
-
-
-def _constant(state: State, one: _Tried) -> bool:
+def _constant(state: State, one: Tried) -> bool:
     """Whether each column of a form has one coefficient at all frequencies, as far as the record shows."""
     return one.net < 3.0 or _inconstant(state, one) < NET_LEAST
 
 
-def _inconstant(state: State, one: _Tried) -> float:
+def _inconstant(state: State, one: Tried) -> float:
     """Of the column that shows it most: beside a square the plain column may still be a common source's."""
-    columns = one.option.columns
-    return max(inconstancy(state, columns[k], np.delete(columns, k, axis=0)) for k in range(len(columns)))
+    rows = one.shape.columns
+    return max(inconstancy(state, rows[k], np.delete(rows, k, axis=0)) for k in range(len(rows)))
 
 
 def inconstancy(state: State, column: Array, beside: Array | None = None) -> float:
@@ -405,67 +356,6 @@ def agreement(u: Array, w: Array, *, any_phase: bool = False) -> tuple[float, in
     return float((power_of / np.maximum(information, 1e-300)).sum()) / noise, edges.size
 
 
-def _keys(state: State, option: Option) -> list[tuple[str, str]]:
-    """Key and unit of each coefficient of a form."""
-    if option.form == "first_order":
-        unit = coefficient_unit(state.unit, option.regressors[0].unit)
-        return [("coefficient", unit), ("rate", coefficient_unit(state.unit, f"{option.regressors[0].unit}/s"))]
-    columns = option.regressors
-    return [(KEYS.get(form_of(one)[2], "coefficient"), coefficient_unit(state.unit, one.unit)) for one in columns]
-
-
-def _estimate(state: State, channel: Channel, chosen: _Tried) -> dict[str, Any]:
-    """The coefficients as the fit has them."""
-    keys = _keys(state, chosen.option)
-    places = range(chosen.fit.c.size - len(keys), chosen.fit.c.size)
-    sizes = {
-        key: interval(float(chosen.fit.c[place]), float(chosen.fit.sd[place]), unit)
-        for (key, unit), place in zip(keys, places, strict=True)
-    }
-    window = {NUMBER["rate"]: chosen.option.number} if chosen.option.form == "rate" else {}
-    return {**sizes, "form": chosen.option.form, **window, "input": channel.input, **channel.extra}
-
-
-def _measured(channel: Channel, chosen: _Tried, state: State) -> dict[str, Any]:
-    """Intervals of the coefficients and of the form's number."""
-    option = chosen.option
-    form = option.form
-    alternatives = [option]
-    shaped = form in (*LATE, "play")
-    if shaped:
-        alternatives += [
-            column_of(channel, state, form, number, option.window * state.dt if option.window > 1 else 0.0)
-            for number in _around(state, channel, chosen)
-        ]
-    weight, means, sds = state.posterior(*(one.columns for one in alternatives))
-    kept = _kept(state, option.columns[0], channel, option.window) if form == "static" and channel.noisy else 1.0
-    sizes = {
-        key: mixture(weight.ravel(), means[..., j].ravel() / kept, sds[..., j].ravel() / kept, unit)
-        for j, (key, unit) in enumerate(_keys(state, option))
-    }
-    if shaped:
-        numbers = np.array([one.number for one in alternatives])
-        # The deviation within a cell of the grid: its width over the root of 12.
-        apart = np.gradient(np.sort(numbers))[np.argsort(np.argsort(numbers))] / math.sqrt(12.0)
-        total = weight.sum(axis=1)
-        late = form in LATE
-        sizes[NUMBER["lag" if late else form]] = mixture(total, numbers, apart, "s" if late else channel.of)
-    return sizes
-
-
-def _around(state: State, channel: Channel, chosen: _Tried) -> list[float]:
-    """Numbers about the best one, over all that the record leaves possible."""
-    options = [one for one in options_of(channel, state) if one.form == chosen.option.form]
-    gains = state.scores([one.columns for one in options])
-    numbers = np.array([one.number for one in options])
-    possible = numbers[gains > gains.max() - 2.0 * ALIKE]
-    factor = float(numbers[1] / numbers[0]) if numbers.size > 1 else 2.0
-    low, high = float(possible.min()) / factor, float(possible.max()) * factor
-    if chosen.option.form in LATE:
-        high = min(high, LONGEST_LAG * channel.values.size * state.dt)
-    return [float(x) for x in np.geomspace(low, high, FINE)]
-
-
 def _kept(state: State, column: Array, channel: Channel, window: int) -> float:
     """Share of a coefficient that the own noise of a channel leaves: the share of the information that is none of it.
 
@@ -487,10 +377,9 @@ def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, 
     """The coefficient of a channel that this record would have shown; None where it has none that changes."""
     if channel not in record.channels:
         return None
-    values = record.channels[channel]
-    size = state.least(smoothed(values, round(10.0 * record.rate_hz)) - float(values.mean()))
-    unit = coefficient_unit(state.unit, SIDE_CHANNELS[channel][1])
-    return {"coefficient": (size, unit)} if math.isfinite(size) else None
+    shape = shape_of(_side(record, channel), state, "static", math.nan, SMOOTHING_S[1])
+    found = columns.least(state, shape, "coefficient") if shape.keys else {}  # else the model has it
+    return found if found and math.isfinite(found["coefficient"][0]) else None
 
 
 #: Keys of `simulate --effect` beside the coefficient: the numbers of a form, and its other coefficients.

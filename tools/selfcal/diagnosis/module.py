@@ -21,9 +21,10 @@ from selfcal.base.grid import half_means
 from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
-from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SLOW, LN_SMOOTHINGS, LONGEST_LAG
+from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SMOOTHINGS, LONGEST_LAG
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
+from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
     Act,
@@ -363,7 +364,7 @@ def transients(seen: Seen) -> Iterator[Candidate]:
     ln_tau = math.log(FASTEST * seen.dt) + 0.5 * math.log(2.0) * np.arange(2 * int(math.log2(seen.n / FASTEST)) + 1)
     tau = np.exp(ln_tau)
     shapes: list[Shape] = [("ramp", (), t - t.mean(), LN_SLOW)]
-    shapes += [("turn_on", (float(one),), np.exp(-(t + seen.since_s) / one), LN_LOOKS) for one in tau]
+    shapes += [("turn_on", (float(one),), np.exp(-(t + seen.since_s) / one), LN_LOOKS + LN_SLOW) for one in tau]
     scored = _scored(seen, shapes)
     for one in _weighed(seen, shapes, scored):
         if one.theta:

@@ -20,7 +20,8 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.forms import LN_SLOW, LONGEST_LAG, agreement, whitened
+from selfcal.diagnosis.forms import LONGEST_LAG, agreement, whitened
+from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array

@@ -17,9 +17,9 @@ import numpy as np
 from selfcal.base.grid import half_means
 from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, at_jump, raised, scan
-from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
+from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
 from selfcal.likelihood.state import Look, Regressor, State, gain_for, interval, ln_looks, mixture, net, sizes
 from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Terms

@@ -19,8 +19,8 @@ from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
-from selfcal.diagnosis.forms import LN_SLOW
 from selfcal.diagnosis.record import Record
+from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
 from selfcal.likelihood.statemodel import Array, Mask
 

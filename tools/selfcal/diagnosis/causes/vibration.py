@@ -10,8 +10,9 @@ import numpy as np
 
 from selfcal.diagnosis import forms
 from selfcal.diagnosis.cause import Cause, Channels, Key, shown
-from selfcal.diagnosis.forms import LN_SLOW, Channel
+from selfcal.diagnosis.forms import Channel
 from selfcal.diagnosis.record import Record, smoothed
+from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
