@@ -166,14 +166,11 @@ def add_posteriors(
     """What the extended model knows of each axis at rest, as `identify` tells it; None where the record bears no
     report, and after a signal. The document has its posterior."""
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
-    findings = [finding for axis in axes.values() for finding in axis["findings"]]
-    moved = [one for finding in findings if finding["cause"] == "motion" for one in finding["estimate"]["intervals"]]
-    rest = recording.without(moved)
     known: dict[str, Identified | None] = {}
     for name, axis in axes.items():
         known[name] = None
         with suppress(UserError):
-            known[name] = None if ending.asked else identify_axis(rest, name, model, "library", None)
+            known[name] = None if ending.asked else identify_axis(recording, name, model, "library", None)
         axis["posterior"] = _posterior(known[name])
     return known
 

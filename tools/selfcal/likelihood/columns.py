@@ -35,13 +35,15 @@ from selfcal.likelihood.statemodel import Array
 #: 7 showed 7 nats of a supply or a temperature and 2 of a ramp at a price of 0.8, where 4 and 2 were due; the tail ran
 #: on to 10.2. With 1.8 two show 7.6 of any.
 LN_SLOW = 1.8
-#: Drifts at which shapes are ranked: the fitted one's size over e to these.
-SMALLER = (0.0, 1.5, 3.0)
+#: Drifts at which shapes are ranked beside the fitted one: its size over e to these. The last is for slow shapes alone.
+SMALLER = (1.5, 3.0)
 #: Forms of a family that are fitted: those that rank best. After the first one only forms whose score is within so many
 #: nats, and this share of the best, of what a form needs to be taken, or to be as likely as the best.
 FITTED, FIT_ADDS, COARSE = 3, 3.0, 0.05
 #: Numbers between those of the grid: places on either side of the best, over so many octaves.
 FINER, REACHES = 4, (1.0, 0.25)
+#: Worth from which on a shape may be named, or be as likely as the one that is, nats.
+NEARLY = NET_LEAST - ALIKE
 #: A number's posterior reaches to where ln likelihood is this much lower, in reaches a factor 2 apart, and has so many
 #: places: of one number, and of each of two.
 LOWER, REACH_LEAST, PLACES = 6.0, 0.002, (17, 11)
@@ -120,7 +122,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
     if not shapes:
         return {}
     blocks = [one.columns for one in shapes]
-    drifts = [state.best, *(drift for by in SMALLER if by for drift in state.stiffer(by))]
+    drifts = [state.best, *(drift for by in SMALLER[: 1 + slow] for drift in state.stiffer(by))]
     gains = np.max([state.scores(blocks, drift) for drift in drifts], axis=0)
     if gains.max() < least:
         return {}
@@ -148,7 +150,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
 
 def _between(state: State, best: Tried) -> Tried:
     """The best numbers between those of the grid."""
-    for reach in REACHES if best.shape.numbers else ():
+    for reach in REACHES if best.shape.numbers and best.net > NEARLY else ():
         moves = np.exp2(reach * np.linspace(-1.0, 1.0, 2 * FINER + 1))
         shapes = best.shape.near([[*np.multiply(best.shape.theta, by)] for by in product(moves, repeat=_count(best))])
         gains = state.scores([one.columns for one in shapes], best.fit)

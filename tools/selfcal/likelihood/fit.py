@@ -19,6 +19,8 @@ from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Mask, Terms, matri
 
 #: Columns that the compiled filter takes in one pass (bindings/likelihood.cpp).
 COLUMNS_MOST = 39
+#: A column of which the others leave less than this share is one of theirs.
+SPENT = 1e-9
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
 #: ... of a quick look, which ranks causes and measures none: their evidence differs by more.
@@ -85,6 +87,22 @@ class Sums:
     n: float
     x: Array  # [1 + p, states]: predicted state of the next sample, of the record and of each column
 
+    def of(self, places: Sequence[int]) -> Sums:
+        """The record, 0 of `places`, and some columns."""
+        return replace(self, G=self.G[np.ix_(places, places)], x=self.x[places])
+
+    def less(self, known: int) -> Sums:
+        """The record and the columns after the first `known` ones, less what those explain of them. A column that is
+        one of theirs is nothing."""
+        inverse = replace(self, G=self.G[: 1 + known, : 1 + known]).coefficients()[1]
+        rest = [0, *range(1 + known, len(self.G))]
+        cross = self.G[1 : 1 + known][:, rest]
+        G = self.G[np.ix_(rest, rest)] - cross.T @ inverse @ cross
+        spent = np.diag(G) < SPENT * np.diag(self.G)[rest]
+        spent[0] = False
+        G[spent], G[:, spent] = 0.0, 0.0
+        return replace(self, G=G, x=self.x[rest])
+
     def coefficients(self) -> tuple[Array, Array, float]:
         """Least squares: coefficients [p], their covariance over sigma^2 [p, p], residual sum of squares. The last is
         infinite where the filter overflowed. Solved once."""
@@ -95,6 +113,9 @@ class Sums:
         A, B = self.G[1:, 1:], self.G[1:, 0]
         if not np.isfinite(self.G).all():
             return np.zeros(B.size), np.zeros(A.shape), math.inf
+        if B.size == 1:
+            inverse = np.divide(1.0, A, out=np.zeros_like(A), where=A > 1e-300)
+            return inverse[0] * B, inverse, max(float(self.G[0, 0] - inverse[0, 0] * B[0] ** 2), 1e-300)
         # A column of zeros, a step later than these samples, has no coefficient.
         size = np.sqrt(np.maximum(np.diag(A), 0.0))
         scale = np.divide(1.0, size, out=np.zeros_like(size), where=size > 1e-150)

@@ -154,15 +154,14 @@ class State:
         [a, m], means [a, m, k] and standard deviations [a, m, k] of the normals that they are the sum of. Each of the
         `alternatives`, the likeliest first, is one set of columns; before the record they are equally likely."""
         blocks = [np.atleast_2d(one) for one in alternatives]
-        k = len(blocks[0])
         found: list[tuple[Array, Array, Array]] = []
         for one, theta, ln_share in self.possible(blocks[0], rich=True):
             ln_weight, means, sds = [], [], []
-            for sums in self.sums(one.terms, theta, blocks):
+            for sums in self.beside(one.terms, theta, blocks):
                 c, inverse, rss = sums.coefficients()
-                sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse)[-k:], 1e-300))
+                sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse), 1e-300))
                 ln_weight.append(ln_share + ln_likelihood(sums) + float(np.log(sd).sum()))
-                means.append(c[-k:])
+                means.append(c)
                 sds.append(sd)
             found.append((np.array(ln_weight), np.array(means), np.array(sds)))
         value = np.array([each[0] for each in found]).T
@@ -171,20 +170,29 @@ class State:
 
     def sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
         """Of the model with each of the blocks [k, n] of further columns: one pass for many of them."""
-        known = 1 + 1 + len(self.regressors)
-        at = 0
+        known = range(2 + len(self.regressors))
+        for sums, places in self._passes(terms, theta, blocks):
+            yield from (sums.of([*known, *place]) for place in places)
+
+    def beside(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
+        """Of each of the blocks alone, less what the model's columns explain of it and of the record."""
+        known = 1 + len(self.regressors)
+        for sums, places in self._passes(terms, theta, blocks):
+            less = sums.less(known)
+            yield from (less.of([0, *(k - known for k in place)]) for place in places)
+
+    def _passes(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[tuple[Sums, list[range]]]:
+        """Passes over the model's columns and some blocks [k, n] each, with the places of these."""
+        known, at = 2 + len(self.regressors), 0
         while at < len(blocks):
-            upto, width = at, 0
-            while upto < len(blocks) and (upto == at or width + len(blocks[upto]) <= ABREAST):
-                width += len(blocks[upto])
-                upto += 1
-            sums = run(self.series.beside(np.vstack(blocks[at:upto])), terms, theta)[0][0]
-            place = known
-            for block in blocks[at:upto]:
-                chosen = [*range(known), *range(place, place + len(block))]
-                yield replace(sums, G=sums.G[np.ix_(chosen, chosen)], x=sums.x[chosen])
-                place += len(block)
-            at = upto
+            places = [range(known, known + len(blocks[at]))]
+            for block in blocks[at + 1 :]:
+                if places[-1].stop + len(block) > known + ABREAST:
+                    break
+                places.append(range(places[-1].stop, places[-1].stop + len(block)))
+            series = self.series.beside(np.vstack(blocks[at : at + len(places)]))
+            yield run(series, terms, theta)[0][0], places
+            at += len(places)
 
     @cached_property
     def rich(self) -> Fit:
@@ -204,7 +212,8 @@ class State:
         """Gain [b] of each block [k, n] of further columns with the drift of a fit, by default of the best: a bound
         from below for what they gain with it refitted. One pass for many of them."""
         at = self.best if at is None else at
-        found = [ln_likelihood(sums) for sums in self.sums(at.terms, at.theta, [np.atleast_2d(one) for one in blocks])]
+        each = self.beside(at.terms, at.theta, [np.atleast_2d(one) for one in blocks])
+        found = [ln_likelihood(sums) for sums in each]
         return np.array(found) - self.best.ln_likelihood
 
     def least(self, column: Array) -> float:

@@ -15,7 +15,7 @@ from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, sho
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
-from selfcal.likelihood.columns import LN_SLOW, Number, Shape
+from selfcal.likelihood.columns import LN_SLOW, NEARLY, Number, Shape
 from selfcal.likelihood.state import Look, Regressor, State, log_normal
 from selfcal.likelihood.statemodel import Array
 
@@ -30,8 +30,14 @@ LN_LOOKS = 0.4
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """The best time constant, or the best two where both are as likely."""
-    return columns.looks(state, "turn_on", _shapes(state, record))
+    """The best time constant, or the best two where a single one shows settling and both are clearly more likely."""
+    tau = _grid(record)
+    single = [_shape(state, record, [one]) for one in tau]
+    found = columns.looks(state, "turn_on", single)
+    if not found or found[0].net < NEARLY:
+        return found
+    pairs = [_shape(state, record, two) for two in combinations(tau, 2) if two[1] > 0.999 * APART * two[0]]
+    return columns.looks(state, "turn_on", [*single, *pairs])
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
@@ -39,13 +45,6 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
     tau_s, sd = theta
     known = {"tau_s": log_normal(math.log(tau_s), sd, "s")}
     return columns.located(state, "turn_on", _shape(state, record, [tau_s]), known)
-
-
-def _shapes(state: State, record: Record) -> list[Shape]:
-    """One time constant or two, an octave apart on a grid."""
-    tau = _grid(record)
-    pairs = [two for two in combinations(tau, 2) if two[1] > 0.999 * APART * two[0]]
-    return [_shape(state, record, times) for times in (*tau[:, None], *pairs)]
 
 
 def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
@@ -104,7 +103,8 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     cut = tuple(replace(one, values=one.values[:split]) for one in before.regressors)
     half = replace(before, y=before.y[:split], r=before.r[:split], regressors=cut, fits=()).refit()
     own_record = replace(record, present=record.present[:split])
-    found = columns.alike(columns.tried(half, _shapes(half, own_record), slow=False, least=-math.inf))[0]
+    single = [_shape(half, own_record, [one]) for one in _grid(own_record)]
+    found = columns.alike(columns.tried(half, single, slow=False, least=-math.inf))[0]
     times = np.array(found.shape.theta)
     kept = tuple(one for one in after.regressors if one.name in known)
     own = next(one for one in after.regressors if one.name not in known)
