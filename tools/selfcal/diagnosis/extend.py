@@ -25,7 +25,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import finish
 from selfcal.likelihood.state import Regressor as Column
 from selfcal.model.file import LONGEST_TEXT, MOST_COLUMNS, MOST_STATED, SMALLEST, Model
-from selfcal.model.forms import NUMBER, formed
+from selfcal.model.forms import NUMBER, curved, formed
 from selfcal.model.laws import averaged
 from selfcal.model.regressors import trailing_mean
 
@@ -206,7 +206,8 @@ def _with_values(one: Diagnosed, name: str, width: float, entry: Mapping[str, An
         values = formed(channel - about, form, width, 0.0, 1.0 / record.rate_hz)
     else:
         means = trailing_mean(channel, max(1, round(width * record.rate_hz)))
-        values = formed(means - about, form, float(entry.get(NUMBER.get(form, ""), math.nan)))
+        number = float(entry.get(NUMBER.get(form, ""), math.nan))
+        values = curved(means, entry["knots"]) if form == "free" else formed(means - about, form, number)
     columns = tuple(
         replace(column, values=values) if column.name == name else column for column in one.state.regressors
     )

@@ -18,7 +18,9 @@ from scipy.fft import rfft
 from scipy.special import chdtrc
 
 from selfcal.base.units import power
+from selfcal.diagnosis import curve
 from selfcal.diagnosis.cause import Channels, Key, medians, positive
+from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Number, Shape, Tried
@@ -26,12 +28,12 @@ from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
-from selfcal.model.forms import NUMBER, POWER, formed, slope
+from selfcal.model.forms import NUMBER, POWER, curved, formed, slope
 from selfcal.model.regressors import coefficient_unit
 
 #: Forms, the simplest first. `first_order` is (coefficient + rate s) / (1 + lag_s s): static, a lag, and a filtered
 #: rate are cases of it.
-FORMS = ("static", "lag", "rate", "square", "first_order", "cube", "play")
+FORMS = ("static", "lag", "rate", "square", "first_order", "cube", "play", "free")
 #: The columns of each form: a power comes with all that are simpler.
 PARTS = {"square": ("static", "square"), "cube": ("static", "square", "cube"), "first_order": ("static", "lag")}
 #: Forms with a time constant of a lag.
@@ -52,7 +54,16 @@ LONGEST_LAG = 1.0 / 3.0
 #: A lag or a play that changes the column by less than this share of it is none.
 ALIKE_COLUMN = 0.1
 #: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
-LN_FORMS = {"static": 0.0, "lag": 3.0, "rate": 2.5, "square": 2.0, "first_order": 3.0, "cube": 2.0, "play": 3.0}
+LN_FORMS = {
+    "static": 0.0,
+    "lag": 3.0,
+    "rate": 2.5,
+    "square": 2.0,
+    "first_order": 3.0,
+    "cube": 2.0,
+    "play": 3.0,
+    "free": 2.0,
+}
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
 LN_SMOOTHINGS = math.log(2.0)
 #: Bands of equal information that must agree on another axis' coefficient.
@@ -134,11 +145,16 @@ def shape_of(channel: Channel, state: State, form: str, number: float, width_s: 
 
     def regressor(form: str, values: Array, **more: Any) -> Regressor:
         name = channel.name if form == "static" else f"{channel.name}_{form}"
-        unit = power(channel.of, POWER.get(form, 1)) + ("/s" if form == "rate" else "")
+        unit = "1" if form == FREE else power(channel.of, POWER.get(form, 1)) + ("/s" if form == "rate" else "")
         stated = {"form": form} if form != "static" else {}
-        own = {key: value for key, value in entry.items() if form != "rate" or key != "reference"}
+        own = {key: value for key, value in entry.items() if form not in ("rate", FREE) or key != "reference"}
         return Regressor(name, channel.cause, values, unit, {**own, **smooth, **stated, **more})
 
+    if form == FREE:
+        means = smoothed(channel.values, window)
+        column = regressor(FREE, means, knots=curve.knots_of(means, round(number)))
+        stated = {"form": FREE, "input": channel.input, **channel.extra}
+        return curve.shape(column, means, channel.ln_looks + LN_FORMS[FREE], state.unit, stated)
     known = _known(state)
     parts = [part for part in PARTS.get(form, (form,)) if (channel.column, channel.input, part) not in known]
 
@@ -217,6 +233,9 @@ def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
         elif form == "play":
             span = float(np.ptp(smoothed(channel.values, max(1, round(middle / dt)))))
             yield from (shape_of(channel, state, form, share * span, middle) for share in PLAYS)
+        elif form == FREE:
+            counts = [count for count in curve.KNOTS if 10 * count < n]
+            yield from (shape_of(channel, state, form, count, width) for count in counts for width in widths[:2])
         else:
             yield from (shape_of(channel, state, form, math.nan, width) for width in widths)
 
@@ -263,6 +282,7 @@ def _look(state: State, channel: Channel) -> list[Look]:
         if chosen.net < 1.0:
             return []
     rivals = [one.shape.form for one in alike if one.shape.form != chosen.shape.form]
+    chosen = curve.best(state, chosen, chosen.shape.regressors[0].values) if chosen.shape.form == FREE else chosen
     before, chosen = _whole(state, channel, chosen)
     if before is state:
         return [_of_shape(state, channel, chosen, {"form_also_possible": rivals} if rivals else {})]
@@ -385,7 +405,7 @@ def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, 
 #: Keys of `simulate --effect` beside the coefficient: the numbers of a form, and its other coefficients.
 EFFECT_KEYS = {
     **{key: positive(None) for key in ("lag_s", "width", "window_s")},
-    **{key: Key(None) for key in ("rate", "square", "cube")},
+    **{key: Key(None) for key in ("rate", "square", "cube", "knots")},
 }
 #: Window of a rate whose effect states none, s.
 RATE_WINDOW_S = 60.0
@@ -406,6 +426,9 @@ def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
     elif "rate" in keys:
         window_s = float(keys.get("window_s", RATE_WINDOW_S))
         total += float(keys["rate"]) * slope(values, window_s, interval_s)
+    if "knots" in keys:
+        bent = curved(values, keys["knots"])
+        total += float(keys["coefficient"]) * (bent - bent[0] - (values - values[0]))
     for form in POWER:
         if form in keys:
             column = formed(values, form, about=float(values.mean()))
@@ -419,6 +442,8 @@ def of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
     if form in ("rate", "square", "cube"):
         window = {"window_s": float(column.entry["window_s"])} if form == "rate" else {}
         return {"coefficient": 0.0, form: c[0], **window}
+    if form == FREE:
+        return {"coefficient": c[0], "knots": as_text(column.entry["knots"])}
     return {"coefficient": c[0], **({NUMBER[form]: float(column.entry[NUMBER[form]])} if form in NUMBER else {})}
 
 
@@ -430,4 +455,10 @@ def of_other(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
 def of_look(look: Look) -> dict[str, Any]:
     """Keys of `simulate --effect` for a finding. A slope needs its window, and every form a coefficient."""
     window = {key: look.estimate[key] for key in (NUMBER["rate"], "other") if key in look.estimate}
-    return {"coefficient": 0.0, **medians(look), **window}
+    knots = {"knots": as_text(look.estimate["knots"])} if "knots" in look.estimate else {}
+    return {"coefficient": 0.0, **medians(look), **window, **knots}
+
+
+def as_text(knots: Sequence[Sequence[float]]) -> str:
+    """A curve as a value of `--effect`: CHANNEL/HEIGHT+CHANNEL/HEIGHT..."""
+    return "+".join(f"{place:.7f}/{height:.6f}" for place, height in knots)

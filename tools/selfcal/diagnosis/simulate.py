@@ -231,6 +231,9 @@ def applied_to(text: str, model: Model, scene: _reference.Scene, axes: Sequence[
                 record[key] = _intervals(given[key])
                 scene.motion_times = [*scene.motion_times, *(time for pair in record[key] for time in pair)]
                 continue
+            if key == "knots" and key in given:
+                record[key] = _knots(name, given[key])
+                continue
             if key in given:
                 value = _number(name, key, entry, given[key])
             elif entry.default is not None:
@@ -264,6 +267,24 @@ def _intervals(text: str) -> list[list[float]]:
         if not 0.0 <= begin < end < math.inf:
             raise UserError(f"--effect motion: write intervals=BEGIN-END+BEGIN-END in seconds, not '{text}'")
         found.append([begin, end])
+    return found
+
+
+def _knots(effect: str, text: str) -> list[list[float]]:
+    """A curve of a channel: CHANNEL/HEIGHT+CHANNEL/HEIGHT..., the channel rising."""
+    try:
+        found = [[float(x) for x in pair.split("/")] for pair in text.split("+")]
+    except ValueError:
+        found = []
+    places = [pair[0] for pair in found]
+    if (
+        len(found) < 2
+        or any(len(pair) != 2 or not np.isfinite(pair).all() for pair in found)
+        or sorted(set(places)) != places
+    ):
+        raise UserError(
+            f"--effect {effect}: write knots=CHANNEL/HEIGHT+CHANNEL/HEIGHT..., the channel rising, not '{text}'"
+        )
     return found
 
 

@@ -47,9 +47,17 @@ FORMS = {
     "first_order": "by its value and its rate behind one first-order lag",
     "cube": "by its cube as well",
     "play": "through a play (hysteresis)",
+    "free": "by a curve of its own",
 }
 #: Forms, as an alternative.
-FORM_NAMES = {"rate": "its rate", "square": "its square", "cube": "its cube", "lag": "a lag", "play": "a play"}
+FORM_NAMES = {
+    "rate": "its rate",
+    "square": "its square",
+    "cube": "its cube",
+    "lag": "a lag",
+    "play": "a play",
+    "free": "a curve",
+}
 #: What stands out, by the beginning of a statistic's name.
 STATISTICS = (
     ("jump", "the bias jumps more than its drift does"),
@@ -132,7 +140,7 @@ def _size(key: str, value: Any) -> str:
             return f"jumps at {times} s" if times else ""
         case "statistic":
             return statistic(str(value))
-        case "input" | "source" | "measured" | "law":
+        case "input" | "source" | "measured" | "law" | "knots":
             return ""
     if isinstance(value, list | tuple):
         return f"{label} {', '.join(str(one) for one in value)}"

@@ -122,6 +122,11 @@ class State:
         """The state less some columns. Its fits are still those with them, from which a fit beside it starts."""
         return replace(self, regressors=tuple(one for one in self.regressors if one.name not in names))
 
+    def first(self, samples: int) -> State:
+        """The state of the first samples alone, fitted by itself."""
+        cut = tuple(replace(one, values=one.values[:samples]) for one in self.regressors)
+        return replace(self, y=self.y[:samples], r=self.r[:samples], regressors=cut, fits=()).refit()
+
     def stiffer(self, by: float) -> list[Fit]:
         """The best fit with a drift smaller by exp(-by), if it has one."""
         return [self.best.shrunk(by)] if any(name in DRIFT_SIZES for name in self.best.terms.names) else []

@@ -19,7 +19,7 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 from selfcal.base.units import SENSORS
-from selfcal.model.forms import FORMS, INPUTS, NUMBER, POWER
+from selfcal.model.forms import FORMS, INPUTS, NUMBER, POWER, Knots
 from selfcal.model.laws import (
     DAMPING_LIMITS,
     FACTORS,
@@ -63,13 +63,15 @@ LOG_NORMAL_SD = (1e-4, 5.0)
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
-    "column": ("column", "unit", "reference", "window_s", "input", "form", "lag_s", "width"),
+    "column": ("column", "unit", "reference", "window_s", "input", "form", "lag_s", "width", "knots"),
     "rate": ("column", "unit", "reference", "window_s"),
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
     "turn_on": ("tau_s",),
     "pulse": ("start_s", "end_s"),
 }
+#: Knots of a curve.
+MOST_KNOTS = 200
 #: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
 #: What a term of a law may state beside its kind and deviation.
@@ -169,6 +171,7 @@ class Regressor:
     form: str = "static"
     lag_s: float = math.nan
     width: float = math.nan
+    knots: Knots = ()
 
     @property
     def number(self) -> float:
@@ -178,13 +181,13 @@ class Regressor:
     @property
     def on_module(self) -> bool:
         """Whether `selfcal_form()` makes its columns."""
-        return self.form != "play" and self.input == "value"
+        return self.form not in ("play", "free") and self.input == "value"
 
     @property
     def offset(self) -> float:
         """Value of the column at which x0 alone is the bias: powers are taken about the reference already, and a rate
         has none."""
-        return 0.0 if self.form in POWER or self.form == "rate" else self.reference
+        return 0.0 if self.form in POWER or self.form in ("rate", "free") else self.reference
 
     @property
     def mean_s(self) -> float:
@@ -590,6 +593,8 @@ class _Reader:
         for form, key in NUMBER.items():
             if key != "window_s" and key in fields and chosen["form"] != form:
                 raise self.fail(f"{where}.{key}", f"goes with form: {form} alone")
+        if ("knots" in fields) != (chosen["form"] == "free"):
+            raise self.fail(f"{where}.knots", "goes with form: free, and form: free with knots")
         priors = self.only(self.entry(fields, "sd", where), tuple(group.name for group in groups), f"{where}.sd")
         if not priors:
             raise self.fail(f"{where}.sd", "must name at least one group")
@@ -607,15 +612,32 @@ class _Reader:
         return Regressor(
             name=self.text(fields, "name", where),
             kind=kind,
-            unit=units.power(unit, power) + ("/s" if "rate" in (kind, chosen["form"]) else ""),
+            unit="1"
+            if chosen["form"] == "free"
+            else units.power(unit, power) + ("/s" if "rate" in (kind, chosen["form"]) else ""),
             channel_unit=unit,
             sd={name: self.number(value, f"{where}.sd.{name}") for name, value in priors.items()},
             probability=probability,
             reference=self.number(fields.get("reference", 0.0), f"{where}.reference", low=-math.inf, strict=False),
             column=self.text(fields, "column", where) if "column" in REGRESSORS[kind] else "",
+            knots=self.knots(fields["knots"], f"{where}.knots") if "knots" in fields else (),
             **chosen,
             **needed,
         )
+
+    def knots(self, tree: Any, where: str) -> Knots:
+        """The curve of a form: free."""
+        if not isinstance(tree, list) or not 2 <= len(tree) <= MOST_KNOTS:
+            raise self.fail(where, f"must be a list of 2 to {MOST_KNOTS} pairs [channel, height]")
+        found: list[tuple[float, float]] = []
+        for at, pair in enumerate(tree):
+            if not isinstance(pair, list) or len(pair) != 2:
+                raise self.fail(f"{where}[{at}]", f"must be a pair [channel, height], not {shown(pair)}")
+            place, height = (self.number(x, f"{where}[{at}]", low=-math.inf, strict=False) for x in pair)
+            if found and not place > found[-1][0]:
+                raise self.fail(f"{where}[{at}]", "the channel's values must rise")
+            found.append((place, height))
+        return tuple(found)
 
     def regressors(self, tree: Any, groups: tuple[Group, ...]) -> tuple[Regressor, ...]:
         if not isinstance(tree, list):

@@ -15,9 +15,11 @@ from selfcal import _library32
 Array = NDArray[np.float64]
 
 #: Forms, the simplest first.
-FORMS = ("static", "lag", "rate", "square", "cube", "play")
+FORMS = ("static", "lag", "rate", "square", "cube", "play", "free")
 #: The entry that has a form's number.
 NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width"}
+#: A curve: values of the channel, rising, and heights. Between two the line through both holds, beyond the ends these.
+Knots = tuple[tuple[float, float], ...]
 #: The power of the channel's unit.
 POWER = {"square": 2, "cube": 3}
 #: `selfcal_column_kind_t`: names in C, by number.
@@ -109,6 +111,12 @@ def played(values: Array, width: float) -> Array:
         at = min(max(at, value - half), value + half)
         out[i] = at
     return out
+
+
+def curved(values: Array, knots: Knots) -> Array:
+    """[n]: the heights of a curve at `values` [n] of a channel."""
+    places, heights = np.array(knots).T
+    return np.asarray(np.interp(values, places, heights))
 
 
 def variance_of(values: Array, missing: NDArray[np.integer[Any]] | None = None) -> Array:

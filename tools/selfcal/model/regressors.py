@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model, Regressor
-from selfcal.model.forms import KIND, Source, made, played, source_of, variance_of
+from selfcal.model.forms import KIND, Source, curved, made, played, source_of, variance_of
 
 #: End of a pulse that is over before the first row, s.
 OVER_S = 1e-6
@@ -25,12 +25,12 @@ Choice = tuple[Regressor, ...]
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
-    The library forms them (`selfcal_form()`), as it does on a module. A play, which it lacks, is made of its means.
-    Time counts from the first row, s; a step and a pulse have the clock of the recording that the rows were cut from, a
-    turn-on counts from power-on. A column with a `window_s` is the mean over that time up to each row. A step is 1 from
-    its time on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain over the last
-    `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a column that is
-    absent or of another kind.
+    The library forms them (`selfcal_form()`), as it does on a module. A play and a curve, which it lacks, are made of
+    its means. Time counts from the first row, s; a step and a pulse have the clock of the recording that the rows were
+    cut from, a turn-on counts from power-on. A column with a `window_s` is the mean over that time up to each row. A
+    step is 1 from its time on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain over the
+    last `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a column
+    that is absent or of another kind.
     """
     if not regressors:
         return np.empty((recording.samples, 0))
@@ -49,6 +49,8 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     for one in regressors:
         if one.form == "play":
             columns[:, place] = as_float(played(columns[:, place], one.width))
+        elif one.form == "free":
+            columns[:, place] = as_float(curved(columns[:, place], one.knots))
         place += len(one.columns)
     return columns
 

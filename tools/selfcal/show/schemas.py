@@ -75,6 +75,7 @@ def model() -> Json:
     term = {"anyOf": [{"enum": ["walk", "markov"]}, *kinds]}
     law = _only({"probability": NUMBER, "terms": _list(term), "coloured_noise": {"type": "boolean"}}, ["terms"])
     special = {"column": TEXT, "unit": TEXT, "input": {"enum": ["value", "variance"]}, "form": {"enum": list(FORMS)}}
+    special["knots"] = _list(_list(NUMBER, minItems=2, maxItems=2), minItems=2)
     regressors = [
         _only(
             {"name": TEXT, "kind": {"const": kind}, "sd": _map(NUMBER, minProperties=1), "probability": NUMBER}

@@ -112,7 +112,7 @@ def check_forms(model: Model) -> None:
     """Raises UserError for a regressor of a form that no module makes."""
     for regressor in model.regressors:
         if not regressor.on_module:
-            what = f"form: {regressor.form}" if regressor.form == "play" else f"input: {regressor.input}"
+            what = f"form: {regressor.form}" if regressor.form in ("play", "free") else f"input: {regressor.input}"
             raise UserError(
                 f"{model.path}: regressor '{regressor.name}': no module makes `{what}`: leave the regressor out, or "
                 "take `identify`, which does"

@@ -259,16 +259,8 @@ def _breadth(line: Look) -> float:
 
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
     """The line that the first half alone shows."""
-    y = before.y[:split]
-    half = replace(
-        before,
-        y=y,
-        r=before.r[:split],
-        regressors=tuple(replace(one, values=one.values[:split]) for one in before.regressors),
-        fits=(),
-    ).refit()
     part = replace(record, present=record.present[:split])
-    found = looks(half, part)
+    found = looks(before.first(split), part)
     if not found:
         return after
     f = float(found[0].estimate["frequency_hz"]["median"])

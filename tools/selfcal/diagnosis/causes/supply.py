@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from selfcal.diagnosis import forms
+from selfcal.diagnosis import curve, forms
 from selfcal.diagnosis.cause import Cause, Key, shown
 
 CAUSE = Cause(
@@ -12,6 +12,7 @@ CAUSE = Cause(
     source="surroundings",
     looks=lambda state, record: forms.side_looks(state, record, "supply"),
     at=lambda state, record, theta: forms.side_at(state, record, "supply", theta),
+    trained=curve.trained,
     of_means=True,
     alike=lambda a, b: True,
     pictures=shown("means", "evidence"),

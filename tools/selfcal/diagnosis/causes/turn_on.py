@@ -100,8 +100,7 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     """With the time constants that the first samples alone show. What their scored successors gain is the noise model
     that is left of the first ones: the transient itself is mostly over."""
     known = {one.name for one in before.regressors}
-    cut = tuple(replace(one, values=one.values[:split]) for one in before.regressors)
-    half = replace(before, y=before.y[:split], r=before.r[:split], regressors=cut, fits=()).refit()
+    half = before.first(split)
     own_record = replace(record, present=record.present[:split])
     single = [_shape(half, own_record, [one]) for one in _grid(own_record)]
     found = columns.alike(columns.tried(half, single, slow=False, least=-math.inf))[0]
