@@ -38,9 +38,11 @@ from conftest import CASE_RECORDS, ROOT, case_records
 
 #: The rest of a refusal is the way out.
 NO_FORM, NO_INPUT = "no module makes `form: play`: leave", "no module makes `input: variance`: leave"
+NO_CURVE = "no module makes `form: free`: leave"
 #: Verbs that refuse the written model, or the recording with it, by cause and form.
 REFUSED: Mapping[tuple[str, str], Mapping[str, str]] = {
     ("temperature", "play"): {"codegen": NO_FORM, "replay": NO_FORM},
+    ("temperature", "free"): {"codegen": NO_CURVE, "replay": NO_CURVE},
     ("vibration", "static"): {"codegen": NO_INPUT, "replay": NO_INPUT},
     ("vibration", "lag"): {"codegen": NO_INPUT, "replay": NO_INPUT},
     ("outliers", "lost words"): {"replay": "outside the model's priors"},
@@ -65,7 +67,10 @@ NOT_AGAIN: Mapping[tuple[str, str], str] = {
     ("unexplained", "flat"): "it has no model",
     ("variance_change", "by temperature"): "the simulated noise level follows no channel",
     ("held_samples", "throughout"): "the model is of the part's own rate",
-    **{("temperature", form): "the simulated temperature only rises" for form in ("cube", "play", "first_order")},
+    **{
+        ("temperature", form): "the simulated temperature only rises"
+        for form in ("cube", "play", "first_order", "free")
+    },
     **{("cross_axis", form): "the simulated axis has a drift of its own" for form in ("lag", "square")},
 }
 #: Forms that another one has as a case.

@@ -112,6 +112,7 @@ def _of(channel: str, form: str, **numbers: float) -> Effect:
             "square": lambda: size["square"] * (values - about) ** 2,
             "cube": lambda: size["cube"] * (values - about) ** 3,
             "play": lambda: size["coefficient"] * play(values, numbers["width"]),
+            "free": lambda: size["height"] * np.exp(-0.5 * ((values - about) / 0.8) ** 2),
             "first_order": lambda: (
                 size["coefficient"] * filtered + size["rate"] * (values - filtered) / numbers["lag_s"]
             ),
@@ -119,7 +120,7 @@ def _of(channel: str, form: str, **numbers: float) -> Effect:
         d.y["gx"] += made[form]()
         truth = {key: numbers[key] for key in ("lag_s", "width") if key in numbers}
         # A power about another value than the record's middle has another static part.
-        return {**truth, **({} if form in ("square", "cube") else size)}
+        return {**truth, **({} if form in ("square", "cube", "free") else size)}
 
     return effect
 
@@ -364,6 +365,7 @@ FORMS: Mapping[str, Mapping[str, Effect]] = {
         "square": _of("temperature", "square", square=0.006, about=29.0),
         "cube": _of("temperature", "cube", cube=0.0015, about=31.0),
         "play": _of("temperature", "play", coefficient=0.04, width=3.5),
+        "free": _of("temperature", "free", height=0.25, about=31.0),
         "first_order": _of("temperature", "first_order", coefficient=0.02, rate=4.0, lag_s=50.0),
     },
     "supply": {
