@@ -201,7 +201,7 @@ def test_the_written_model_carries_over(kind: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", CURVES)
 def test_a_curve_of_the_temperature_is_found(kind: str) -> None:
     """It is the first finding, by a curve. Of the dip it is the drawn one within a third of its size, root mean square
-    over the record: where few readings lie a height is known to a third. A table's jumps lie anywhere within the lattice
+    over the record: where few readings lie a height is known to a third. A table's jumps lie anywhere in the lattice
     and noise of the temperature, 0.15 degC: no curve of what was read has more than half of the variance."""
     for seed in range(case_records(2, 20)):
         drawn = Drawn(7900 + seed)

@@ -57,7 +57,7 @@ def test_the_effect_has_the_covariance_of_its_keys() -> None:
     400 independent records: each mean of products within 4.5 of its standard deviations."""
     keys = {"period_s": 37.0, "damping": 0.12, "sd": 0.3}
     channels = oscillation.Channels(np.arange(60.0) / 2.0, *[np.zeros(60)] * 2, {}, np.random.default_rng(465))
-    drawn = np.array([oscillation.CAUSE.add(keys, channels) for _ in range(400)])  # type: ignore[misc]
+    drawn = np.array([oscillation.CAUSE.simulated.add(keys, channels) for _ in range(400)])  # type: ignore[misc]
     w, d = 2.0 * math.pi / keys["period_s"], keys["damping"]
     s = math.sqrt(1.0 - d * d)
     for lag in (0, 7, 20, 40):

@@ -50,8 +50,8 @@ def settled(axes: dict[str, Array], rate: float = 1.0) -> tuple[dict[str, Diagno
     states = {name: State(name, "deg/s", y, 1.0 / rate, 0.0, np.ones(y.size)).refit() for name, y in axes.items()}
     record = Record(rate, states, {}, {}, present, recorded_hz=rate)
     found = {name: Diagnosed(state, state, record) for name, state in states.items()}
-    assert shared.CAUSE.settle is not None
-    shared.CAUSE.settle(record, found)
+    assert shared.CAUSE.grouping.settle is not None
+    shared.CAUSE.grouping.settle(record, found)
     return found, record
 
 
@@ -190,8 +190,8 @@ def test_the_real_accelerometers_share_noise() -> None:
         record = of_recording(recording, Model.load(None), 1.0, ("ax", "ay"))
         states = {name: record.axes[name].refit() for name in ("ax", "ay")}
         found = {name: Diagnosed(state, state, record) for name, state in states.items()}
-        assert shared.CAUSE.settle is not None
-        shared.CAUSE.settle(record, found)
+        assert shared.CAUSE.grouping.settle is not None
+        shared.CAUSE.grouping.settle(record, found)
         for name, other in combinations(found, 2):
             (finding,) = found[name].findings
             assert finding.look.estimate["other"] == other

@@ -373,7 +373,7 @@ def test_every_effect_changes_the_recording_with_its_defaults(effect: str, tmp_p
 def test_the_list_of_effects_has_every_key(tmp_path: Path) -> None:
     """Truth: the keys that the complaint about an unknown one names."""
     rows = dict(line.split(maxsplit=1) for line in run("simulate", "--list-effects").stdout.splitlines()[1:])
-    assert list(rows) == [cause.id for cause in CAUSES.values() if cause.keys]
+    assert list(rows) == [cause.id for cause in CAUSES.values() if cause.simulated.keys]
     for effect, keys in rows.items():
         with pytest.raises(UserError, match=r"unknown key 'nonsense' \(known: (.*)\)") as caught:
             simulate(DATA / "simulated_adis16405.yaml", tmp_path / "log.npz", effects=[f"{effect}:nonsense=1"])

@@ -107,7 +107,7 @@ def _of_axis(
 def _term(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> _Term | str:
     """The finding as a part of the model, or why it is none that another recording can have."""
     cause = CAUSES[finding.look.cause]
-    why_not = cause.no_carry(finding.look) or cause.once
+    why_not = cause.score.no_carry(finding.look) or cause.score.once
     if why_not:
         return why_not
     known = {column.name for column in finding.before.regressors}
@@ -120,10 +120,10 @@ def _term(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -
         if not all(column in at for column in names):
             return "the final model does not have it"
         c = tuple(float(one.state.best.c[1 + at[column]]) for column in names)
-        return _Term(finding, tuple(extended[key] for key in keys), c, cause.anew)
-    if cause.extend is not None and not cause.no_gain:
+        return _Term(finding, tuple(extended[key] for key in keys), c, cause.score.anew)
+    if cause.written.extend is not None and not cause.score.no_gain:
         return _Term(finding, (), (), False)
-    return cause.no_gain or "the bank's model does not change by it"
+    return cause.score.no_gain or "the bank's model does not change by it"
 
 
 def _evidence(
@@ -137,7 +137,7 @@ def _evidence(
     """Bank samples and ln evidence [2, PIECES] after each piece of the second recording, with `terms` in the model."""
     tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
     for term in terms:
-        extend = CAUSES[term.finding.look.cause].extend
+        extend = CAUSES[term.finding.look.cause].written.extend
         if extend is not None and not term.columns:
             extend(Extension(tree, model, record, name, found, term.finding))
     anew = tuple(column for term in terms if term.anew for column in term.columns)

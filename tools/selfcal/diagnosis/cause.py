@@ -105,61 +105,36 @@ def sized(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[s
 
 
 @dataclass(frozen=True)
-class Cause:
-    """Everything about one cause.
+class Grouping:
+    """What makes findings one (events.py).
 
-    id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
-    unsure       words instead where the estimate has `source`: which axis is the source is not shown.
-    looks        candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
-    at           the look at it with a known shape, on an axis that it is known to act on.
-    of_means     slow: means show all of it, and the look at every sample takes it from them.
-    most         times at most that the loop names it on an axis; 0: as often as it is found.
-    slow         a drift of another law may show it: `identify` weighs more laws.
-    source       where it comes from: surroundings, handling, sensor, read-out or model.
-    alike        whether two looks of it are one event or source: the same time, line, channel or law.
-    pairs        its looks name the other axis of a pair (`other`): pairs that meet are one group of axes.
-    piece        whether a look is a piece of a hidden quantity, of which it gets the axes and the times of jumps, s.
-    settle       after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
-    pictures     names of pictures.py for a look.
-    no_gain      why a gain on held-out time is not defined.
-    once         why another recording has it not: an event of its time, or of its read-out. "": it may have it.
-    no_carry     why the bank cannot weigh a look on another recording that has it; "": it can.
-    anew         its size belongs to one recording: another one weighs it anew under its prior.
-    onset        scored from its on-line detection, `Look.when[0]`.
-    trained      look, states before and after, record and split: the state after as the first `split` samples show it.
-    together     nats a sample that two axes gain, and their sd: residuals of both, spacing, s, split and the estimate.
-    least        the size that this record would have shown, by key of the estimate: value and unit; None: no size.
-    entry        the model file's entry of its column for the whole recording, by the look that found it.
-    smoothed     its column is the mean of a channel: the model file states the trailing window that suits it.
-    from_zero    the simulator's effect begins at 0, its column is about the middle.
-    law          adds a law to a model file's tree without which N is wrong: `identify` reports by it.
-    extend       writes what is no column into the model file.
-    stated       whether a model file has it already: then it is no finding. A column is in the model from the start.
-    of_column    keys of `--effect` for columns of the model file: the first one and the coefficients of all.
-    of_estimate  keys of `--effect` for a finding where they are not the medians of its estimate; None, or none of them:
-                 the simulator cannot make it.
-    keys         keys of `simulate --effect`; empty: it cannot be simulated.
-    follows      the effect follows another axis: the key `other`.
-    common       the effect is of the whole recording and has no axis.
-    add          what the effect adds to a reading before the read-out, [n]: keys, channels.
-    spoil        changes the finished readings of an axis in place: those, keys, rate, Hz, lattice, random numbers.
+    alike   whether two looks are one event or source: the same time, line, channel or law.
+    pairs   its looks name the other axis of a pair (`other`): pairs that meet are one group of axes.
+    piece   whether a look is a piece of a hidden quantity, of which it gets the axes and the times of jumps, s.
+    settle  after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
+    most    times at most that the loop names it on an axis; 0: as often as it is found.
     """
 
-    id: str
-    words: str
-    record_next: str
-    unsure: str = ""
-    looks: Looks | None = None
-    at: Callable[[State, Record, Sequence[float]], Look] | None = None
-    of_means: bool = False
-    most: int = 0
-    slow: bool = False
-    source: str = "model"
     alike: Callable[[Look, Look], bool] = _never
     pairs: bool = False
     piece: Callable[[Look, Collection[str], Sequence[float]], bool] = field(default=lambda look, axes, jumps: False)
     settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None
-    pictures: Callable[[Look], Sequence[str]] = field(default=lambda look: ("unexplained",))
+    most: int = 0
+
+
+@dataclass(frozen=True)
+class Scored:
+    """How it is scored on held-out time (score.py), and on another recording (carried.py).
+
+    no_gain   why a gain on held-out time is not defined.
+    once      why another recording has it not: an event of its time, or of its read-out. "": it may have it.
+    no_carry  why the bank cannot weigh a look on another recording that has it; "": it can.
+    anew      its size belongs to one recording: another one weighs it anew under its prior.
+    onset     scored from its on-line detection, `Look.when[0]`.
+    trained   look, states before and after, record and split: the state after as the first `split` samples show it.
+    together  nats a sample that two axes gain, and their sd: residuals of both, spacing, s, split and the estimate.
+    """
+
     no_gain: str = ""
     once: str = ""
     no_carry: Callable[[Look], str] = field(default=lambda look: "")
@@ -167,7 +142,21 @@ class Cause:
     onset: bool = False
     trained: Callable[[Look, State, State, Record, int], State] | None = None
     together: Callable[[Array, Array, float, int, Mapping[str, Any]], tuple[float, float]] | None = None
-    least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None
+
+
+@dataclass(frozen=True)
+class Written:
+    """What the written model file has of it (extend.py).
+
+    entry      its column's entry for the whole recording, by the look that found it.
+    smoothed   its column is the mean of a channel: the file states the trailing window that suits it.
+    from_zero  the simulator's effect begins at 0, its column is about the middle.
+    law        adds a law to a tree without which N is wrong: `identify` reports by it.
+    extend     writes what is no column.
+    stated     whether a model file has it already: then it is no finding. A column is in the model from the start.
+    of_column  keys of `--effect` for columns of the file: the first one and the coefficients of all.
+    """
+
     entry: Callable[[Mapping[str, Any], Look | None, Record], dict[str, Any]] = sized
     smoothed: bool = False
     from_zero: bool = False
@@ -175,12 +164,59 @@ class Cause:
     extend: Callable[[Extension], None] | None = None
     stated: Callable[[Finding, Model], bool] = field(default=lambda finding, model: False)
     of_column: Callable[[Regressor, Sequence[float]], dict[str, Any]] | None = None
-    of_estimate: Callable[[Look], dict[str, Any] | None] | None = None
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """How `simulate --effect` makes it (simulate.py).
+
+    keys         its keys; empty: it cannot be simulated.
+    follows      the effect follows another axis: the key `other`.
+    common       the effect is of the whole recording and has no axis.
+    of_estimate  keys for a finding where they are not the medians of its estimate; None, or none of them: the simulator
+                 cannot make it.
+    add          what the effect adds to a reading before the read-out, [n]: keys, channels.
+    spoil        changes the finished readings of an axis in place: those, keys, rate, Hz, lattice, random numbers.
+    """
+
     keys: Mapping[str, Key] = field(default_factory=dict)
     follows: bool = False
     common: bool = False
+    of_estimate: Callable[[Look], dict[str, Any] | None] | None = None
     add: Callable[[Mapping[str, Any], Channels], Array] | None = None
     spoil: Callable[[Array, Mapping[str, Any], float, float, Random], None] | None = None
+
+
+@dataclass(frozen=True)
+class Cause:
+    """Everything about one cause.
+
+    id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
+    unsure    words instead where the estimate has `source`: which axis is the source is not shown.
+    source    where it comes from: surroundings, handling, sensor, read-out or model.
+    looks     candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
+    at        the look at it with a known shape, on an axis that it is known to act on.
+    of_means  slow: means show all of it, and the look at every sample takes it from them.
+    slow      a drift of another law may show it: `identify` weighs more laws.
+    least     the size that this record would have shown, by key of the estimate: value and unit; None: no size.
+    pictures  names of pictures.py for a look.
+    """
+
+    id: str
+    words: str
+    record_next: str
+    unsure: str = ""
+    source: str = "model"
+    looks: Looks | None = None
+    at: Callable[[State, Record, Sequence[float]], Look] | None = None
+    of_means: bool = False
+    slow: bool = False
+    least: Callable[[State, Record], Mapping[str, tuple[float, str]] | None] | None = None
+    pictures: Callable[[Look], Sequence[str]] = field(default=lambda look: ("unexplained",))
+    grouping: Grouping = Grouping()
+    score: Scored = Scored()
+    written: Written = Written()
+    simulated: Simulated = Simulated()
 
     def located(self, state: State, record: Record, theta: Sequence[float]) -> Look:
         """The look at it with the shape `theta`."""
@@ -189,14 +225,14 @@ class Cause:
 
     def effect(self, look: Look) -> dict[str, Any] | None:
         """Keys of `--effect` for a finding; None: the simulator cannot make it."""
-        if self.of_estimate is not None:
-            return self.of_estimate(look)
-        return {key: value for key, value in medians(look).items() if key in self.keys} or None
+        if self.simulated.of_estimate is not None:
+            return self.simulated.of_estimate(look)
+        return {key: value for key, value in medians(look).items() if key in self.simulated.keys} or None
 
     @property
     def several(self) -> bool:
         """Whether the simulator makes several of its effects on an axis: it has no member that holds one."""
-        return self.add is not None and not any(key.field for key in self.keys.values())
+        return self.simulated.add is not None and not any(key.field for key in self.simulated.keys.values())
 
 
 def shown(*names: str) -> Callable[[Look], Sequence[str]]:

@@ -117,7 +117,7 @@ def events_of(record: Record) -> dict[str, Array]:
 
 def less_stated(one: Diagnosed, model: Model) -> Diagnosed:
     """The axis without findings that the model file states already: they are `stated`."""
-    stated = [finding for finding in one.findings if CAUSES[finding.look.cause].stated(finding, model)]
+    stated = [finding for finding in one.findings if CAUSES[finding.look.cause].written.stated(finding, model)]
     findings = [finding for finding in one.findings if not any(finding is each for each in stated)]
     return replace(one, findings=findings, stated=stated, before=one.before if findings else one.after)
 

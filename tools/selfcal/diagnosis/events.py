@@ -81,9 +81,9 @@ class Member:
         if a.cause != b.cause or all(events):
             return a.cause == b.cause and events[0] == events[1]
         cause = CAUSES[a.cause]
-        if cause.pairs:
+        if cause.grouping.pairs:
             return bool({self.axis, a.estimate["other"]} & {other.axis, b.estimate["other"]})
-        return (self.axis != other.axis or a.when is None) and cause.alike(a, b)
+        return (self.axis != other.axis or a.when is None) and cause.grouping.alike(a, b)
 
 
 @dataclass
@@ -165,7 +165,7 @@ def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -
         look = member.finding.look
         if quantity is not None and member.axis in quantity["axes"]:
             start_s = member.entry["when"][0] - look.when[0] if look.when else 0.0
-            if CAUSES[look.cause].piece(look, quantity["axes"], [jump - start_s for jump in jumps]):
+            if CAUSES[look.cause].grouping.piece(look, quantity["axes"], [jump - start_s for jump in jumps]):
                 events[0].members.append(member)
                 continue
         fitting = [event for event in events if event.entry is None and any(map(member.joins, event.members))]
@@ -176,7 +176,9 @@ def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -
             continue
         nearest = min(fitting, key=lambda event: _apart(event, member))
         nearest.members.append(member)
-        for other in fitting if CAUSES[look.cause].pairs else ():  # a pair that joins two groups makes them one
+        for other in (
+            fitting if CAUSES[look.cause].grouping.pairs else ()
+        ):  # a pair that joins two groups makes them one
             if other is not nearest:
                 nearest.members += other.members
                 events.remove(other)
@@ -279,7 +281,7 @@ def _entry(event: Event) -> dict[str, Any]:
         pairs = {
             frozenset((member.axis, str(member.finding.look.estimate.get("other")))): member for member in event.members
         }
-        counted = list(pairs.values()) if CAUSES[event.cause].pairs else event.members
+        counted = list(pairs.values()) if CAUSES[event.cause].grouping.pairs else event.members
         gain = sum(member.finding.look.gain for member in counted)
         entry = {
             "cause": event.cause,

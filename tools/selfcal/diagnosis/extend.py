@@ -55,7 +55,7 @@ def extended(
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]
     for name, one in found.items():
         for finding in one.findings:
-            extend = CAUSES[finding.look.cause].extend
+            extend = CAUSES[finding.look.cause].written.extend
             if extend is not None:
                 extend(Extension(tree, model, record, name, found, finding))
     _fit_small(tree, kept)
@@ -157,10 +157,12 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
                 continue
             finding = finding_of(one, regressor)
             look = None if finding is None else finding.look
-            own = CAUSES[regressor.cause].entry(regressor.entry, look, record)
+            own = CAUSES[regressor.cause].written.entry(regressor.entry, look, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
             form = entry.get("form")
-            if entry["kind"] == "column" and (form == "rate" or (CAUSES[regressor.cause].smoothed and form != "lag")):
+            if entry["kind"] == "column" and (
+                form == "rate" or (CAUSES[regressor.cause].written.smoothed and form != "lag")
+            ):
                 smoothed.add(key)
             c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
@@ -246,7 +248,7 @@ def fitted_law(one: Diagnosed, block: int | None = None, rounded: float = 0.0) -
     at_first = sum(
         float(c * column.values[0])
         for c, column in zip(fit.c[1:], one.state.regressors, strict=True)
-        if column.cause in CAUSES and CAUSES[column.cause].from_zero and form_of(column)[2] != "rate"
+        if column.cause in CAUSES and CAUSES[column.cause].written.from_zero and form_of(column)[2] != "rate"
     )
     return {
         "hypothesis": drift.pop("hypothesis"),
@@ -278,7 +280,7 @@ def _effects(name: str, one: Diagnosed) -> list[str]:
             strongest[kind] = effect
     texts = []
     for effect in strongest.values():
-        where = {} if effect.cause.common else {"axis": name}
+        where = {} if effect.cause.simulated.common else {"axis": name}
         values = {key: f"{value:.8g}" if isinstance(value, float) else value for key, value in effect.keys.items()}
         texts.append(f"{effect.cause.id}:" + ",".join(f"{key}={value}" for key, value in {**values, **where}.items()))
     return texts
@@ -323,8 +325,8 @@ def _of_columns(one: Diagnosed) -> Iterator[_Effect]:
             0.5 * (value / max(float(fit.sd[1 + k]), 1e-300)) ** 2 for value, k in zip(c, places, strict=True)
         )
         cause = CAUSES.get(column.cause)
-        if cause is not None and cause.of_column is not None:
-            yield _Effect(cause, strength, cause.of_column(column, c), _channel_of(column))
+        if cause is not None and cause.written.of_column is not None:
+            yield _Effect(cause, strength, cause.written.of_column(column, c), _channel_of(column))
 
 
 def check_not_by_hand(path: Path | str) -> None:

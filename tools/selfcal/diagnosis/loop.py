@@ -94,7 +94,10 @@ def diagnose_record(
     work.each(walk, found)
     if any(one.unfinished == INTERRUPTED for one in found.values()):
         raise Stopped
-    settled = [_weed(found), *(cause.settle(record, found) for cause in CAUSES.values() if cause.settle is not None)]
+    settled = [
+        _weed(found),
+        *(cause.grouping.settle(record, found) for cause in CAUSES.values() if cause.grouping.settle is not None),
+    ]
     changed = list(dict.fromkeys(name for names in settled for name in names))
     work.each(lambda name: _end(found[name], advance), changed)
     return found
@@ -368,7 +371,8 @@ def _looked(one: Diagnosed, record: Record, causes: Sequence[Looks]) -> tuple[li
         looks = [
             look
             for look in cause(one.state, record)
-            if named[look.cause] < (CAUSES[look.cause].most or ROUNDS) and not any(map(look.repeats, one.harmful))
+            if named[look.cause] < (CAUSES[look.cause].grouping.most or ROUNDS)
+            and not any(map(look.repeats, one.harmful))
         ]
         found += looks
         if all(look.net < NET_LEAST for look in looks):

@@ -66,29 +66,29 @@ def gain(
     """What one finding gains. `partner`: the axis that shares the cause. `located`: several axes show its shape, which
     the first half of one alone hardly does."""
     cause = CAUSES[look.cause]
-    if cause.no_gain:
-        return HeldOut(None, cause.no_gain)
+    if cause.score.no_gain:
+        return HeldOut(None, cause.score.no_gain)
     n = before.y.size
     split = n // 2
-    joint = cause.together is not None and partner is not None
+    joint = cause.score.together is not None and partner is not None
     if before is after and not joint:
         return HeldOut(None, "the readings are left out before and after: the model of the noise is the same")
-    if cause.onset and look.when is not None:
+    if cause.score.onset and look.when is not None:
         place = round(look.when[0] * record.rate_hz)
         if place > split - max(20, n // 20):
             split = place + max(20, (n - place) // 4)
         if n - split < max(60, n // 20):
             return HeldOut(None, "too little of the record is left after its detection")
-    if cause.trained is not None and not located:
-        after = cause.trained(look, before, after, record, split)
+    if cause.score.trained is not None and not located:
+        after = cause.score.trained(look, before, after, record, split)
     cut = _cut(before, partner if joint and partner is not None else after, split)
     if cut is None:
         return HeldOut(None, "too few samples are left to score")
-    if cause.together is not None and partner is not None:
+    if cause.score.together is not None and partner is not None:
         # The joint log score of two axes less the other one's own is the first one's given the other.
         old = _sequential(before, cut.marks, {})
         one, two = (_residual(state, split) for state in (before, partner))
-        more, sd = cause.together(one, two, before.dt, split, look.estimate)
+        more, sd = cause.score.together(one, two, before.dt, split, look.estimate)
         scores = cut.scores(old.ln_evidence)
         return _held_out(cut, scores, scores + more, sd, before.unit, {})
     horizons = _horizons(before.dt, n, split)
@@ -283,7 +283,7 @@ def bias_ahead(state: State) -> float:
     events = [
         c * column.values[-1]
         for c, column in zip(fit.c[1:], state.regressors, strict=True)
-        if column.cause in CAUSES and CAUSES[column.cause].once
+        if column.cause in CAUSES and CAUSES[column.cause].score.once
     ]
     return float(fit.c[0] + sum(events) + (x[0] - fit.c @ x[1:]) @ (m.h @ total) / count)
 

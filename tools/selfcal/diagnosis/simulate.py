@@ -33,7 +33,7 @@ def added_by(
 ) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
     """Adds the effects that a cause forms by itself, and the quantity that moves several axes, to `values` [axes, n]
     before the read-out; None without any."""
-    own = [(form, one["axes"]) for one in applied if (form := CAUSES[one["id"]].add) is not None]
+    own = [(form, one["axes"]) for one in applied if (form := CAUSES[one["id"]].simulated.add) is not None]
     hidden = model.hidden_input
     if not own and hidden is None:
         return None
@@ -77,7 +77,7 @@ def read_out(
     s, and how many readings make one from there on; None without."""
     changed = None
     for effect in applied:
-        spoil = CAUSES[effect["id"]].spoil
+        spoil = CAUSES[effect["id"]].simulated.spoil
         for name, keys in effect["axes"].items():
             place = model.axes.index(name)
             if spoil is not None:
@@ -105,14 +105,16 @@ def show_effects() -> None:
     """Print every effect of `--effect` with its keys, and the limits of a key where it has any."""
     print("--effect ID:key=value,... with these keys. Those that are not given have defaults, or are left out:")
     for cause in CAUSES.values():
-        keys = [key if of.limits == Key(None).limits else f"{key} ({of.limits})" for key, of in cause.keys.items()]
+        keys = [
+            key if of.limits == Key(None).limits else f"{key} ({of.limits})" for key, of in cause.simulated.keys.items()
+        ]
         if keys:
             print(f"  {cause.id:20}{', '.join([*keys, *_other_keys(cause)])}")
 
 
 def _other_keys(cause: Cause) -> list[str]:
     """Keys whose values are names of axes."""
-    return [*(["other"] if cause.follows else []), *([] if cause.common else ["axis"])]
+    return [*(["other"] if cause.simulated.follows else []), *([] if cause.simulated.common else ["axis"])]
 
 
 def show(meta: Mapping[str, Any], output: Path | str) -> None:
@@ -204,11 +206,11 @@ def axis_of(truth: Mapping[str, Any], group: Group, dt_s: float, block: int) -> 
 def applied_to(text: str, model: Model, scene: _reference.Scene, axes: Sequence[_reference.Axis]) -> dict[str, Any]:
     """Put one effect, ID[:key=value,...], into the scene. Returns what was applied, default values filled in."""
     name, *pairs = re.split("[:,]", text)
-    known = [cause.id for cause in CAUSES.values() if cause.keys]
+    known = [cause.id for cause in CAUSES.values() if cause.simulated.keys]
     if name not in known:
         raise UserError(f"--effect: unknown effect '{name}' (known: {', '.join(known)})")
     cause = CAUSES[name]
-    keys = cause.keys
+    keys = cause.simulated.keys
     names = [*keys, *_other_keys(cause)]
     given: dict[str, str] = {}
     for pair in pairs:
@@ -244,7 +246,7 @@ def applied_to(text: str, model: Model, scene: _reference.Scene, axes: Sequence[
             record[key] = int(value) if whole else value
             if entry.field:
                 setattr(scene if whole else axis, entry.field, record[key])
-        if cause.follows:
+        if cause.simulated.follows:
             following = group.axes[(group.axes.index(axis_name) + 1) % len(group.axes)]
             record["other"] = given.get("other", following)
             model.group_of(record["other"])

@@ -72,7 +72,7 @@ def with_added_laws(
 
     again = []
     for name, shown in suspected.items():
-        add_law = CAUSES[shown.cause].law
+        add_law = CAUSES[shown.cause].written.law
         if add_law is None or document["axes"][name]["suspicion"] != shown.cause:
             continue
         tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))

@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, shown
+from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.causes import quantization_noise
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
@@ -93,12 +93,11 @@ CAUSE = Cause(
     "The white noise has memory: neighbouring samples are correlated.",
     "Record at the sensor's full rate with its filter off.",
     source="read-out",
-    alike=lambda a, b: True,
     looks=looks,
     slow=True,
     pictures=shown("correlation"),
     least=_least,
-    extend=_extend,
-    stated=_stated,
-    keys={"lag1": Key(lambda s: 0.5, "noise_lag1", lambda v: -1.0 < v < 1.0, "between -1 and 1")},
+    grouping=Grouping(alike=lambda a, b: True),
+    written=Written(extend=_extend, stated=_stated),
+    simulated=Simulated(keys={"lag1": Key(lambda s: 0.5, "noise_lag1", lambda v: -1.0 < v < 1.0, "between -1 and 1")}),
 )

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis import forms
-from selfcal.diagnosis.cause import Cause, Key, shown, sized
+from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, shown, sized
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
@@ -195,16 +195,19 @@ CAUSE = Cause(
     "third one that was not recorded, such as the temperature.",
     record_next="Turn the sensor so that the other axis reads something else. Record temperature and supply beside it.",
     source="sensor",
-    alike=lambda a, b: bool(a.estimate["other"] == b.estimate["other"]),
-    piece=lambda look, axes, jumps: look.estimate["other"] in axes,
     looks=looks,
-    settle=_settle,
     pictures=shown("means", "evidence"),
     least=_least,
-    entry=_entry,
-    of_column=forms.of_other,
-    of_estimate=forms.of_look,
-    keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **forms.EFFECT_KEYS},
-    add=lambda keys, channels: forms.added(keys, channels, channels.axes[str(keys["other"])]),
-    follows=True,
+    grouping=Grouping(
+        alike=lambda a, b: bool(a.estimate["other"] == b.estimate["other"]),
+        piece=lambda look, axes, jumps: look.estimate["other"] in axes,
+        settle=_settle,
+    ),
+    written=Written(entry=_entry, of_column=forms.of_other),
+    simulated=Simulated(
+        keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **forms.EFFECT_KEYS},
+        follows=True,
+        of_estimate=forms.of_look,
+        add=lambda keys, channels: forms.added(keys, channels, channels.axes[str(keys["other"])]),
+    ),
 )

@@ -6,7 +6,7 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, shown
+from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.model_tree import add_law
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, best, fit, ln_likelihood, moved, run
@@ -74,11 +74,12 @@ CAUSE = Cause(
     "Use B, not K: --write-model states its law. A record three times as long makes sure.",
     source="sensor",
     of_means=True,
-    alike=lambda a, b: True,
     looks=looks,
     slow=True,
     pictures=shown("allan"),
-    extend=_extend,
-    stated=lambda finding, model: any(law.drift_name == "B" for law in model.laws.values()),
-    keys={"B": Key(lambda s: 0.5 * s.n, "flicker_B")},
+    grouping=Grouping(alike=lambda a, b: True),
+    written=Written(
+        extend=_extend, stated=lambda finding, model: any(law.drift_name == "B" for law in model.laws.values())
+    ),
+    simulated=Simulated(keys={"B": Key(lambda s: 0.5 * s.n, "flicker_B")}),
 )

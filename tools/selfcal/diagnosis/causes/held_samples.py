@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, counted, medians, positive
+from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, counted, medians, positive
 from selfcal.likelihood.state import Look
 from selfcal.likelihood.statemodel import Array
 
@@ -43,9 +43,11 @@ CAUSE = Cause(
     "The logger asks oftener than the sensor measures: readings repeat.",
     "Log at the sensor's own rate, on its data-ready line.",
     source="read-out",
-    alike=lambda a, b: True,
-    no_gain="repeats are left out before and after",
-    of_estimate=_of_estimate,
-    keys={"rate_hz": positive(lambda s: 0.2 * s.samples / s.duration_s), "intervals": counted(None)},
-    spoil=_spoil,
+    grouping=Grouping(alike=lambda a, b: True),
+    score=Scored(no_gain="repeats are left out before and after"),
+    simulated=Simulated(
+        keys={"rate_hz": positive(lambda s: 0.2 * s.samples / s.duration_s), "intervals": counted(None)},
+        of_estimate=_of_estimate,
+        spoil=_spoil,
+    ),
 )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from selfcal.diagnosis.cause import Cause, counted, medians, shown
+from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, counted, medians, shown
 
 #: Missing samples are told of from this share on.
 MISSING_LEAST = 1e-3
@@ -12,11 +12,13 @@ CAUSE = Cause(
     "Samples are missing.",
     "Check the logger's buffer and the data-ready line.",
     source="read-out",
-    alike=lambda a, b: True,
     pictures=shown("missing"),
-    no_gain="gaps are bridged before and after: the model of the noise is the same",
     least=lambda state, record: {"missing": (MISSING_LEAST * record.present.size, "samples")},
-    of_estimate=lambda look: {key: max(1, round(value)) for key, value in medians(look).items()},
-    keys={"missing": counted(lambda s: max(1, round(0.02 * s.samples)), "missing")},
-    common=True,
+    grouping=Grouping(alike=lambda a, b: True),
+    score=Scored(no_gain="gaps are bridged before and after: the model of the noise is the same"),
+    simulated=Simulated(
+        keys={"missing": counted(lambda s: max(1, round(0.02 * s.samples)), "missing")},
+        common=True,
+        of_estimate=lambda look: {key: max(1, round(value)) for key, value in medians(look).items()},
+    ),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from selfcal.diagnosis.cause import Cause, Key, counted, shown
+from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, counted, shown
 from selfcal.likelihood.state import Look
 from selfcal.readings.motion import Moved
 
@@ -28,12 +28,14 @@ CAUSE = Cause(
     "The sensor was moved or shaken while it should have rested.",
     "Record on a heavy table, away from traffic.",
     source="handling",
-    alike=lambda a, b: True,
-    once="motion is an event of its recording",
     pictures=shown("largest", "fine_level"),
-    of_estimate=_of_estimate,
-    keys={
-        "intervals": counted(lambda s: 5, "motion_intervals"),
-        "amplitude": Key(lambda s: 20.0 * s.sd, "motion_amplitude"),
-    },
+    grouping=Grouping(alike=lambda a, b: True),
+    score=Scored(once="motion is an event of its recording"),
+    simulated=Simulated(
+        keys={
+            "intervals": counted(lambda s: 5, "motion_intervals"),
+            "amplitude": Key(lambda s: 20.0 * s.sd, "motion_amplitude"),
+        },
+        of_estimate=_of_estimate,
+    ),
 )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.bank.result import HALF_90
-from selfcal.diagnosis.cause import Cause, Channels, Extension, Key, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
@@ -204,21 +204,21 @@ CAUSE = Cause(
     "Look for a control loop or a table of this period. Record 20 periods.",
     source="sensor",
     looks=looks,
-    most=1,
     slow=True,
     of_means=True,
-    alike=_alike,
     pictures=shown("allan", "spectrum"),
-    extend=_extend,
-    stated=_stated,
-    add=_add,
-    keys={
-        "period_s": positive(lambda s: s.duration_s / 20.0),
-        "damping": Key(
-            lambda s: 0.1,
-            fits=lambda value: DAMPING_LIMITS[0] <= value <= DAMPING_LIMITS[1],
-            limits=f"{DAMPING_LIMITS[0]:g} to {DAMPING_LIMITS[1]:g}",
-        ),
-        "sd": positive(lambda s: 0.5 * s.n),
-    },
+    grouping=Grouping(alike=_alike, most=1),
+    written=Written(extend=_extend, stated=_stated),
+    simulated=Simulated(
+        keys={
+            "period_s": positive(lambda s: s.duration_s / 20.0),
+            "damping": Key(
+                lambda s: 0.1,
+                fits=lambda value: DAMPING_LIMITS[0] <= value <= DAMPING_LIMITS[1],
+                limits=f"{DAMPING_LIMITS[0]:g} to {DAMPING_LIMITS[1]:g}",
+            ),
+            "sd": positive(lambda s: 0.5 * s.n),
+        },
+        add=_add,
+    ),
 )

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, shown
+from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Scored, Simulated, Written, shown
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import run
@@ -122,11 +122,13 @@ CAUSE = Cause(
     "Single samples are far off.",
     "Check the bus: log the raw words of those samples.",
     source="read-out",
-    alike=lambda a, b: True,
     looks=looks,
-    once="outliers are events of their recording",
     pictures=shown("largest", "histogram"),
     least=_least,
-    extend=_extend,
-    keys={"fraction": Key(lambda s: 0.005, "outlier_fraction", lambda v: 0.0 <= v <= 1.0, "from 0 to 1")},
+    grouping=Grouping(alike=lambda a, b: True),
+    score=Scored(once="outliers are events of their recording"),
+    written=Written(extend=_extend),
+    simulated=Simulated(
+        keys={"fraction": Key(lambda s: 0.005, "outlier_fraction", lambda v: 0.0 <= v <= 1.0, "from 0 to 1")}
+    ),
 )

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.fft import next_fast_len, rfft
 from scipy.ndimage import uniform_filter1d
 
-from selfcal.diagnosis.cause import Cause, Key
+from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, Written
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, finish, fit, moved
@@ -308,15 +308,15 @@ CAUSE = Cause(
     source="surroundings",
     looks=looks,
     at=at,
-    alike=_alike,
-    settle=_settle,
     pictures=_pictures,
-    anew=True,
-    trained=_trained,
     least=_least,
-    of_column=_of_column,
-    keys={
-        "frequency_hz": Key(lambda s: 0.05, "periodic_frequency_hz"),
-        "amplitude": Key(lambda s: 0.5 * s.n, "periodic_amplitude"),
-    },
+    grouping=Grouping(alike=_alike, settle=_settle),
+    score=Scored(anew=True, trained=_trained),
+    written=Written(of_column=_of_column),
+    simulated=Simulated(
+        keys={
+            "frequency_hz": Key(lambda s: 0.05, "periodic_frequency_hz"),
+            "amplitude": Key(lambda s: 0.5 * s.n, "periodic_amplitude"),
+        }
+    ),
 )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.base.grid import half_means
-from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
 from selfcal.diagnosis.causes.step import ONE_EVENT_S, WEIGHT_LEAST, Scan, at_jump, raised, scan
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
@@ -317,20 +317,19 @@ CAUSE = Cause(
     source="surroundings",
     looks=looks,
     at=at,
-    most=3,
     slow=True,
     of_means=True,
-    alike=_alike,
-    piece=at_jump,
-    once="a pulse is an event of its recording",
     pictures=shown("means", "evidence"),
     least=_least,
-    entry=_entry,
-    of_column=_of_column,
-    add=_add,
-    keys={
-        "time_s": Key(lambda s: 0.45 * s.duration_s),
-        "duration_s": positive(lambda s: 0.1 * s.duration_s),
-        "amplitude": Key(lambda s: 2.0 * s.n),
-    },
+    grouping=Grouping(alike=_alike, piece=at_jump, most=3),
+    score=Scored(once="a pulse is an event of its recording"),
+    written=Written(entry=_entry, of_column=_of_column),
+    simulated=Simulated(
+        keys={
+            "time_s": Key(lambda s: 0.45 * s.duration_s),
+            "duration_s": positive(lambda s: 0.1 * s.duration_s),
+            "amplitude": Key(lambda s: 2.0 * s.n),
+        },
+        add=_add,
+    ),
 )

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, Key, medians, positive, shown
+from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, medians, positive, shown
 from selfcal.likelihood.statemodel import Array
 
 
@@ -38,15 +38,17 @@ CAUSE = Cause(
     "The codes of the converter show in the readings: they are coarse and not stated, or they are not alike.",
     "State the lsb in the model file, or record with a finer range.",
     source="read-out",
-    alike=lambda a, b: True,
     pictures=shown("lattice"),
-    no_gain="the lattice is in the reading and not in the prediction",
-    of_estimate=lambda look: medians(look) if "misread" in look.estimate else None,
-    keys={
-        "lsb": positive(lambda s: 2.0 * s.sd, "lsb"),
-        "misread": Key(None, fits=lambda v: 0.0 <= v <= 1.0, limits="from 0 to 1"),
-        "value": Key(None),
-        "width": positive(None),
-    },
-    spoil=_spoil,
+    grouping=Grouping(alike=lambda a, b: True),
+    score=Scored(no_gain="the lattice is in the reading and not in the prediction"),
+    simulated=Simulated(
+        keys={
+            "lsb": positive(lambda s: 2.0 * s.sd, "lsb"),
+            "misread": Key(None, fits=lambda v: 0.0 <= v <= 1.0, limits="from 0 to 1"),
+            "value": Key(None),
+            "width": positive(None),
+        },
+        of_estimate=lambda look: medians(look) if "misread" in look.estimate else None,
+        spoil=_spoil,
+    ),
 )

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.base import units
-from selfcal.diagnosis.cause import Cause, Channels, Extension, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Simulated, Written, positive, shown
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit
@@ -86,12 +86,11 @@ CAUSE = Cause(
     "The readings are differences of a counted angle or velocity: quantization noise stands beside the white noise.",
     "State the increment of the counter, or record the counter itself.",
     source="read-out",
-    alike=lambda a, b: True,
     pictures=shown("correlation"),
     least=_least,
-    law=_law,
-    extend=_extend,
-    stated=lambda finding, model: any(law.coloured_noise for law in model.laws.values()),
-    keys={"Q": positive(lambda s: s.n * math.sqrt(s.duration_s / s.samples))},
-    add=_add,
+    grouping=Grouping(alike=lambda a, b: True),
+    written=Written(
+        law=_law, extend=_extend, stated=lambda finding, model: any(law.coloured_noise for law in model.laws.values())
+    ),
+    simulated=Simulated(keys={"Q": positive(lambda s: s.n * math.sqrt(s.duration_s / s.samples))}, add=_add),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from selfcal.diagnosis.cause import Cause, Key, shown
+from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Shape
@@ -37,13 +37,12 @@ CAUSE = Cause(
     "Record three times as long, with the temperature beside it.",
     source="sensor",
     of_means=True,
-    alike=lambda a, b: True,
     looks=looks,
     at=at,
     slow=True,
     pictures=shown("means", "evidence"),
     least=lambda state, record: columns.least(state, _shape(state, record), "slope"),
-    from_zero=True,
-    of_column=lambda column, c: {"slope": c[0]},
-    keys={"slope": Key(lambda s: 5.0 * s.n / s.duration_s, "ramp_slope")},
+    grouping=Grouping(alike=lambda a, b: True),
+    written=Written(from_zero=True, of_column=lambda column, c: {"slope": c[0]}),
+    simulated=Simulated(keys={"slope": Key(lambda s: 5.0 * s.n / s.duration_s, "ramp_slope")}),
 )

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
-from selfcal.diagnosis.cause import Cause, shown
+from selfcal.diagnosis.cause import Cause, Grouping, Scored, shown
 from selfcal.diagnosis.causes.cross_axis import without
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
@@ -324,11 +324,14 @@ CAUSE = Cause(
     "Two axes share noise of a common source.",
     "Change the supply, then the mount: the noise that follows one of them comes from there.",
     source="surroundings",
-    pairs=True,
-    # Slow noise: the quantity wanders.
-    piece=lambda look, axes, jumps: look.estimate["other"] in axes and look.estimate.get("band_hz", (1.0,))[0] == 0.0,
-    settle=_settle,
     pictures=shown("together"),
-    together=carried_over,
     least=_least,
+    grouping=Grouping(
+        pairs=True,
+        piece=lambda look, axes, jumps: (
+            look.estimate["other"] in axes and look.estimate.get("band_hz", (1.0,))[0] == 0.0
+        ),
+        settle=_settle,
+    ),
+    score=Scored(together=carried_over),
 )

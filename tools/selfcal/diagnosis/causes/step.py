@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Key, shown, sized
+from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, Written, shown, sized
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
@@ -223,18 +223,17 @@ CAUSE = Cause(
     source="handling",
     looks=looks,
     at=at,
-    most=3,
     slow=True,
     of_means=True,
-    alike=_alike,
-    piece=at_jump,
     pictures=shown("means", "evidence"),
-    once="a jump is an event of its recording",
     least=_least,
-    entry=_entry,
-    of_column=_of_column,
-    keys={
-        "time_s": Key(lambda s: s.duration_s / 2.0, "step_time_s"),
-        "amplitude": Key(lambda s: 2.0 * s.n, "step_amplitude"),
-    },
+    grouping=Grouping(alike=_alike, piece=at_jump, most=3),
+    score=Scored(once="a jump is an event of its recording"),
+    written=Written(entry=_entry, of_column=_of_column),
+    simulated=Simulated(
+        keys={
+            "time_s": Key(lambda s: s.duration_s / 2.0, "step_time_s"),
+            "amplitude": Key(lambda s: 2.0 * s.n, "step_amplitude"),
+        }
+    ),
 )

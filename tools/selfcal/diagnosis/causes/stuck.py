@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from selfcal._reference import Random
-from selfcal.diagnosis.cause import Cause, counted
+from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, counted
 from selfcal.likelihood.statemodel import Array
 
 
@@ -23,9 +23,11 @@ CAUSE = Cause(
     "The readings stop at one value for a while.",
     "Check the bus and the sensor's data-ready line at that time.",
     source="read-out",
-    alike=lambda a, b: bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0]),
-    no_gain="readings that stick are no readings: none is scored",
-    of_estimate=lambda look: {"intervals": len(look.estimate["intervals"])},
-    keys={"intervals": counted(lambda s: 2)},
-    spoil=_spoil,
+    grouping=Grouping(alike=lambda a, b: bool(a.estimate["intervals"][0][0] == b.estimate["intervals"][0][0])),
+    score=Scored(no_gain="readings that stick are no readings: none is scored"),
+    simulated=Simulated(
+        keys={"intervals": counted(lambda s: 2)},
+        of_estimate=lambda look: {"intervals": len(look.estimate["intervals"])},
+        spoil=_spoil,
+    ),
 )

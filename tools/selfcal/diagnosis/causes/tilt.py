@@ -14,7 +14,7 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
-from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, shown
 from selfcal.diagnosis.causes import step
 from selfcal.likelihood.state import Look, State, interval
 from selfcal.likelihood.statemodel import Array
@@ -109,11 +109,11 @@ CAUSE = Cause(
     source="handling",
     at=step.at,
     of_means=True,
-    alike=step.CAUSE.alike,
     pictures=shown("means", "evidence"),
-    once="a turn is an event of its recording",
-    entry=step.CAUSE.entry,
-    of_column=step.CAUSE.of_column,
-    add=_add,
-    keys={"time_s": Key(lambda s: s.duration_s / 2.0), "amplitude": Key(lambda s: 2.0 * s.n)},
+    grouping=Grouping(alike=step.CAUSE.grouping.alike),
+    score=Scored(once="a turn is an event of its recording"),
+    written=Written(entry=step.CAUSE.written.entry, of_column=step.CAUSE.written.of_column),
+    simulated=Simulated(
+        keys={"time_s": Key(lambda s: s.duration_s / 2.0), "amplitude": Key(lambda s: 2.0 * s.n)}, add=_add
+    ),
 )

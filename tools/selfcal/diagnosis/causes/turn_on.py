@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, medians, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
@@ -139,21 +139,22 @@ CAUSE = Cause(
     source="sensor",
     looks=looks,
     at=at,
-    most=1,
     slow=True,
     of_means=True,
-    alike=_alike,
     pictures=shown("means", "evidence"),
-    trained=_trained,
-    anew=True,
     least=_least,
-    entry=_entry,
-    of_column=lambda column, c: {"amplitude": c[0], "tau_s": float(column.entry["tau_s"])},
-    add=_add,
-    keys={
-        "amplitude": Key(lambda s: 5.0 * s.n),
-        "tau_s": positive(lambda s: s.duration_s / 10.0),
-        "amplitude_2": Key(lambda s: 0.0),
-        "tau_2_s": positive(lambda s: s.duration_s / 10.0),
-    },
+    grouping=Grouping(alike=_alike, most=1),
+    score=Scored(anew=True, trained=_trained),
+    written=Written(
+        entry=_entry, of_column=lambda column, c: {"amplitude": c[0], "tau_s": float(column.entry["tau_s"])}
+    ),
+    simulated=Simulated(
+        keys={
+            "amplitude": Key(lambda s: 5.0 * s.n),
+            "tau_s": positive(lambda s: s.duration_s / 10.0),
+            "amplitude_2": Key(lambda s: 0.0),
+            "tau_2_s": positive(lambda s: s.duration_s / 10.0),
+        },
+        add=_add,
+    ),
 )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from selfcal.diagnosis.cause import Cause, Channels, Key, positive, shown
+from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.causes.step import scan
@@ -251,15 +251,19 @@ CAUSE = Cause(
     "Record longer: dwell times are known by the jumps. Try another part: single ones have it.",
     source="sensor",
     looks=looks,
-    most=1,
     slow=True,
     pictures=shown("means", "evidence"),
-    no_gain="the levels are found in the readings themselves, and no model file predicts them",
-    once="its jumps are events of their recording",
-    add=_add,
-    keys={
-        "amplitude": Key(lambda s: 3.0 * s.n),
-        "dwell_low_s": positive(lambda s: s.duration_s / 20.0),
-        "dwell_high_s": positive(lambda s: s.duration_s / 20.0),
-    },
+    grouping=Grouping(most=1),
+    score=Scored(
+        no_gain="the levels are found in the readings themselves, and no model file predicts them",
+        once="its jumps are events of their recording",
+    ),
+    simulated=Simulated(
+        keys={
+            "amplitude": Key(lambda s: 3.0 * s.n),
+            "dwell_low_s": positive(lambda s: s.duration_s / 20.0),
+            "dwell_high_s": positive(lambda s: s.duration_s / 20.0),
+        },
+        add=_add,
+    ),
 )

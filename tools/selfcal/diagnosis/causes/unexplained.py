@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from selfcal.diagnosis.cause import Cause
+from selfcal.diagnosis.cause import Cause, Grouping, Scored
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 
@@ -25,8 +25,8 @@ CAUSE = Cause(
     "unexplained",
     "The readings differ from every model tried, and no known cause explains it.",
     "Record again: if the statistic stands out a second time, it is the sensor's own.",
-    alike=lambda a, b: bool(a.estimate["statistic"] == b.estimate["statistic"]),
-    most=1,
-    settle=_settle,
-    no_gain="no model was extended",
+    grouping=Grouping(
+        alike=lambda a, b: bool(a.estimate["statistic"] == b.estimate["statistic"]), settle=_settle, most=1
+    ),
+    score=Scored(no_gain="no model was extended"),
 )

@@ -12,7 +12,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from selfcal.diagnosis.cause import Cause, Extension, Key, medians, positive, shown
+from selfcal.diagnosis.cause import (
+    Cause,
+    Extension,
+    Grouping,
+    Key,
+    Scored,
+    Simulated,
+    Written,
+    medians,
+    positive,
+    shown,
+)
 from selfcal.diagnosis.causes import vibration
 from selfcal.diagnosis.causes.step import ONE_EVENT_S
 from selfcal.diagnosis.forms import LN_SMOOTHINGS, SMOOTHING_S
@@ -240,19 +251,22 @@ CAUSE = Cause(
     "The noise level changes.",
     "Look for what was switched on at that time, or for what the channel drives.",
     source="surroundings",
-    alike=_alike,
     looks=looks,
-    most=3,
     pictures=shown("marked_level"),
-    once="a change of the noise is an event of its recording",
-    no_carry=lambda look: "" if look.when else "the bank's noise level follows no channel",
-    onset=True,
-    trained=_trained,
     least=_least,
-    extend=_extend,
-    of_estimate=lambda look: medians(look, "time_s", "ratio") if look.when else None,
-    keys={
-        "time_s": Key(lambda s: s.duration_s / 2.0, "variance_time_s"),
-        "ratio": positive(lambda s: 2.0, "noise_ratio"),
-    },
+    grouping=Grouping(alike=_alike, most=3),
+    score=Scored(
+        once="a change of the noise is an event of its recording",
+        no_carry=lambda look: "" if look.when else "the bank's noise level follows no channel",
+        onset=True,
+        trained=_trained,
+    ),
+    written=Written(extend=_extend),
+    simulated=Simulated(
+        keys={
+            "time_s": Key(lambda s: s.duration_s / 2.0, "variance_time_s"),
+            "ratio": positive(lambda s: 2.0, "noise_ratio"),
+        },
+        of_estimate=lambda look: medians(look, "time_s", "ratio") if look.when else None,
+    ),
 )

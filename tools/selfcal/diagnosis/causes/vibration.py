@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.diagnosis import forms
-from selfcal.diagnosis.cause import Cause, Channels, Key, shown
+from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.forms import Channel
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood.columns import LN_SLOW
@@ -62,13 +62,14 @@ CAUSE = Cause(
     "The bias follows the vibration of another axis.",
     "Switch the source of the vibration off and on, twice.",
     source="surroundings",
-    pairs=True,
     looks=looks,
     pictures=shown("means", "evidence"),
-    smoothed=True,
-    of_column=forms.of_other,
-    of_estimate=forms.of_look,
-    keys={"coefficient": Key(lambda s: 0.3 * s.n / s.sd**2), "lag_s": forms.EFFECT_KEYS["lag_s"]},
-    follows=True,
-    add=_add,
+    grouping=Grouping(pairs=True),
+    written=Written(smoothed=True, of_column=forms.of_other),
+    simulated=Simulated(
+        keys={"coefficient": Key(lambda s: 0.3 * s.n / s.sd**2), "lag_s": forms.EFFECT_KEYS["lag_s"]},
+        follows=True,
+        of_estimate=forms.of_look,
+        add=_add,
+    ),
 )
