@@ -244,13 +244,14 @@ def test_a_clean_record_names_none(base: Path, tmp_path: Path) -> None:
 
 
 def test_the_recipe_of_a_cause_makes_one(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """CONTRIBUTING's cause as printed, for a shape that no other cause has. Truth: its coefficient, 0.04."""
+    """CONTRIBUTING's cause as printed, for a shape that no other cause has. Truth: its coefficient, 0.05, and tau, 200 s,
+    which is on neither end of the recipe's grid."""
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     (text,) = re.findall(
         r"```python\n(.*?)```", page[page.index("### A cause") : page.index("### A kind of term")], re.S
     )
     toy = ModuleType("toy")
-    toy.__dict__["shape"] = lambda time_s: np.sign(np.sin((time_s / 5.0) ** 1.2))
+    toy.__dict__["shape"] = lambda t, tau_s: np.sign(np.sin((t / 5.0) ** 1.2)) * np.exp(-t / tau_s)
     exec(compile(text.replace("NAME", "toy"), "toy", "exec"), toy.__dict__)
     added = MappingProxyType({"toy": toy.__dict__["CAUSE"], **CAUSES})
     for name, module in list(sys.modules.items()):
@@ -258,11 +259,12 @@ def test_the_recipe_of_a_cause_makes_one(base: Path, tmp_path: Path, monkeypatch
             monkeypatch.setattr(module, "CAUSES", added)
     monkeypatch.setattr(loop, "LOOKS", (toy.__dict__["CAUSE"].looks, *loop.LOOKS))
     log, model = tmp_path / "log.npz", tmp_path / "model.yaml"
-    simulate(base, log, 3, ["toy:axis=gx,coefficient=0.04"])
+    simulate(base, log, 3, ["toy:axis=gx,coefficient=0.05,tau_s=200"])
     for again in (False, True):
         (found,) = diagnose(log, axes=["gx"], model=base, write_model=model)["axes"]["gx"]["findings"]
         assert found["cause"] == "toy"
-        assert abs(found["estimate"]["coefficient"]["median"] - 0.04) < 4.0 * found["estimate"]["coefficient"]["sd"]
+        for key, truth in (("coefficient", 0.05), ("tau_s", 200.0)):
+            assert abs(found["estimate"][key]["median"] - truth) < 4.0 * found["estimate"][key]["sd"]
         (effect,) = yaml.safe_load(model.read_text(encoding="utf-8"))["simulate"]["effects"]
         assert effect.startswith("toy:coefficient=0.0") and effect.endswith(",axis=gx")
         if not again:
