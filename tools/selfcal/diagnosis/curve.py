@@ -38,6 +38,11 @@ def spline(values: Array, places: Sequence[float] | Array) -> Array:
     return np.array([np.interp(values, places, row) for row in np.eye(len(places))[1:]])
 
 
+def counts(samples: int) -> list[int]:
+    """Knots that so many samples can tell apart, and memory holds the columns of."""
+    return [count for count in KNOTS if 10 * count < samples and 2 * count * samples * len(KNOTS) < NUMBERS_MOST]
+
+
 def knots_of(values: Array, count: int) -> list[float]:
     """So many knots, even over the range, less those that no value is near."""
     places = np.linspace(values.min(), values.max(), count)

@@ -234,8 +234,7 @@ def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
             span = float(np.ptp(smoothed(channel.values, max(1, round(middle / dt)))))
             yield from (shape_of(channel, state, form, share * span, middle) for share in PLAYS)
         elif form == FREE:
-            counts = [count for count in curve.KNOTS if 10 * count < n]
-            yield from (shape_of(channel, state, form, count, width) for count in counts for width in widths[:2])
+            yield from (shape_of(channel, state, form, k, width) for k in curve.counts(n) for width in widths[:2])
         else:
             yield from (shape_of(channel, state, form, math.nan, width) for width in widths)
 
