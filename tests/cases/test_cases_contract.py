@@ -244,8 +244,8 @@ def test_a_clean_record_names_none(base: Path, tmp_path: Path) -> None:
 
 
 def test_the_recipe_of_a_cause_makes_one(base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """CONTRIBUTING's cause as printed, for a shape that no other cause has. Truth: its coefficient, 0.05, and tau, 200 s,
-    which is on neither end of the recipe's grid."""
+    """CONTRIBUTING's cause as printed, for a shape that no other cause has. Truth: its coefficient, 0.05, and its time
+    constant, 200 s, which lies between two of the recipe's grid."""
     page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     (text,) = re.findall(
         r"```python\n(.*?)```", page[page.index("### A cause") : page.index("### A kind of term")], re.S

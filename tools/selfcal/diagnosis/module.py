@@ -291,7 +291,9 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     V = rfft(weights, padded, axis=0)
     place = np.minimum(np.rint(np.arange(V.shape[0]) * n / padded).astype(int), U.shape[0] - 1)
     gain = np.where(usable[place], full(V.real, known[place]) + full(V.imag, known[place]), 0.0)
-    alone = np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place] * usable[place][:, None]
+    alone = 0.5 * np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place] * usable[place][:, None]
+    turns = np.arange(gain.size) * n / padded
+    gain, alone = gain - ln_lines(turns, n, gain), alone - ln_lines(turns[:, None], n, alone)
     t = np.arange(n)
     places = [int(np.argmax(gain)), *(int(k) for k in np.argmax(alone, axis=0))]
     for at in dict.fromkeys(places):
@@ -300,7 +302,8 @@ def lines(seen: Seen) -> Iterator[Candidate]:
         # Of few turns: the record ends, and a spectrum does not.
         there = information(seen.model, seen.y, pair).mean(axis=0) * np.outer(own[place[at]], own[place[at]])
         found = act(pair @ weights, there)
-        yield Candidate("periodic", (f / seen.dt,), found, ln_lines(n, max(1.0, found.evidence)), pair)
+        price = float(ln_lines(np.array(f * n), n, np.array(found.evidence)))
+        yield Candidate("periodic", (f / seen.dt,), found, price, pair)
 
 
 def _level(ratio: Array, beside: int, axis: int) -> Array:
@@ -329,18 +332,19 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
     power /= np.sqrt(own)
     gain = (power.conj() * (inverse.astype(np.float32) @ power)).sum(axis=0).real / n
     gain[(np.abs(power) ** 2).max(axis=0) > CLEAR_LINE * n] = 0.0
+    gain -= ln_lines(np.arange(gain.size) * n / padded, n, np.ones(1))
     gain[: 1 + int(0.5 / MEANS_S * padded * dt)] = gain[-4:] = 0.0
     found = []
     for _ in range(FAST_LINES):
         at = int(np.argmax(gain))
-        if gain[at] < ln_lines(n, 1.0) or not 0 < at < gain.size - 1:
+        if gain[at] <= 0.0 or not 0 < at < gain.size - 1:
             break
         left, top, right = (float(value) for value in gain[at - 1 : at + 2])
         turn = (at + 0.5 * (left - right) / min(left + right - 2.0 * top, -1e-9)) / padded
         wave = np.exp(2j * math.pi * np.mod(turn * np.arange(n), 1.0))
         score = (w @ wave / np.sqrt(own[:, at])) @ inverse
         one = act(np.array([score.real, score.imag]), 0.5 * n * inverse)
-        evidence = one.evidence - ln_lines(n, max(1.0, one.evidence))
+        evidence = one.evidence - float(ln_lines(np.array(turn * n), n, np.array(one.evidence)))
         if evidence >= EVIDENT and len(one.axes) > 1:
             found.append(Event(tuple(names[k] for k in one.axes), "periodic", (turn / dt,), evidence))
         gain[max(0, at - 8) : at + 9] = 0.0

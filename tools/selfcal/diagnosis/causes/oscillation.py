@@ -17,13 +17,14 @@ import numpy as np
 
 from selfcal.bank.result import HALF_90
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
+from selfcal.diagnosis.causes import periodic
 from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import swinging
 from selfcal.likelihood.fit import Fit, Series, best, fit, ln_likelihood, run
-from selfcal.likelihood.state import Look, State, net
+from selfcal.likelihood.state import ALIKE, Look, State, net
 from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms
 from selfcal.model.file import Model
 from selfcal.model.laws import RATIO_LIMITS, swing
@@ -63,9 +64,27 @@ def looks(state: State, record: Record) -> list[Look]:
     period = math.exp(chosen.value("ln_period"))
     if worth < 1.0 or period * TURNS_LEAST > state.y.size * state.dt:
         return []
+    turns = state.y.size * state.dt / period
+    coherent = 2.0 * math.pi * math.exp(chosen.value("ln_damping")) * turns < 1.0
+    line = _line(state, record, period, gain) if coherent else []
+    if line:
+        return line
     changes, unit = {"extras": extras, "fits": tuple(fits)}, state.unit
     sizes = _sizes(chosen, unit)
     return [Look("oscillation", gain, worth, sizes, changes, measure=lambda final: _sizes(final.best, unit))]
+
+
+def _line(state: State, record: Record, period: float, gain: float) -> list[Look]:
+    """The line of this period where it explains as much: swings that keep their phase over the whole record have no
+    damping. Of the band in which oscillations are looked for."""
+    width = 1.0 / (state.y.size * state.dt)
+    tried = [1.0 / period + move * width for move in np.linspace(-1.0, 1.0, 17)]
+    gains = state.scores([np.array([*periodic.columns(f, record).values()]) for f in tried])
+    found = periodic.at(state, record, (tried[int(np.argmax(gains))],))
+    if found.gain < gain - ALIKE:
+        return []
+    n = round(2.0 * state.y.size * state.dt / PERIOD_LIMITS[0])
+    return [replace(found, net=periodic.worth_of(found.gain, 1.0 / (period * width), n), others=("oscillation",))]
 
 
 def _sizes(chosen: Fit, unit: str) -> dict[str, Any]:

@@ -127,12 +127,20 @@ def _spread(c: Array, sd: Array, duration_s: float) -> float:
     return float(np.mean(sd)) / max(math.hypot(*c), 1e-300) * math.sqrt(12.0) / (2.0 * math.pi * duration_s)
 
 
-def ln_lines(n: int, gain: float) -> float:
-    """ln of the number of independent lines among `n` samples, for one that gains so much.
+def ln_lines(turns: Array, n: int, gain: Array) -> Array:
+    """ln of the number of independent lines that one of so many `turns` among `n` samples, which gains so much, is the
+    best of. The prior of a frequency is flat in its logarithm: a slow line is one of few.
 
     The frequency is continuous: between two bins of the periodogram lies a larger maximum (Baluev 2008, MNRAS 385,
     1279, equation 6, for even sampling)."""
-    return math.log(max(1.0, 0.5 * n * math.sqrt(math.pi / 3.0))) + 0.5 * math.log(max(1.0, gain))
+    octaves = math.log(max(math.e, 0.5 * n / TURNS_LEAST))
+    places = np.log(np.maximum(1.0, octaves * math.sqrt(math.pi / 3.0) * turns))
+    return np.asarray(places + 0.5 * np.log(np.maximum(1.0, gain)))
+
+
+def worth_of(gain: float, turns: float, n: int, columns: int = 2) -> float:
+    """A line's gain net of the search for it."""
+    return net(gain, columns, float(ln_lines(np.array(turns), n, np.array(gain))))
 
 
 def _line(state: State, record: Record) -> list[Look]:
@@ -146,8 +154,8 @@ def _line(state: State, record: Record) -> list[Look]:
     power[frequency < low] = 0.0
     beside = frequency > half - low
     power[beside] = [_power(float(f), t, w, there) for f in frequency[beside]]
-    at = int(np.argmax(power))
-    if net(float(power[at]), 2, ln_lines(n, float(power[at]))) <= 0.0:
+    at = int(np.argmax(power - ln_lines(frequency * n * state.dt, n, power)))
+    if worth_of(float(power[at]), float(frequency[at]) * n * state.dt, n) <= 0.0:
         return []
     width = 1.0 / (n * state.dt)
 
@@ -169,7 +177,7 @@ def _line(state: State, record: Record) -> list[Look]:
             f, pair, gain, chosen = one
     if f < 30.0 * width:
         gain = min(gain, state.rich_gain(pair))
-    worth = net(gain, len(pair), ln_lines(n, gain))
+    worth = worth_of(gain, f / width, n, len(pair))
     return [_look(state, record, f, pair, gain, worth, chosen)] if worth >= 1.0 else []
 
 
@@ -292,7 +300,7 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     t = record.time_s
     n = int(np.isfinite(state.y).sum())
     frequency = math.sqrt(TURNS_LEAST / t[-1] * 0.5 * record.rate_hz)
-    gain = gain_for(lambda gain: net(gain, 2, ln_lines(n, gain)))
+    gain = gain_for(lambda gain: worth_of(gain, frequency * t[-1], n))
     amplitude = state.least(np.sin(2.0 * math.pi * frequency * t)) * math.sqrt(gain)
     return {"amplitude": (amplitude, state.unit), "frequency_hz": (frequency, "Hz")}
 
