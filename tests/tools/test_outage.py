@@ -10,15 +10,24 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
+import yaml
 from outage_truth import COEFFICIENT, N, part, stated
 
+from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.diagnosis import words
+from selfcal.diagnosis.carried import Term, with_terms
+from selfcal.diagnosis.finding import Finding
+from selfcal.likelihood.state import Look
+from selfcal.model.file import DEFAULT, Model
 from selfcal.model.parts import AXES, SHEET_N, Floats
+from selfcal.model.regressors import offered
+from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import (
     GPS_S,
     LONGEST_S,
@@ -106,6 +115,18 @@ def test_the_words() -> None:
         "be."
     )
     assert "18 m and 2 times too cautious" in words_of(before, {**after, "nees": 0.75})
+    assert words_of(after, after) == "With or without it 18 m after 60 s without GPS and as sure as it may be."
+
+
+def test_a_change_of_the_noise_beside_a_column() -> None:
+    """A bank with columns refuses to handle changes of the noise: the model with both findings goes without."""
+    tree = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+    tree["regressors"] = [{"name": "warm", "kind": "turn_on", "tau_s": 50.0, "sd": {"gyro": 1.0}, "probability": 0.5}]
+    look, none = Look("variance_change", 20.0, 15.0, {}, {}, when=(500.0, 500.0)), cast(Any, None)
+    term = Term(Finding(look, 1, none, none), (), (), False)
+    assert with_terms(Model.load(), none, {}, "gx", [term], []).handling.variance_changes
+    own = with_terms(Model.load(), none, {}, "gx", [term], Model.of_tree(tree, DEFAULT).regressors)
+    Bank(make_tables(replace(own, regressors=offered(own, "gx")), 1.0, ("gx",)))
 
 
 def test_errors_that_are_too_short() -> None:

@@ -183,7 +183,10 @@ def with_terms(
         if extend is not None and not term.columns:
             extend(Extension(tree, model, record, name, found, term.finding))
     own = Model.of_tree(tree, model.path)
-    return replace(own, regressors=(*own.regressors, *columns))
+    own = replace(own, regressors=(*own.regressors, *columns))
+    if own.regressors:  # a module handles changes beside no column
+        own = replace(own, handling=replace(own.handling, steps=False, variance_changes=False))
+    return own
 
 
 def _compared(without: Array, whole: Array) -> dict[str, Any]:

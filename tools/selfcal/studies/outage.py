@@ -246,8 +246,11 @@ def _check(told: Mapping[str, Told]) -> None:
 
 def words_of(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     """What a finding means after OUTAGE_S, in a sentence."""
-    told = f"Without it {words.ratio(before['position_m'])} m after {OUTAGE_S} s without GPS and {_sure(before)}"
-    return f"{told}; with it {words.ratio(after['position_m'])} m and {_sure(after)}."
+    one, two = (f"{words.ratio(side['position_m'])} m" for side in (before, after))
+    sure = [_sure(side) for side in (before, after)]
+    if (one, sure[0]) == (two, sure[1]):
+        return f"With or without it {one} after {OUTAGE_S} s without GPS and {sure[0]}."
+    return f"Without it {one} after {OUTAGE_S} s without GPS and {sure[0]}; with it {two} and {sure[1]}."
 
 
 def _sure(side: Mapping[str, Any]) -> str:
