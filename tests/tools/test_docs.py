@@ -54,7 +54,8 @@ UNTRIED = {
     "replay log.csv": "QEMU; test_firmware.py",
     "replay tests/data": "QEMU; test_firmware.py",
     "fleet ": "recordings of the reader's own; test_batch_priors.py, test_fleet.py",
-    "plan ": "a model of the reader's own; test_plan.py",
+    "plan part.yaml": "a model of the reader's own; test_plan.py",
+    "plan icm42688p": "minutes; test_plan.py",
     "tumble ": "a log that is drawn; test_tumble.py compares the output",
     "rivals ": "minutes; test_rivals.py",
     "worth": "minutes; test_worth.py",
@@ -65,7 +66,7 @@ SLOW = ("montecarlo", "identify ../shared/data", "diagnose ../shared/data")
 #: Columns of a document.
 WIDTH = 120
 COMMAND = "    .venv/bin/selfcal "
-COMMANDS = (COMMAND, "    cp ", "    cut ")
+COMMANDS = (COMMAND, "    cp ", "    cut ", "    .venv/bin/python ")
 NUMBER = re.compile(r"[-+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 
 
@@ -73,6 +74,9 @@ def checkout(folder: Path) -> Path:
     """`folder` as a checkout with its package installed, for the commands of a document."""
     (folder / ".venv" / "bin").mkdir(parents=True, exist_ok=True)
     (folder / ".venv" / "bin" / "selfcal").symlink_to(PROGRAM[0])
+    python = folder / ".venv" / "bin" / "python"
+    python.write_text(f'#!/bin/sh\nexec "{sys.executable}" "$@"\n', encoding="utf-8")
+    python.chmod(0o755)
     for name in ("lib", "tools", "tests"):
         (folder / name).symlink_to(ROOT / name)
     shared = folder.parent / "shared"
@@ -91,8 +95,11 @@ def excused(command: str) -> bool:
 
 def executed(text: str, folder: Path) -> str:
     """A document whose indented commands are run in `folder`, one after the other, each with its output below it, long
-    lines wrapped. A command that has no output in the document gets none. `cp` and `cut` are run as well."""
+    lines wrapped. A command that has no output in the document gets none. `cp`, `cut` and Python are run as well. A
+    program of the document, whose first line is `# NAME.py`, is there from the start."""
     checkout(folder)
+    for name, program in re.findall(r"^```python\n# (\w+\.py)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        (folder / name).write_text(program, encoding="utf-8")
     lines, found, at = text.splitlines(), list[str](), 0
     while at < len(lines):
         found.append(lines[at])

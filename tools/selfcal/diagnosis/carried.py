@@ -8,7 +8,7 @@ is weighed anew under its prior. Each finding is left out of the model with all 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
@@ -18,6 +18,7 @@ import yaml
 from scipy.special import logsumexp
 
 from selfcal.bank.library import Bank
+from selfcal.bank.priors import state_own
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.cause import Extension
 from selfcal.diagnosis.causes import CAUSES
@@ -46,7 +47,7 @@ class Carried:
 
 
 @dataclass(frozen=True)
-class _Term:
+class Term:
     """One finding as a part of the bank's model: columns with their coefficients, or a change of the model file's tree.
     `anew`: the sizes of its columns are weighed anew."""
 
@@ -77,10 +78,10 @@ def _of_axis(
         none = Carried(None, f"{second.path} has no axis {name}")
         return [none] * len(findings), none
     extended: dict[str, Regressor] = {one.name: one for one in Model.of_tree(tree, model.path).regressors}
-    terms: dict[int, _Term] = {}
+    terms: dict[int, Term] = {}
     results: dict[int, Carried] = {}
     for k, finding in enumerate(findings):
-        term = _term(found[name], finding, extended)
+        term = why_stays(finding) or term_of(found[name], finding, extended)
         if isinstance(term, str):
             results[k] = Carried(None, term)
         else:
@@ -104,25 +105,29 @@ def _of_axis(
     return [results[k] for k in range(len(findings))], together
 
 
-def _term(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> _Term | str:
-    """The finding as a part of the model, or why it is none that another recording can have."""
+def why_stays(finding: Finding) -> str:
+    """Why no other recording has a finding; "": one can."""
     cause = CAUSES[finding.look.cause]
-    why_not = cause.score.no_carry(finding.look) or cause.score.once
-    if why_not:
-        return why_not
-    known = {column.name for column in finding.before.regressors}
-    names = [column.name for column in finding.after.regressors if column.name not in known]
-    if names:
-        keys = dict.fromkeys(regressor_key(column) for column in names)
+    return cause.score.no_carry(finding.look) or cause.score.once
+
+
+def term_of(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> Term | str:
+    """The finding as a part of the bank's model, or why it is none. `extended`: the model file's regressors."""
+    cause = CAUSES[finding.look.cause]
+    added = finding.columns
+    if added:
+        entries = [CAUSES[column.cause].written.entry(column.entry, finding.look, one.record) for column in added]
+        pairs = zip(entries, added, strict=True)
+        keys = dict.fromkeys(entry.get("name", regressor_key(column.name)) for entry, column in pairs)
         if not all(key in extended for key in keys):
             return "the extended model has no room for its column"
         at = {column.name: k for k, column in enumerate(one.state.regressors)}
-        if not all(column in at for column in names):
+        if not all(column.name in at for column in added):
             return "the final model does not have it"
-        c = tuple(float(one.state.best.c[1 + at[column]]) for column in names)
-        return _Term(finding, tuple(extended[key] for key in keys), c, cause.score.anew)
+        c = tuple(float(one.state.best.c[1 + at[column.name]]) for column in added)
+        return Term(finding, tuple(extended[key] for key in keys), c, cause.score.anew)
     if cause.written.extend is not None and not cause.score.no_gain:
-        return _Term(finding, (), (), False)
+        return Term(finding, (), (), False)
     return cause.score.no_gain or "the bank's model does not change by it"
 
 
@@ -132,17 +137,10 @@ def _evidence(
     found: Mapping[str, Diagnosed],
     name: str,
     readings: Readings,
-    terms: Sequence[_Term],
+    terms: Sequence[Term],
 ) -> Array:
     """Bank samples and ln evidence [2, PIECES] after each piece of the second recording, with `terms` in the model."""
-    tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
-    for term in terms:
-        extend = CAUSES[term.finding.look.cause].written.extend
-        if extend is not None and not term.columns:
-            extend(Extension(tree, model, record, name, found, term.finding))
-    anew = tuple(column for term in terms if term.anew for column in term.columns)
-    own = Model.of_tree(tree, model.path)
-    own = replace(own, regressors=(*own.regressors, *anew))
+    own = with_terms(model, record, found, name, terms, [column for t in terms if t.anew for column in t.columns])
     regressors = offered(own, name)
     recording = readings.recording
     values = readings.working.copy()
@@ -167,6 +165,28 @@ def _evidence(
     if not np.isfinite(evidence).all():
         raise UserError("the priors of the model leave nothing of the second recording")
     return evidence
+
+
+def with_terms(
+    model: Model,
+    record: Record,
+    found: Mapping[str, Diagnosed],
+    name: str,
+    terms: Sequence[Term],
+    columns: Iterable[Regressor],
+) -> Model:
+    """The model with the laws of the terms of an axis, and these columns."""
+    tree: dict[str, Any] = yaml.safe_load(model.path.read_text(encoding="utf-8"))
+    state_own(tree, model)
+    for term in terms:
+        extend = CAUSES[term.finding.look.cause].written.extend
+        if extend is not None and not term.columns:
+            extend(Extension(tree, model, record, name, found, term.finding))
+    own = Model.of_tree(tree, model.path)
+    own = replace(own, regressors=(*own.regressors, *columns))
+    if own.regressors:  # a module handles changes beside no column
+        own = replace(own, handling=replace(own.handling, steps=False, variance_changes=False))
+    return own
 
 
 def _compared(without: Array, whole: Array) -> dict[str, Any]:

@@ -278,6 +278,19 @@ def carried(finding: Mapping[str, Any]) -> list[str]:
     return []
 
 
+def navigation(document: Mapping[str, Any]) -> list[str]:
+    """What the findings mean for a GPS/INS filter, a line each, and what that rests on; none where nobody asked."""
+    if "navigation" not in document:
+        return []
+    flown = [one for one in document["findings"] if "navigation" in one]
+    lines = [
+        f"{what(one)}: {one['navigation']['words'] if one['navigation'] else 'no flight: ' + one['navigation_reason']}"
+        for one in flown
+    ]
+    told = document["navigation"]
+    return [*lines, told["words"]] if told else [*lines, *([] if lines else ["no flight: no finding matters"])]
+
+
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
     told = [

@@ -52,6 +52,8 @@ def show(
         say(words.small(less) + ("" if details else " (--details)"))
     elif not shown and axes:
         say("nothing found")
+    for line in words.navigation(document):
+        say(line)
     for name, axis in document["axes"].items():
         if "error" in axis:
             say(f"{name}: no result: {axis['error']}")

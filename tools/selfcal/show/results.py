@@ -273,6 +273,8 @@ class Event(Object):
     also_possible: list[str]
     record_next: str
     gain_on: dict[str, Any] | None
+    navigation: dict[str, Any] | None
+    navigation_reason: str | None
 
 
 class Finding(Object):
@@ -333,6 +335,7 @@ class Diagnosis(Document):
     findings: list[Event]
     axes: dict[str, DiagnosedAxis]
     model: dict[str, Any]
+    navigation: dict[str, Any] | None
 
     def _print(self, console: Any) -> None:
         from selfcal.show.findings import show

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich import box
@@ -18,6 +18,10 @@ from selfcal.model.file import Model
 from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
+
+if TYPE_CHECKING:
+    from selfcal.bank.library import Bank
+    from selfcal.bank.result import AxisResult
 
 SCHEMA = "selfcal.navigate/1"
 #: What filter designers multiply a data sheet's noise by.
@@ -71,21 +75,22 @@ def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
     """
     from selfcal.bank.library import Bank
 
-    model = Model.load()
-    bank = Bank(make_tables(model, 1.0, tuple(AXES), bank_rate_hz=1.0))
+    bank = Bank(make_tables(Model.load(), 1.0, tuple(AXES), bank_rate_hz=1.0))
     bank.push(rest)
-    found: list[Mapping[str, float]] = []
-    for k in range(len(AXES)):
-        now, *later = (bank.report(k, ahead_s=ahead) for ahead in (0.0, *HORIZONS_S))
-        white = [(now.probability[law], estimates["N"]) for law, estimates in now.parameters.items()]
-        noise = {"N": math.sqrt(sum(p * (e.mean**2 + e.sd**2) for p, e in white))}
-        if now.best != "constant":
-            noise |= matched(now.bias_sd**2, *(one.bias_sd**2 for one in later))
-        found.append(noise)
-    return found
+    return [noise_of(bank, k)[0] for k in range(len(AXES))]
 
 
-def matched(now: float, near: float, far: float) -> Mapping[str, float]:
+def noise_of(bank: Bank, axis: int, mask: int = 0) -> tuple[dict[str, float], AxisResult]:
+    """The noise of an axis by a bank, as `identified_noise` has it, in the bank's units, and the bank's report."""
+    now, *later = (bank.report(axis, mask, ahead) for ahead in (0.0, *HORIZONS_S))
+    white = [(now.probability[law], estimates["N"]) for law, estimates in now.parameters.items()]
+    noise = {"N": math.sqrt(sum(p * (e.mean**2 + e.sd**2) for p, e in white))}
+    if now.best != "constant":
+        noise |= matched(now.bias_sd**2, *(one.bias_sd**2 for one in later))
+    return noise, now
+
+
+def matched(now: float, near: float, far: float) -> dict[str, float]:
     """The drift whose variance grows from `now` to `near` and `far` over HORIZONS_S: Gauss-Markov, or a walk where the
     growth does not slow down."""
     first, last = HORIZONS_S

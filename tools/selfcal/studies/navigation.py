@@ -29,8 +29,8 @@ from scipy.spatial.transform import Rotation
 from selfcal.base.units import STANDARD_GRAVITY, convert
 from selfcal.model.parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
 
-#: Lengths of the rest, and of the flight with GPS and after its outage, s.
-REST_S, GPS_S, OUTAGE_S = 1800, 300, 60
+#: Lengths of the rest, and of the flight with GPS and after its outage, s; the longest outage that is flown.
+REST_S, GPS_S, OUTAGE_S, LONGEST_S = 1800, 300, 60, 300
 #: Readings per s in flight.
 RATE_HZ = 10
 #: Latency of a position, and the sd of its error by part, s; a position's own sd by axis, m.
@@ -95,7 +95,7 @@ class Flight:
 def flight() -> Flight:
     """Take-off, then figures of eight at a changing speed in coordinated turns, which let the biases be seen."""
     dt = 1.0 / RATE_HZ
-    t = np.arange((GPS_S + OUTAGE_S) * RATE_HZ + 1) * dt
+    t = np.arange((GPS_S + LONGEST_S) * RATE_HZ + 1) * dt
     after = np.maximum(t - TAKE_OFF_S, 0.0)
     start = 0.5 * (1.0 - np.cos(np.pi * np.minimum(t / TAKE_OFF_S, 1.0)))
     speed = SPEED * start + SPEED_SWING * np.sin(2.0 * np.pi * after / SPEED_PERIOD_S)
@@ -132,25 +132,41 @@ class Part:
     @classmethod
     def of(cls, law: str, seeds: Sequence[int], *, noise: float = 1.0) -> Part:
         """Parts of a law; `noise` scales every error there is."""
-        parts = [_part(law, seed, noise) for seed in seeds]
+        return cls._of([_part(law, seed, noise) for seed in seeds])
+
+    @classmethod
+    def of_errors(cls, rest: Floats, errors: Floats) -> Part:
+        """Flights with these errors of the readings in SI units: `rest` [flights, s, 6] means of 1 s, `errors`
+        [flights, readings, 6]. How much of an error is bias is not known: none, so that no error of it is judged."""
+        pairs = enumerate(zip(rest, errors, strict=True))
+        return cls._of([_flown(np.random.default_rng(k), *pair, np.zeros((1, 6))) for k, pair in pairs])
+
+    @classmethod
+    def _of(cls, parts: Sequence[Mapping[str, Any]]) -> Part:
         return cls(**{name: np.stack([part[name] for part in parts]) for name in parts[0]})
 
 
 def _part(law: str, seed: int, noise: float) -> dict[str, Any]:
-    truth, rng = flight(), generator(law, seed, len(AXES))
     samples = (REST_S + GPS_S + OUTAGE_S) * RATE_HZ
     simulated = [simulate(law, samples, seed, axis=axis, rate_hz=RATE_HZ) for axis in AXES]
-    readings, bias = (noise * SCALE * np.array(both).T for both in zip(*simulated, strict=True))
+    errors, bias = (noise * SCALE * np.array(both).T for both in zip(*simulated, strict=True))
     rest = REST_S * RATE_HZ
+    means = errors[:rest].reshape(REST_S, RATE_HZ, -1).mean(axis=1)
+    return _flown(generator(law, seed, len(AXES)), means, errors[rest:], bias[rest:], noise)
+
+
+def _flown(rng: np.random.Generator, rest: Floats, errors: Floats, bias: Floats, noise: float = 1.0) -> dict[str, Any]:
+    """A part by the errors of its readings: the flight, its GPS and its start are simulated."""
+    truth = flight()
     still = np.concatenate([np.zeros(3), truth.attitude[0].T @ _UP])
-    true = np.concatenate([truth.rate, truth.force], axis=1)
+    true = np.concatenate([truth.rate, truth.force], axis=1)[: len(errors)]
     latency = noise * LATENCY_SD_S * rng.standard_normal()
     at, t = np.arange(GPS_S) - latency, np.arange(len(truth.position)) / RATE_HZ
     heard = np.stack([np.interp(at, t, axis) for axis in truth.position.T], axis=1)
     return {
-        "rest": readings[:rest].reshape(REST_S, RATE_HZ, -1).mean(axis=1) + still,
-        "readings": readings[rest:] + true,
-        "bias": bias[rest:],
+        "rest": rest + still,
+        "readings": errors + true,
+        "bias": bias,
         "gps": heard + noise * GPS_SD_M * rng.standard_normal(heard.shape),
         "latency": np.array([latency]),
         "start_position": noise * START_SD_M * rng.standard_normal(3),
@@ -186,7 +202,7 @@ class Filters:
         kept, variance = self.noise.step(1.0)
         move = np.broadcast_to(np.eye(_STATES), (count, _STATES, _STATES)).copy()
         np.einsum("...ii->...i", move)[:, _DRIFT] = kept
-        for k in range(REST_S):
+        for k in range(self.part.rest.shape[1]):
             force = _UP @ self.attitude
             measure[:, 3:, _A] = cross(force)
             expected = self.constant + self.drift
@@ -194,18 +210,18 @@ class Filters:
             self.update(measure, self.part.rest[:, k] - expected, self.noise.N**2)
             self.predict(move, kept, variance)
 
-    def fly(self) -> list[tuple[Floats, Floats]]:
-        """The errors that are judged and their covariance, [filters, JUDGED] and [filters, JUDGED, JUDGED]: at GPS_S,
-        when the position of LATENCY_S earlier has come, and after OUTAGE_S without any."""
+    def fly(self, outages_s: Sequence[int] = (0, OUTAGE_S)) -> list[tuple[Floats, Floats]]:
+        """The errors that are judged and their covariance, [filters, JUDGED] and [filters, JUDGED, JUDGED]: so long
+        after GPS_S, when the last position, of LATENCY_S earlier, has come; `outages_s` ascend."""
         judged = []
-        for k in range((GPS_S + OUTAGE_S) * RATE_HZ):
+        for k in range((GPS_S + outages_s[-1]) * RATE_HZ):
             second, between = divmod(k, RATE_HZ)
-            if not between and second == GPS_S:
+            if not between and second - GPS_S in outages_s:
                 judged.append(self.judged(k))
             if not between and 0 < second <= GPS_S - LATENCY_S:
                 self.locate(self.part.gps[:, second])
             self.move(self.part.readings[:, k])
-        return [*judged, self.judged((GPS_S + OUTAGE_S) * RATE_HZ)]
+        return [*judged, self.judged((GPS_S + outages_s[-1]) * RATE_HZ)]
 
     def locate(self, gps: Floats) -> None:
         """A position by GPS: where the vehicle was `latency` ago, over which its velocity counts as constant."""

@@ -42,6 +42,9 @@ def diagnose(
     on: Annotated[
         Path | str | None, option("Measure each finding's gain on a second recording of the part", metavar="LOG")
     ] = None,
+    navigate: Annotated[
+        bool, option("Fly a GPS/INS filter with and without each finding that matters", "--navigate")
+    ] = False,
     fail_on: shared.FailOn = None,
     limits: shared.LimitsFile = None,
     junit: shared.Junit = None,
@@ -61,6 +64,7 @@ def diagnose(
     the second look did not finish without a result of its own has the first look's. `full_rate`: no first look.
     `decimate`: look at block means at this rate alone, Hz.
     `on`: a second recording, read as the first, on which each finding's gain is measured.
+    `navigate`: position errors of a GPS/INS filter without and with each finding that matters (studies/outage.py).
     `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
     write is kept, by a UserError. `fail_on`: see fail_on.py; it is
     only checked here. `limits`, `junit`, `verdicts`, `start_s`, `end_s`, `since_power_on_s`, `gate`: as `identify` has
@@ -142,6 +146,11 @@ def diagnose(
             doing.now("posterior")
             known = add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
             add_findings(document, recording, diagnosed, known, quantity)
+            if navigate and not ending.asked:
+                from selfcal.studies.outage import add_outages
+
+                doing.now("flights")
+                add_outages(document, loaded, tree, record, diagnosed, recording, second)
             if write_model is not None:
                 write_text(write_model, as_text(tree, recording.path, read_out))
                 note(f"{write_model}: {read_out}")
