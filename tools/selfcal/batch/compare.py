@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.result import bias_of, likeliest, sd_of
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, table_of
 
@@ -64,18 +64,11 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
     the size of each cause found. A cause is `small` where it changes no number by as much as matters."""
     sizes: dict[str, Mapping[str, Any]] = {}
     if "hypotheses" in identified:
-        law = max(identified["hypotheses"], key=lambda name: identified["hypotheses"][name])
+        law = likeliest(identified["hypotheses"])
         for name, estimate in identified["parameters"][law].items():
             if estimate["identified"]:
                 sizes[f"{name} ({law})" if name != "N" else "N"] = estimate
-        bias = identified["bias_now"]
-        half = HALF_90 * bias["sd"]
-        sizes["bias"] = {
-            "median": bias["mean"],
-            "q05": bias["mean"] - half,
-            "q95": bias["mean"] + half,
-            "unit": bias["unit"],
-        }
+        sizes["bias"] = bias_of(identified)
         for regressor in identified.get("regressors", {}).values():
             for column, estimate in regressor["coefficients"].items():
                 if math.isfinite(estimate["median"]):
@@ -109,7 +102,7 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
             continue
         if "present" in a:
             continue
-        sd = math.hypot(*((estimate["q95"] - estimate["q05"]) / (2.0 * HALF_90) for estimate in (a, b)))
+        sd = math.hypot(sd_of(a), sd_of(b))
         distance = (b["median"] - a["median"]) / sd if sd > 0.0 else 0.0
         if abs(distance) >= LIMIT:
             rows.append(

@@ -21,6 +21,7 @@ from scipy.signal import max_len_seq
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.result import HALF_90
 from selfcal.base.errors import UserError
+from selfcal.base.output import print_lines
 from selfcal.base.units import duration_words
 from selfcal.batch.plan import LEAST, MOST, SHARE, Wish, part_of
 from selfcal.batch.spread import Row, spread
@@ -149,8 +150,12 @@ def drawn_rows(model: Model, axis: str, experiment: Experiment, bit_s: float, sa
     ]
 
 
-def lines_of(document: Mapping[str, Any]) -> list[str]:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What to record, in words."""
+    print_lines(_lines(document), to_stderr=to_stderr)
+
+
+def _lines(document: Mapping[str, Any]) -> list[str]:
     if document["duration_s"] is None:
         return ["no record that can be simulated suffices: wider levels, or a wider wish"]
     low, high = document["levels"]

@@ -28,8 +28,8 @@ from selfcal.adequacy.allan import information_of, terms_of
 from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable, short
-from selfcal.base.output import console_of, plotter, save_picture
+from selfcal.base.errors import UserError, short
+from selfcal.base.output import plotter, print_lines, save_picture
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.simulate import truth_of
@@ -354,9 +354,7 @@ def picture(document: Mapping[str, Any], path: Path | str) -> None:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """How long for each wish, in all, and what another rate would change."""
-    console = console_of(to_stderr=to_stderr)
-    for line in _lines(document):
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+    print_lines(_lines(document), to_stderr=to_stderr)
 
 
 def steady(curve: Sequence[Mapping[str, float]]) -> float | None:

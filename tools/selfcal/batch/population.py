@@ -403,6 +403,6 @@ def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: float) -> 
     return float(weight @ difference), float(_tail(weight, difference / sd))
 
 
-def sd_of(log_p: float) -> float:
+def sd_off(log_p: float) -> float:
     """How many standard deviations off a two-sided probability is; at most 38."""
     return float(-ndtri(max(math.exp(max(log_p, -700.0)) / 2.0, 1e-300)))

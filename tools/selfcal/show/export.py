@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.overbound import overbound, upper_limit
+from selfcal.bank.result import likeliest
 from selfcal.base import units
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import write_text
@@ -142,8 +143,7 @@ def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
     n, k = overbound(tau, limits)
     if level is not None and not math.isfinite(n):
         raise UserError("--overbound: the record is too short for an Allan deviation; leave the option out")
-    probability = axes[worst_axis["K"]]["hypotheses"]
-    law = max(probability, key=lambda name: probability[name])
+    law = likeliest(axes[worst_axis["K"]]["hypotheses"])
     unexplained = [name for name, axis in axes.items() if not axis["adequate"]]
     verdict = f"NOT ADEQUATE: no law explains {', '.join(unexplained)}" if unexplained else "adequate"
     notes = [

@@ -14,6 +14,7 @@ from rich.table import Table
 from selfcal.adequacy.document import as_typed, since
 from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
+from selfcal.bank.result import likeliest
 from selfcal.base import units
 from selfcal.base.errors import called, printable
 from selfcal.base.output import TABLE_WIDTH, console_of, table_of
@@ -195,7 +196,7 @@ def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table
     headings = ("law", "P", "N", drift, second)
     table = table_of(headings, caption=caption, collapse_padding=left_out > 0, pad_edge=left_out == 0)
     for name, axis in axes.items():
-        best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
+        best = likeliest(axis["hypotheses"])
         bias = axis["bias_now"]
         level = f"bias {bias['mean']:.6g} ± {bias['sd']:.2g}"
         heading = f"{name} \\[{bias['unit']}]"

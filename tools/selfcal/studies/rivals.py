@@ -95,8 +95,7 @@ def of_recording(
                 "rivals": entries,
             }
     document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": answers}
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
@@ -163,8 +162,7 @@ def ensemble(
         "cells": entries,
         "choice": over_laws(entries),
     }
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
@@ -83,6 +84,15 @@ T = TypeVar("T")
 def to_stderr(given: Mapping[str, Any]) -> bool:
     """Whether tables go to stderr, because stdout has the JSON."""
     return str(given.get("json")) == "-"
+
+
+def shown_by(module: str) -> Callable[[Any, Mapping[str, Any]], None]:
+    """The `show` of a verb whose answer another module's `show` prints, which is imported then."""
+
+    def show(answer: Any, given: Mapping[str, Any]) -> None:
+        import_module(f"selfcal.{module}").show(answer, to_stderr=to_stderr(given))
+
+    return show
 
 
 def on_a_line(verb: Callable[P, T]) -> Callable[P, T]:

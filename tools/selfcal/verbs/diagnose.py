@@ -117,8 +117,7 @@ def diagnose(
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
                         write_page(report, document, record, {})
-                    if json is not None:
-                        write_json(document, json)
+                    write_json(document, json)
                 ending.check()
                 reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
@@ -154,8 +153,7 @@ def diagnose(
                 write_page(report, document, record, diagnosed, given)
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return Diagnosis(document)
 
 

@@ -148,8 +148,7 @@ def fleet(
     document = {**document_with(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
     if write_model is not None:
         document["words"] += lines_of_priors(write_priors(write_model, loaded, summary), loaded)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     if report is not None:
         from selfcal.batch.fleet_page import write_page
 

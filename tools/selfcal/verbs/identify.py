@@ -112,8 +112,7 @@ def identify(
     check_writable(
         json, plot, None if export is None else export[1], junit, verdicts, inputs=(*list_of(log), model, limits)
     )
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     if overbound is not None and export is None:
@@ -169,8 +168,7 @@ def identify(
                 weigh_more_laws(document, recording, [name for name in doubtful if name not in again])
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     if export is not None:
         write_export(document, *export, overbound)
     if plot is not None:

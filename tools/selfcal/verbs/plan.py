@@ -89,8 +89,7 @@ def plan(
     from selfcal.model.regressors import coefficient_unit
 
     check_writable(json, plot, inputs=list_of(model))
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     if not isinstance(model, Path | str) or is_recording(model):
         from selfcal.adequacy.part import tree_of
         from selfcal.base.units import SENSORS
@@ -112,8 +111,7 @@ def plan(
         if plot is not None or axis is not None:
             raise UserError("--tumble plans all axes together, and has no picture: leave --axis and --plot out")
         answer = plan_of(loaded, want)
-        if json is not None:
-            write_json(answer, json)
+        write_json(answer, json)
         return answer
     name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
     group = loaded.group_of(name)
@@ -163,8 +161,7 @@ def plan(
         "wishes": entries,
         "rates": rates(loaded, wishes, lengths, ensemble.typical),
     }
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     if plot is not None:
         picture(document, plot)
     return document
@@ -228,26 +225,16 @@ def _response(
             write_text(drive, f"t[s],{input}[{units_of[input]}]\n{text}")
     elif drive is not None:
         raise UserError("no record that can be simulated suffices: wider --levels, or a wider --want")
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
-def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     """Print how long for each wish."""
-    from selfcal.base.errors import printable
-    from selfcal.base.output import console_of
-
     if "levels" in document:
-        from selfcal.batch.design import lines_of
-
-        console = console_of(to_stderr=to_stderr(given))
-        for line in lines_of(document):
-            console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
-        return 0
-    if given.get("tumble"):
+        from selfcal.batch.design import show as table
+    elif given.get("tumble"):
         from selfcal.calibration.plan import show as table
     else:
         from selfcal.batch.plan import show as table
     table(document, to_stderr=to_stderr(given))
-    return 0
