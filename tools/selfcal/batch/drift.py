@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, stdtr
 
-from selfcal.batch.population import FALSE_ALARM, Array
+from selfcal.base.grid import Array
+from selfcal.batch.population import FALSE_ALARM
 
 #: Halvings of the search for r^2.
 _HALVINGS = 40

@@ -12,8 +12,9 @@ import numpy as np
 from markupsafe import Markup
 
 from selfcal.base import units as unit_module
+from selfcal.base.grid import Array
 from selfcal.base.output import write_text
-from selfcal.batch.population import Array, Population
+from selfcal.batch.population import Population
 from selfcal.batch.summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
 from selfcal.show.template import render

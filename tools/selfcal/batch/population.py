@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtri
 
 from selfcal.bank.result import HALF_90, of_mixture
+from selfcal.base.grid import Array
 
-Array = NDArray[np.float64]
 #: Fewest units of a population and of a group.
 FEWEST, FEWEST_OF_GROUP = 5, 3
 #: Points of the grid of spreads, and its reach from the spread of the estimates: of five units the tail weighs.

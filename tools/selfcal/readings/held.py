@@ -12,15 +12,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.logs.sampling import followed_phase
 from selfcal.readings.budget import nats_of
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 
 #: Runs of equal readings that show held ones at least.
 RUNS_LEAST = 50

@@ -10,16 +10,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import ndtr
 
-from selfcal.base.grid import MEDIAN_SD, equal_runs
+from selfcal.base.grid import MEDIAN_SD, Array, Mask, equal_runs
 from selfcal.readings.budget import nats_of
-from selfcal.readings.lattice import Lattice, lattice_of
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from selfcal.readings.lattice import COARSEST, Lattice, lattice_of
 
 #: Readings that are one value: how many at least, and the share up to which they are left out.
 #: Of a value with more, either the value or the others may be the noise. Then most averages have too few readings too,
@@ -40,8 +36,6 @@ STEPS = 50_000
 #: Within the noise: steps of the lattice in the noise from which on single codes are compared; else distinct values so
 #: near, in the noise; ln of the count over the expected one, and over the largest of any other value, at least.
 COARSE, BESIDE, EXCESS, OVER_OTHERS = 0.1, 0.25, 0.15, 2.5
-#: On a lattice of more steps in the noise of a reading ln of the counts is not smooth.
-COARSEST = 1.0
 #: Of the readings that are too many, the share that the levels about them must not explain, at least.
 LOCAL = 0.25
 #: Counts of three codes from which on they alone show the next one's.

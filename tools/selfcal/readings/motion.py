@@ -17,17 +17,13 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import bdtrc, fdtrc, gammaincinv
 
-from selfcal.base.grid import MEDIAN_SD, block_means, runs
+from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means, runs
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.readings.budget import SHARES
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 Interval = tuple[int, int]
 Time = TypeVar("Time", int, float)
 
