@@ -412,9 +412,9 @@ def document_of(batch: Batch) -> dict[str, Any]:
     drift: dict[str, dict[str, Any]] = {}
     drifting: dict[str, list[str]] = {}
     for slope in batch.drifts:
-        drift.setdefault(names[slope.at], {})[slope.quantity] = slope.entry()
+        drift.setdefault(names[slope.of.at], {})[slope.of.quantity] = slope.entry()
         if slope.significant:
-            drifting.setdefault(names[slope.at], []).append(_drift_words(slope))
+            drifting.setdefault(names[slope.of.at], []).append(_drift_words(slope))
     return {
         "population": {population.measured.name: _entry(population, names) for population in batch.populations},
         "unlike": batch.unlike,
@@ -505,9 +505,10 @@ def seen_from_words(population: Population) -> str:
 
 
 def _drift_words(drift: Drift) -> str:
-    rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if drift.logarithm else f"{drift.per_day:+.3g} {drift.unit}"
-    seen = f"{drift.recordings} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
-    return f"{drift.quantity} {rate} a day, {seen}"
+    of = drift.of
+    rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if of.logarithm else f"{drift.per_day:+.3g} {of.unit}"
+    seen = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
+    return f"{of.quantity} {rate} a day, {seen}"
 
 
 def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:

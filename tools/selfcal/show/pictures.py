@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
+from selfcal.base.grid import runs
 from selfcal.diagnosis.causes import CAUSES, shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
@@ -426,12 +427,11 @@ def _missing(finding: Finding, record: Record) -> Figure:
     before, after = finding.before.y, finding.after.y
     held = np.append(False, np.diff(before) == 0.0) & ~np.isfinite(after)
     gone = held | ~record.present.astype(bool)
-    where = np.flatnonzero(gone)
-    runs = np.split(where, np.flatnonzero(np.diff(where) > 1) + 1) if where.size else []
-    longest = max((run.size for run in runs), default=0)
+    gaps = runs(gone)
+    longest = max((end - begin for begin, end in gaps), default=0)
     return Figure(
         "Missing samples",
-        f"{where.size} samples in {len(runs)} gaps; the longest is of {longest} samples.",
+        f"{np.count_nonzero(gone)} samples in {len(gaps)} gaps; the longest is of {longest} samples.",
         [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, 100.0 * _reduced(edges, gone))])],
     )
 
