@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -116,6 +117,24 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
                 }
             )
     return rows
+
+
+def compared_of(
+    seen: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]], verdicts: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Compared]:
+    """Each recording beside the one before, by axis. `seen`: the recordings with the quantities of each axis;
+    `verdicts`: by recording and axis."""
+    compared = {name: Compared() for name in sorted(set().union(*verdicts.values()))}
+    for (first, before), (second, after) in pairwise(seen):
+        for name, axis in compared.items():
+            error = incomparable({log: verdicts[log].get(name) for log in (first, second)})
+            if error is not None:
+                axis.errors += [error] if error not in axis.errors else []
+            elif name in before and name in after:
+                axis.pairs += 1
+                rows = changes(before[name], after[name])
+                axis.changes += [{"from": first, "to": second, **row} for row in rows]
+    return compared
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:

@@ -23,6 +23,8 @@ LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
 #: Share of a strip's points that may lie beyond each of its edges.
 USUAL = 0.02
+#: Points of a curve at most.
+POINTS = 400
 #: Rows of a table behind a picture at most.
 ROWS = 25
 #: Approximate number of ticks of an axis.

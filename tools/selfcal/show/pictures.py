@@ -20,12 +20,10 @@ from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
-from selfcal.show.chart import Band, Curve, Figure, Panel, envelope
+from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope
 
 #: Simulated records of a band.
 RECORDS = 20
-#: Points of a curve at most.
-POINTS = 400
 #: Averaging times a decade, and frequencies a decade, of the overview.
 TAUS_A_DECADE, BINS_A_DECADE = 8, 24
 #: Standard deviations within which 99 % of a normal deviate lie.
