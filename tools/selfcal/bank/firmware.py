@@ -4,6 +4,7 @@ the package's build, and the model's tables are handed over at run time."""
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -31,7 +32,7 @@ class Played:
         self._module: Any = _firmware.Module(
             *arguments(tables),
             _columns(tables),
-            None if table is None else table.arguments,
+            None if table is None else astuple(table),
             [axis.name for axis in tables.axes],
             tables.rate_hz,
             len(tables.channels),

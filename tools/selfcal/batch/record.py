@@ -73,11 +73,6 @@ def examined(verbs: Verbs, options: Options, job: Job) -> list[Row]:
             return [{"error": f"{type(error).__name__}: {first_line(error)}"}]
 
 
-def killed(_: Job) -> list[Row]:
-    """The row of a recording that no worker survives."""
-    return [{"error": KILLED}]
-
-
 def _record(verbs: Verbs, options: Options, path: str) -> Row:
     document = verbs.identify(path, suspicion=False, **options.given)
     row: Row = {

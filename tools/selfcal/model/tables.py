@@ -7,7 +7,6 @@ import math
 import zlib
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,8 +121,8 @@ class HypothesisTable:
 
 @dataclass(frozen=True)
 class GateTable:
-    """The gate for one sampling rate: `window` in samples; of each axis `sigma` (infinite: left out), and if it is a
-    gyro."""
+    """The gate for one sampling rate, its fields as the bindings take them: `window` in samples; of each axis `sigma`
+    (infinite: left out), and if it is a gyro."""
 
     window: int
     false_alarm: float
@@ -132,12 +131,6 @@ class GateTable:
     memory: int
     sigma: tuple[float, ...]
     is_rate: tuple[bool, ...]
-
-    @property
-    def arguments(self) -> tuple[Any, ...]:
-        """The gate as the bindings take it."""
-        numbers = self.window, self.false_alarm, self.hold, self.settle, self.memory
-        return *numbers, list(self.sigma), list(self.is_rate)
 
 
 @dataclass(frozen=True)

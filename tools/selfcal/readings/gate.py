@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,7 +31,7 @@ class Learning:
 
     def __init__(self, table: GateTable) -> None:
         self.window, self.axes = table.window, len(table.sigma)
-        self.gate = _library32.Gate(*table.arguments)
+        self.gate = _library32.Gate(*astuple(table))
         self.learn_at = _library32.GATE_MEASURED_MIN
 
     def push(self, samples: NDArray[np.float32]) -> NDArray[np.bool_]:

@@ -197,10 +197,6 @@ def range_change_of(values: Array, lattice: Lattice | None) -> Misread | None:
     return best if best.nats > nats_of("misread") else None
 
 
-def _truncated(x: Array, step: float) -> Array:
-    return np.asarray(step * np.trunc(x / step))
-
-
 def _no_zeros(x: Array) -> Array:
     """Zeros behind the point are lost: 0.05 is read as 0.5."""
     size = np.abs(x)
@@ -224,7 +220,7 @@ def _maps(y: Array, noise: float, step: float) -> list[tuple[str, Callable[[Arra
     if gap > noise:
         found += [("sign_lost", unsigned), ("digits_lost", lambda x: printed(unsigned(x)))]
     if step > 0.0:
-        found.append(("truncated", lambda x: _truncated(x, step)))
+        found.append(("truncated", lambda x: step * np.trunc(x / step)))
     return found
 
 

@@ -86,11 +86,18 @@ def to_stderr(given: Mapping[str, Any]) -> bool:
     return str(given.get("json")) == "-"
 
 
-def shown_by(module: str) -> Callable[[Any, Mapping[str, Any]], None]:
-    """The `show` of a verb whose answer another module's `show` prints, which is imported then."""
+def shown_by(module: str, *options: str, judged: bool = False) -> Callable[[Any, Mapping[str, Any]], int]:
+    """The `show` of a verb whose answer another module's `show` prints, which is imported then. `options`: switches
+    that it takes too. `judged`: the exit code is that of `--fail-on` and the limits."""
 
-    def show(answer: Any, given: Mapping[str, Any]) -> None:
-        import_module(f"selfcal.{module}").show(answer, to_stderr=to_stderr(given))
+    def show(answer: Any, given: Mapping[str, Any]) -> int:
+        switches = {name: bool(given.get(name)) for name in options}
+        import_module(f"selfcal.{module}").show(answer, to_stderr=to_stderr(given), **switches)
+        if not judged:
+            return 0
+        from selfcal.batch.fail_on import exit_code
+
+        return exit_code(answer, given.get("fail_on"))
 
     return show
 

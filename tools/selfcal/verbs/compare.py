@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
@@ -124,10 +124,4 @@ def compare(
     return Comparison(document)
 
 
-def show(document: Comparison, given: Mapping[str, Any]) -> int:
-    """Print one line a change; the exit code of `--fail-on` and the limits."""
-    from selfcal.batch.compare import show as table
-    from selfcal.batch.fail_on import exit_code
-
-    table(document, to_stderr=shared.to_stderr(given))
-    return exit_code(document, given.get("fail_on"))
+show = shared.shown_by("batch.compare", judged=True)

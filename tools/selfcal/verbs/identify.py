@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 
@@ -194,10 +194,4 @@ def _suspect(document: dict[str, Any], recording: Recording, model: Model, names
     return suspected
 
 
-def show(document: Identification, given: Mapping[str, Any]) -> int:
-    """Print the table; the exit code of `--fail-on` and the limits."""
-    from selfcal.batch.fail_on import exit_code
-    from selfcal.show.identification import show as table
-
-    table(document, to_stderr=shared.to_stderr(given), datasheet=given.get("datasheet", False))
-    return exit_code(document, given.get("fail_on"))
+show = shared.shown_by("show.identification", "datasheet", judged=True)
