@@ -130,11 +130,10 @@ def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
     """Charts of individuals and of moving ranges, each on its own scale."""
     ranges: Array = np.concatenate([np.full(1, np.nan), np.abs(np.diff(y))])
     mean, mean_range = float(y.mean()), float(np.nanmean(ranges))
-    beyond = int((np.abs(y - mean) > INDIVIDUALS * mean_range).sum()), int((ranges > RANGES * mean_range).sum())
+    far, wide = np.abs(y - mean) > INDIVIDUALS * mean_range, ranges > RANGES * mean_range
     every = max(1, math.ceil(y.size / POINTS))
     shown = np.arange(0, y.size, every)
-    out = (np.abs(y - mean) > INDIVIDUALS * mean_range) | (ranges > RANGES * mean_range)
-    shown = np.union1d(shown, np.flatnonzero(out)[:POINTS])
+    shown = np.union1d(shown, np.flatnonzero(far | wide)[:POINTS])
     x = np.asarray(shown + 1.0, np.float64)
     whole: Array = np.ones(shown.size)
     low, high = mean - INDIVIDUALS * mean_range, mean + INDIVIDUALS * mean_range
@@ -151,8 +150,10 @@ def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
     ]
     thinned = f" One in {every} is shown, and each beyond the limits." if every > 1 else ""
     return [
-        Figure(f"{name} by date", f"{beyond[0]} of {y.size} units lie beyond the limits.{thinned}", panels[:1]),
-        Figure(f"{name}, moving range", f"{beyond[1]} ranges lie beyond the limits.{thinned}", panels[1:]),
+        Figure(
+            f"{name} by date", f"{np.count_nonzero(far)} of {y.size} units lie beyond the limits.{thinned}", panels[:1]
+        ),
+        Figure(f"{name}, moving range", f"{np.count_nonzero(wide)} ranges lie beyond the limits.{thinned}", panels[1:]),
     ]
 
 
