@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ, Reading
-from selfcal.verbs._shared import End, Json, ModelFile, Start, shown_by
+from selfcal.verbs._shared import End, Json, ModelFile, Start, to_stderr
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
@@ -68,7 +68,8 @@ def tumble(
         raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST_LOGS} at most")
     files = [path for log in each for path in list_of(log)]
     check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
-    check_picture(plot)
+    if plot is not None:
+        check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     where = place(latitude, height, gravity)
@@ -82,8 +83,14 @@ def tumble(
         write(form, file, accel, gyro, document)
     if plot is not None:
         picture(document, plot)
-    write_json(document, json)
+    if json is not None:
+        write_json(document, json)
     return document
 
 
-show = shown_by("calibration.show")
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+    """Print the calibration."""
+    from selfcal.calibration.show import show as tables
+
+    tables(document, to_stderr=to_stderr(given))
+    return 0

@@ -317,9 +317,9 @@ class View:
             return wrong
         if contact is not None and contact.lost and not module.decoder.finished:
             return "contact lost: check cable and power"
-        for name, text in TROUBLE.items():
-            if name in status and status_text(name, status[name]) == text:
-                return f"{name} {text}: see port/README.md"
+        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if _told(status, name) == text), "")
+        if trouble:
+            return f"{trouble}: see port/README.md"
         why = {axis: word for axis, word in module.reasons.items() if axis in shown}
         word = next((word for word in URGENT if word in why.values()), next(iter(why.values()), ""))
         names = ", ".join(axis for axis, reason in why.items() if reason == word)
@@ -450,6 +450,10 @@ class View:
             chunks += [Text(name, "red") for name in HEALTH if report.values.get(name)]
             blocks.append([_line(head), *_flow(chunks, width, 2, indent=INDENT)])
         return blocks
+
+
+def _told(status: Mapping[str, float], name: str) -> str:
+    return status_text(name, status[name]) if name in status else ""
 
 
 def counted(s: Statistics) -> str:
