@@ -179,7 +179,7 @@ def test_monitor_notes_contact_for_the_view_that_it_shows(monkeypatch: pytest.Mo
     with serial_line("".join(line + "\r" for line in sent).encode()) as path:
         verb.monitor(channel=path, duration=1.5)
     (view,) = seen
-    assert set(view._contacts) == {0}
+    assert set(view.contacts) == {0}
 
 
 # ------------------------------------------------------------------------------------------------------------ line ends

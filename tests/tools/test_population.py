@@ -332,12 +332,12 @@ def test_a_drifting_unit_is_named() -> None:
         made += [
             replace(one, at=units, y=10.0 * one.y) for one in series(random, 1, 4, again=0.05, slope={})[: units - 1]
         ]
-        found = {one.at: one for one in drifts_of(made)}
+        found = {one.of.at: one for one in drifts_of(made)}
         assert [at for at, one in found.items() if one.significant] == [0]
         assert found[0].per_day == pytest.approx(15.0 * sd, abs=4.0 * found[0].sd)
     pairs = [replace(one, days=one.days[:2], y=one.y[:2], s=one.s[:2]) for one in made[:3]]
     assert drifts_of(pairs) == []  # nothing shows what a start changes
-    assert {one.at for one in drifts_of([*pairs, *made[3:]])} == set(range(13))
+    assert {one.of.at for one in drifts_of([*pairs, *made[3:]])} == set(range(13))
     units = case_records(300, 10_000)
     false = 0
     for dates in (2, 3, 6):

@@ -81,7 +81,8 @@ def _command(name: str) -> Any:
             meant, unset = options[key]
             if value not in (unset, []):  # what is not typed keeps the function's default
                 given[key] = meant.made(value) if meant.made is not None else value
-        sys.exit(module.show(verb(**given), given) or 0)
+        answer = verb(**given)
+        sys.exit(module.show(answer, given) or 0 if hasattr(module, "show") else 0)
 
     run.__doc__ = f"{_first_line(selfcal.VERBS[name])}."
     run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.grid import equal_runs
 from selfcal.model.file import Group
 from selfcal.model.tables import Tables
 from selfcal.readings.readings import mostly_beyond
 
-#: Bank samples a report needs (SELFCAL_REPORT_MIN).
-REPORT_MIN = 3
 #: Fewest whole averages, and the share of readings in them: too few, if other averages have lost most of their samples.
 FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
 #: Bank intervals, gaps included, that the checks and the reference compute one by one.
@@ -58,7 +58,7 @@ def usable_blocks(
     blocks = block_means(samples, missing_before, tables.block, group, z)
     blocks = replace(blocks, kept_out=counted(blocks.kept_out))
     present = blocks.mean[np.isfinite(blocks.mean)]
-    needed = REPORT_MIN + len(tables.regressors)
+    needed = _library32.REPORT_MIN + len(tables.regressors)
     kept = ", ".join(f"{count} {what}" for what, count in blocks.kept_out.items() if count) or "none"
     averages = f"{present.size} averages of {tables.dt_s:g} s"
     whole = float((tables.block / blocks.r[np.isfinite(blocks.mean)]).sum())
@@ -84,8 +84,7 @@ def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDAr
     saturated = finite & (np.abs(samples) >= limit)
     stuck = np.zeros(samples.size, bool)
     if group.stuck_limit > 0:
-        change = np.flatnonzero(np.diff(samples, prepend=np.nan) != 0.0)
-        length = np.diff(np.append(change, samples.size))
+        change, length = equal_runs(samples)
         for first, count in zip(change[length >= group.stuck_limit], length[length >= group.stuck_limit], strict=True):
             stuck[first + group.stuck_limit - 1 : first + count] = True
         stuck &= finite

@@ -4,6 +4,7 @@ the package's build, and the model's tables are handed over at run time."""
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import astuple
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,14 +29,10 @@ class Played:
 
     def __init__(self, model: Model, tables: Tables, rows: Path, period_ms: int, gate: bool) -> None:
         table = gate_table(model, tables)
-        watched = None
-        if table is not None:
-            numbers = (table.window, table.false_alarm, table.hold, table.settle, table.memory)
-            watched = (*numbers, list(table.sigma), list(table.is_rate))
         self._module: Any = _firmware.Module(
             *arguments(tables),
             _columns(tables),
-            watched,
+            None if table is None else astuple(table),
             [axis.name for axis in tables.axes],
             tables.rate_hz,
             len(tables.channels),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
@@ -14,13 +13,11 @@ from selfcal import _library32
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import OutsidePriors, UserError
 from selfcal.model.laws import PLACES
-from selfcal.model.tables import AxisTable, Grid, PriorRow, Tables
+from selfcal.model.tables import Grid, Tables
 
 
 def _grid(grid: Grid | None) -> tuple[int, list[float]] | None:
-    if grid is None:
-        return None
-    return (grid.nodes, grid.fit.ravel().tolist())
+    return None if grid is None else (grid.nodes, grid.fit.ravel().tolist())
 
 
 def _regressors(tables: Tables) -> tuple[list[float], list[float], list[float]] | None:
@@ -34,21 +31,13 @@ def _regressors(tables: Tables) -> tuple[list[float], list[float], list[float]] 
     return [column.reference for column in columns], sd, mean
 
 
-def _axis(a: AxisTable) -> tuple[list[float], list[float], list[int], float, float, int]:
-    return list(a.ln_min), list(a.ln_max), [int(law) for law in a.law], a.bias_sd, a.range, a.stuck_limit
-
-
-def _rows(rows: Sequence[Sequence[PriorRow]]) -> list[list[tuple[float, float, int, bool]]]:
-    return [[(low, high, int(law), measured) for low, high, law, measured in row] for row in rows]
-
-
 def arguments(tables: Tables) -> tuple[Any, ...]:
     """The model as the bindings take it (bindings/tables.hpp)."""
     return (
         tables.dt_s,
         tables.block,
-        [_axis(axis) for axis in tables.axes],
-        [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), _rows(h.priors)) for h in tables.hypotheses],
+        [(axis.ln_min, axis.ln_max, axis.law, axis.bias_sd, axis.range, axis.stuck_limit) for axis in tables.axes],
+        [(h.law.as_tuple, h.ln_probability, _grid(h.rho), _grid(h.alpha), h.priors) for h in tables.hypotheses],
         tables.id,
         _regressors(tables),
         tables.half_life_s,

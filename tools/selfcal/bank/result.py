@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,23 @@ from selfcal.model.laws import RATIOS
 
 #: Standard deviations from the middle of a normal to either end of its 90 % interval.
 HALF_90 = 1.6448536269514722
+
+
+def likeliest(probability: Mapping[str, float]) -> str:
+    """The most probable law."""
+    return max(probability, key=lambda law: probability[law])
+
+
+def bias_of(axis: Mapping[str, Any]) -> dict[str, Any]:
+    """The bias at the end of the record, as a document has the other quantities: median, q05, q95 and unit."""
+    bias = axis["bias_now"]
+    half = HALF_90 * bias["sd"]
+    return {"median": bias["mean"], "q05": bias["mean"] - half, "q95": bias["mean"] + half, "unit": bias["unit"]}
+
+
+def sd_of(estimate: Mapping[str, Any]) -> float:
+    """Of a normal quantity of a document, by its 90 % interval."""
+    return float((estimate["q95"] - estimate["q05"]) / (2.0 * HALF_90))
 
 
 def of_mixture(
@@ -56,15 +74,8 @@ class Estimate:
 
     def scaled(self, factor: float) -> Estimate:
         """The same estimate with its unit changed by `factor`."""
-        return Estimate(
-            self.mean * factor,
-            self.median * factor,
-            self.sd * factor,
-            self.q05 * factor,
-            self.q95 * factor,
-            self.identified,
-            self.off_grid,
-        )
+        numbers = {name: factor * getattr(self, name) for name in ("mean", "median", "sd", "q05", "q95")}
+        return replace(self, **numbers)
 
 
 @dataclass(frozen=True)
@@ -86,7 +97,7 @@ class AxisResult:
     @property
     def best(self) -> str:
         """The most probable law."""
-        return max(self.probability, key=lambda name: self.probability[name])
+        return likeliest(self.probability)
 
 
 def in_unit(result: AxisResult, unit: str, to: str) -> AxisResult:

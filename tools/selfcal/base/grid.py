@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,7 @@ def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 
-def equal_runs(values: Array) -> tuple[Rows, Rows]:
+def equal_runs(values: NDArray[np.floating[Any]]) -> tuple[Rows, Rows]:
     """First row [k] and length [k] of every run of equal values [n]; NaN is like no other."""
     first = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
     return first, np.diff(first, append=values.size)

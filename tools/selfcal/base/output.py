@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from selfcal.base.errors import UserError
+from selfcal.base.errors import UserError, printable
 from selfcal.base.limits import STREAMS, named_pipe
 
 if TYPE_CHECKING:
@@ -141,8 +141,11 @@ def check_writable(*files: Path | str | None, inputs: Sequence[Path | str | None
             taken.add(Path(file).resolve())
 
 
-def write_json(document: Mapping[str, Any], path: Path | str) -> None:
-    """Write a document to a file, or to stdout for '-'. What JSON cannot say (infinity, not a number) becomes null."""
+def write_json(document: Mapping[str, Any], path: Path | str | None) -> None:
+    """Write a document to a file, to stdout for '-', for None nowhere. What JSON cannot say (infinity, not a number)
+    becomes null."""
+    if path is None:
+        return
     text = json.dumps(finite(document), indent=2, allow_nan=False) + "\n"
     if str(path) == "-":
         sys.stdout.write(text)
@@ -166,9 +169,9 @@ _NO_WIDTH = 1000
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
 
-def check_picture(path: Path | str) -> None:
-    """Raise UserError for a file name without the suffix of a picture."""
-    if Path(path).suffix not in PICTURES:
+def check_picture(path: Path | str | None) -> None:
+    """Raise UserError for a file name without the suffix of a picture. None is skipped."""
+    if path is not None and Path(path).suffix not in PICTURES:
         raise UserError(f"{path}: a plot is one of {', '.join(PICTURES)}")
 
 
@@ -183,6 +186,13 @@ def console_of(*, to_stderr: bool = False, fits: bool = False) -> Console:
     elif not fits:
         console.width = max(console.width, TABLE_WIDTH)
     return console
+
+
+def print_lines(lines: Iterable[str], *, to_stderr: bool = False) -> None:
+    """Print texts from outside, a line each: whole, and no sign in them is obeyed."""
+    console = console_of(to_stderr=to_stderr)
+    for line in lines:
+        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
 
 
 def table_of(headings: Iterable[str], title: str | None = None, *, wraps: bool = False, **look: Any) -> Table:

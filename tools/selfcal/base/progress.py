@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
+from typing import Self
 
 from rich.console import Console
-from rich.progress import Progress
+from rich.progress import Progress, ProgressColumn
 
 from selfcal.base.errors import note
 
@@ -17,11 +18,13 @@ class Doing:
     """`with Doing("diagnose") as doing:`, then `doing.now("gx: round 2")` whenever the work changes, from any thread,
     and `doing.tick()` from the main one."""
 
-    def __init__(self, verb: str) -> None:
+    def __init__(self, verb: str, *columns: ProgressColumn, total: float | None = None) -> None:
+        """`columns` of the bar, whose `said` is a field, and the `total` of the work. Of a `verb` "" no line is
+        written."""
         console = Console(stderr=True)
         self.verb, self.text, self.terminal = verb, "", console.is_terminal
-        self.progress = Progress(console=console, transient=True, disable=not self.terminal)
-        self.task = self.progress.add_task(verb, total=None)
+        self.progress = Progress(*columns, console=console, transient=True, disable=not self.terminal)
+        self.task = self.progress.add_task(verb or "records", total=total, said="")
         self.began = self.told = time.monotonic()
 
     def now(self, text: str) -> None:
@@ -31,12 +34,16 @@ class Doing:
 
     def tick(self) -> None:
         """Write a line if one is due."""
-        now = time.monotonic()
-        if not self.terminal and now - self.told >= EVERY_S:
-            self.told = now
-            note(f"{self.verb}: {self.text} ({now - self.began:.0f} s)")
+        self.tell(f"{self.text} ({time.monotonic() - self.began:.0f} s)")
 
-    def __enter__(self) -> Doing:
+    def tell(self, text: str) -> None:
+        """Write this line if one is due."""
+        now = time.monotonic()
+        if self.verb and not self.terminal and now - self.told >= EVERY_S:
+            self.told = now
+            note(f"{self.verb}: {text}")
+
+    def __enter__(self) -> Self:
         self.progress.start()
         return self
 

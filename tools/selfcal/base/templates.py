@@ -1,15 +1,10 @@
-"""Texts out of Jinja2 templates: pages, whose values are escaped, and C, whose values are not."""
+"""Texts out of Jinja2 templates of C, whose values are not escaped."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
-
-
-def of_pages(folder: Path) -> Environment:
-    """Templates of HTML in a folder."""
-    return Environment(loader=FileSystemLoader(folder), autoescape=True, trim_blocks=True, lstrip_blocks=True)
 
 
 def of_code(folder: Path) -> Environment:

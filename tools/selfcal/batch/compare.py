@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.result import bias_of, likeliest, sd_of
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, table_of
 
@@ -64,18 +65,11 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
     the size of each cause found. A cause is `small` where it changes no number by as much as matters."""
     sizes: dict[str, Mapping[str, Any]] = {}
     if "hypotheses" in identified:
-        law = max(identified["hypotheses"], key=lambda name: identified["hypotheses"][name])
+        law = likeliest(identified["hypotheses"])
         for name, estimate in identified["parameters"][law].items():
             if estimate["identified"]:
                 sizes[f"{name} ({law})" if name != "N" else "N"] = estimate
-        bias = identified["bias_now"]
-        half = HALF_90 * bias["sd"]
-        sizes["bias"] = {
-            "median": bias["mean"],
-            "q05": bias["mean"] - half,
-            "q95": bias["mean"] + half,
-            "unit": bias["unit"],
-        }
+        sizes["bias"] = bias_of(identified)
         for regressor in identified.get("regressors", {}).values():
             for column, estimate in regressor["coefficients"].items():
                 if math.isfinite(estimate["median"]):
@@ -109,7 +103,7 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
             continue
         if "present" in a:
             continue
-        sd = math.hypot(*((estimate["q95"] - estimate["q05"]) / (2.0 * HALF_90) for estimate in (a, b)))
+        sd = math.hypot(sd_of(a), sd_of(b))
         distance = (b["median"] - a["median"]) / sd if sd > 0.0 else 0.0
         if abs(distance) >= LIMIT:
             rows.append(
@@ -123,6 +117,24 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
                 }
             )
     return rows
+
+
+def compared_of(
+    seen: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]], verdicts: Mapping[str, Mapping[str, Any]]
+) -> dict[str, Compared]:
+    """Each recording beside the one before, by axis. `seen`: the recordings with the quantities of each axis;
+    `verdicts`: by recording and axis."""
+    compared = {name: Compared() for name in sorted(set().union(*verdicts.values()))}
+    for (first, before), (second, after) in pairwise(seen):
+        for name, axis in compared.items():
+            error = incomparable({log: verdicts[log].get(name) for log in (first, second)})
+            if error is not None:
+                axis.errors += [error] if error not in axis.errors else []
+            elif name in before and name in after:
+                axis.pairs += 1
+                rows = changes(before[name], after[name])
+                axis.changes += [{"from": first, "to": second, **row} for row in rows]
+    return compared
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:

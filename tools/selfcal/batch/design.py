@@ -15,12 +15,13 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.signal import max_len_seq
 
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.result import HALF_90
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
+from selfcal.base.output import print_lines
 from selfcal.base.units import duration_words
 from selfcal.batch.plan import LEAST, MOST, SHARE, Wish, part_of
 from selfcal.batch.spread import Row, spread
@@ -31,7 +32,6 @@ from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Terms
 from selfcal.model.file import Model
 
-Floats = NDArray[np.float64]
 #: Lengths of a bit over the lag that is expected, and stages of the register that makes them.
 BITS, STAGES = (0.5, 1.0, 2.0, 4.0), 9
 #: Records that a length is tried with, how exact the predicted one is, and how much longer the next is.
@@ -49,7 +49,7 @@ class Experiment:
     levels: tuple[float, float]
     input_lag_s: float
 
-    def set_points(self, bit_s: float, duration_s: float) -> tuple[Floats, Floats]:
+    def set_points(self, bit_s: float, duration_s: float) -> tuple[Array, Array]:
         """Times [k] at which the set point changes, s, and the set points [k] from there on."""
         count = math.ceil(duration_s / bit_s)
         # The register begins with its longest run.
@@ -57,14 +57,14 @@ class Experiment:
         kept = np.flatnonzero(np.append(True, np.diff(bits.astype(int)) != 0))
         return np.asarray(kept * bit_s, np.float64), np.where(bits[kept], self.levels[1], self.levels[0])
 
-    def input(self, bit_s: float, samples: int, dt: float) -> Floats:
+    def input(self, bit_s: float, samples: int, dt: float) -> Array:
         """[samples]: the input about its middle."""
         at, levels = self.set_points(bit_s, samples * dt)
         wanted = levels[np.searchsorted(at, np.arange(samples) * dt, side="right") - 1] - 0.5 * sum(self.levels)
         return np.asarray(late(np.append(0.0, wanted), max(self.input_lag_s, 1e-3 * dt), dt)[1:])
 
 
-def terms_of(truth: Mapping[str, float], dt: float) -> tuple[Terms, Floats, float]:
+def terms_of(truth: Mapping[str, float], dt: float) -> tuple[Terms, Array, float]:
     """The drift of a part, its parameters and its white noise a sample. Raises UserError."""
     if set(truth) - {"N", "K", "sigma_m", "alpha"}:
         raise UserError("--response takes parts of white noise and a walk or a Gauss-Markov drift: state one of these")
@@ -75,7 +75,7 @@ def terms_of(truth: Mapping[str, float], dt: float) -> tuple[Terms, Floats, floa
     return Terms(walk=True), np.array([math.log(max(truth.get("K", 0.0) * math.sqrt(dt) / sigma, 1e-5))]), sigma
 
 
-def halves(experiment: Experiment, truth: Mapping[str, float], u: Floats, dt: float) -> dict[str, float]:
+def halves(experiment: Experiment, truth: Mapping[str, float], u: Array, dt: float) -> dict[str, float]:
     """Half the 90 % intervals of gain and lag that a part's record of the input [n] would have, each over its size."""
     terms, theta, sigma = terms_of(truth, dt)
     drive, at, near = Drive(u, dt), experiment.lag_s, 1e-3 * experiment.lag_s
@@ -149,8 +149,12 @@ def drawn_rows(model: Model, axis: str, experiment: Experiment, bit_s: float, sa
     ]
 
 
-def lines_of(document: Mapping[str, Any]) -> list[str]:
+def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What to record, in words."""
+    print_lines(_lines(document), to_stderr=to_stderr)
+
+
+def _lines(document: Mapping[str, Any]) -> list[str]:
     if document["duration_s"] is None:
         return ["no record that can be simulated suffices: wider levels, or a wider wish"]
     low, high = document["levels"]

@@ -19,7 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, stdtr
 
-from selfcal.batch.population import FALSE_ALARM, Array
+from selfcal.base.grid import Array
+from selfcal.batch.population import FALSE_ALARM
 
 #: Halvings of the search for r^2.
 _HALVINGS = 40
@@ -57,21 +58,28 @@ class Series:
 class Drift:
     """The slope of a device's quantity, of its logarithm or of itself, a day; `log_p` of so steep a slope by chance."""
 
-    at: int
-    quantity: str
-    unit: str
-    logarithm: bool
+    of: Series
     per_day: float
     sd: float
     log_p: float
-    recordings: int
-    days: float
     significant: bool
+
+    @property
+    def days(self) -> float:
+        """From the first recording to the last."""
+        return float(np.ptp(self.of.days))
 
     def entry(self) -> dict[str, Any]:
         """As the JSON has it."""
-        names = ("per_day", "sd", "log_p", "recordings", "days", "significant")
-        return {"of": "ln" if self.logarithm else "value"} | {name: getattr(self, name) for name in names}
+        return {
+            "of": "ln" if self.of.logarithm else "value",
+            "per_day": self.per_day,
+            "sd": self.sd,
+            "log_p": self.log_p,
+            "recordings": self.of.y.size,
+            "days": self.days,
+            "significant": self.significant,
+        }
 
 
 def drifts_of(series: Iterable[Series]) -> list[Drift]:
@@ -93,21 +101,7 @@ def drifts_of(series: Iterable[Series]) -> list[Drift]:
             slope, sd, _ = history.line(square)
             log_p = math.log(2.0) + math.log(max(float(stdtr(degrees, -abs(slope) / sd)), 1e-300))
             significant = log_p <= math.log(FALSE_ALARM / of_unit[history.at])
-            days = float(np.ptp(history.days))
-            drifts.append(
-                Drift(
-                    history.at,
-                    history.quantity,
-                    history.unit,
-                    history.logarithm,
-                    slope,
-                    sd,
-                    log_p,
-                    history.y.size,
-                    days,
-                    significant,
-                )
-            )
+            drifts.append(Drift(history, slope, sd, log_p, significant))
     return drifts
 
 

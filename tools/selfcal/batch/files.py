@@ -6,7 +6,8 @@ import csv
 import hashlib
 import io
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from glob import glob
@@ -188,15 +189,8 @@ def _serials(paths: Sequence[str], serial_from: str | None) -> dict[str, str]:
         return {path: _within(pattern, path) if pattern else stem(path) for path in paths}
     if kind:
         raise UserError(f"--serial-from takes name, name:PATTERN or field, not '{short(serial_from or '')}'")
-    return _with_folders({path: stem(path) for path in paths})
-
-
-def _with_folders(named: Mapping[str, str]) -> dict[str, str]:
-    """Names that several files have become their paths."""
-    counted: dict[str, int] = {}
-    for name in named.values():
-        counted[name] = counted.get(name, 0) + 1
-    return {path: name if counted[name] == 1 else path for path, name in named.items()}
+    counted = Counter(map(stem, paths))
+    return {path: stem(path) if counted[stem(path)] == 1 else path for path in paths}
 
 
 def _within(pattern: str, path: str) -> str:

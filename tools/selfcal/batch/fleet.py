@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from selfcal.base.errors import printable
-from selfcal.base.output import console_of
+from selfcal.base.output import print_lines
 from selfcal.batch.fail_on import outcome
 from selfcal.batch.unit_table import Unit
 from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
@@ -79,9 +78,7 @@ def _by_cause(unit: Unit, fail_on: str) -> tuple[list[str], list[str]]:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """What a person reads: how many, and by name the devices that need a look."""
-    console = console_of(to_stderr=to_stderr)
-    for line in _lines(document):
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+    print_lines(_lines(document), to_stderr=to_stderr)
 
 
 def _lines(document: Mapping[str, Any]) -> Iterator[str]:

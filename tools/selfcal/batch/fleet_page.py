@@ -12,14 +12,15 @@ import numpy as np
 from markupsafe import Markup
 
 from selfcal.base import units as unit_module
+from selfcal.base.grid import Array
 from selfcal.base.output import write_text
-from selfcal.batch.population import Array, Population
+from selfcal.batch.population import Population
 from selfcal.batch.summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
-from selfcal.show.chart import Band, Curve, Figure, Panel, draw
+from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, draw
 from selfcal.show.template import render
 
-#: Most of what the page shows: lines of a list, those not folded, units of the matrix, pictures, points of a chart.
-MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES, MOST_POINTS = 150, 15, 100, 48, 400
+#: Most of what the page shows: lines of a list, those not folded, units of the matrix, pictures.
+MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES = 150, 15, 100, 48
 #: Keys of the document that name devices: what to do, and what they are in a line.
 KINDS = {
     "failed": ("Beyond a limit: set these aside", "beyond a limit, or with the cause asked for"),
@@ -129,11 +130,10 @@ def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
     """Charts of individuals and of moving ranges, each on its own scale."""
     ranges: Array = np.concatenate([np.full(1, np.nan), np.abs(np.diff(y))])
     mean, mean_range = float(y.mean()), float(np.nanmean(ranges))
-    beyond = int((np.abs(y - mean) > INDIVIDUALS * mean_range).sum()), int((ranges > RANGES * mean_range).sum())
-    every = max(1, math.ceil(y.size / MOST_POINTS))
+    far, wide = np.abs(y - mean) > INDIVIDUALS * mean_range, ranges > RANGES * mean_range
+    every = max(1, math.ceil(y.size / POINTS))
     shown = np.arange(0, y.size, every)
-    out = (np.abs(y - mean) > INDIVIDUALS * mean_range) | (ranges > RANGES * mean_range)
-    shown = np.union1d(shown, np.flatnonzero(out)[:MOST_POINTS])
+    shown = np.union1d(shown, np.flatnonzero(far | wide)[:POINTS])
     x = np.asarray(shown + 1.0, np.float64)
     whole: Array = np.ones(shown.size)
     low, high = mean - INDIVIDUALS * mean_range, mean + INDIVIDUALS * mean_range
@@ -150,8 +150,10 @@ def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
     ]
     thinned = f" One in {every} is shown, and each beyond the limits." if every > 1 else ""
     return [
-        Figure(f"{name} by date", f"{beyond[0]} of {y.size} units lie beyond the limits.{thinned}", panels[:1]),
-        Figure(f"{name}, moving range", f"{beyond[1]} ranges lie beyond the limits.{thinned}", panels[1:]),
+        Figure(
+            f"{name} by date", f"{np.count_nonzero(far)} of {y.size} units lie beyond the limits.{thinned}", panels[:1]
+        ),
+        Figure(f"{name}, moving range", f"{np.count_nonzero(wide)} ranges lie beyond the limits.{thinned}", panels[1:]),
     ]
 
 

@@ -22,14 +22,14 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import information_of, terms_of
 from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable, short
-from selfcal.base.output import console_of, plotter, save_picture
+from selfcal.base.errors import UserError, short
+from selfcal.base.grid import Array
+from selfcal.base.output import plotter, print_lines, save_picture
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.simulate import truth_of
@@ -41,7 +41,6 @@ from selfcal.model.tables import make_tables
 from selfcal.show.plot import COLORS
 
 SCHEMA = "selfcal.plan/1"
-Floats = NDArray[np.float64]
 #: Share of the records that have what is wanted at the planned length.
 SHARE = 0.9
 #: Bank samples of the shortest record, and of the longest.
@@ -119,7 +118,7 @@ def refusal(model: Model, axis: str, one: Regressor) -> str:
     return f"{one.name} has `{what}`, which is not in proportion to {one.column}: leave this wish out"
 
 
-def column_of(one: Regressor, channel: Floats, rate_hz: float) -> Floats:
+def column_of(one: Regressor, channel: Array, rate_hz: float) -> Array:
     """float64[n]: the column that a channel [n] at this rate makes. The window of a rate is of whole intervals."""
     if one.kind == "rate":
         one = replace(one, window_s=max(1, round(one.window_s * rate_hz)) / rate_hz)
@@ -133,10 +132,10 @@ class Ensemble:
         self, model: Model, axis: str, wishes: Sequence[Wish], seeds: Sequence[int], scheduler: str | None
     ) -> None:
         self.model, self.axis, self.wishes, self.seeds, self.scheduler = model, axis, wishes, seeds, scheduler
-        self.at: dict[int, Floats] = {}
+        self.at: dict[int, Array] = {}
         self.typical: dict[str, tuple[Law, dict[str, float]]] = {}
 
-    def metrics(self, samples: int) -> Floats:
+    def metrics(self, samples: int) -> Array:
         """Of records of so many bank samples."""
         if samples not in self.at:
             rows = spread(
@@ -224,7 +223,7 @@ def cycling(
     return found
 
 
-def swung(samples: int, cycles: float, swing: float) -> Floats:
+def swung(samples: int, cycles: float, swing: float) -> Array:
     """[n]: so many cycles of a channel about 0."""
     return np.asarray(0.5 * swing * np.cos(2.0 * math.pi * cycles * (np.arange(samples) + 0.5) / samples))
 
@@ -354,9 +353,7 @@ def picture(document: Mapping[str, Any], path: Path | str) -> None:
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """How long for each wish, in all, and what another rate would change."""
-    console = console_of(to_stderr=to_stderr)
-    for line in _lines(document):
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+    print_lines(_lines(document), to_stderr=to_stderr)
 
 
 def steady(curve: Sequence[Mapping[str, float]]) -> float | None:

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 from scipy.special import log_ndtr, ndtri
 
 from selfcal.bank.result import HALF_90, of_mixture
+from selfcal.base.grid import Array
 
-Array = NDArray[np.float64]
 #: Fewest units of a population and of a group.
 FEWEST, FEWEST_OF_GROUP = 5, 3
 #: Points of the grid of spreads, and its reach from the spread of the estimates: of five units the tail weighs.
@@ -403,6 +403,6 @@ def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: float) -> 
     return float(weight @ difference), float(_tail(weight, difference / sd))
 
 
-def sd_of(log_p: float) -> float:
+def sd_off(log_p: float) -> float:
     """How many standard deviations off a two-sided probability is; at most 38."""
     return float(-ndtri(max(math.exp(max(log_p, -700.0)) / 2.0, 1e-300)))

@@ -53,6 +53,11 @@ class Options:
     reading: Mapping[str, Any] = field(default_factory=dict)
     stretch: Mapping[str, Any] = field(default_factory=dict)
 
+    @property
+    def given(self) -> dict[str, Any]:
+        """Keywords of both."""
+        return {"axes": self.axes, "model": self.model, **self.reading, **self.stretch}
+
 
 def examined(verbs: Verbs, options: Options, job: Job) -> list[Row]:
     """One row: the record, or {"error": reason}. `job`: absolute path, content. A broken file never raises."""
@@ -68,20 +73,14 @@ def examined(verbs: Verbs, options: Options, job: Job) -> list[Row]:
             return [{"error": f"{type(error).__name__}: {first_line(error)}"}]
 
 
-def killed(_: Job) -> list[Row]:
-    """The row of a recording that no worker survives."""
-    return [{"error": KILLED}]
-
-
 def _record(verbs: Verbs, options: Options, path: str) -> Row:
-    given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
-    document = verbs.identify(path, suspicion=False, **given)
+    document = verbs.identify(path, suspicion=False, **options.given)
     row: Row = {
         "recording": document["recording"],
         "axes": {name: _of(axis, IDENTIFIED) | _looks(axis) for name, axis in document["axes"].items()},
     }
     if options.diagnose:
-        row["diagnosis"] = _diagnosis(verbs, path, list(document["axes"]), given)
+        row["diagnosis"] = _diagnosis(verbs, path, list(document["axes"]), options.given)
     return row
 
 
@@ -121,8 +120,7 @@ def own_pages(
 def _paged(verbs: Verbs, options: Options, job: Job) -> list[Row]:
     """Write the page of a recording. `job`: its absolute path, the page's place."""
     with contextlib.redirect_stderr(io.StringIO()), contextlib.suppress(UserError, MemoryError):
-        given: dict[str, Any] = {"axes": options.axes, "model": options.model, **options.reading, **options.stretch}
-        verbs.diagnose(job[0], report=job[1], **given)
+        verbs.diagnose(job[0], report=job[1], **options.given)
     return [{}]
 
 

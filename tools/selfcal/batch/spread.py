@@ -28,12 +28,11 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Protocol
 
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn
+from rich.progress import BarColumn, TextColumn
 
-from selfcal.base.errors import UserError, first_line, install, note, printable, shown
+from selfcal.base.errors import UserError, first_line, install, printable, shown
 from selfcal.base.output import temporary_folder, whole
-from selfcal.base.progress import EVERY_S
+from selfcal.base.progress import Doing
 
 #: Argument of the function for a record; it is pickled.
 Job = Any
@@ -115,27 +114,16 @@ def spread(
     return [row for k in range(len(pieces)) for row in finished[k]]
 
 
-class _Remaining:
+class _Remaining(Doing):
     """How much is done and how long the rest takes: a bar in a terminal, else a line of `verb` now and then.
 
     The rest takes as long for its weight as the work of this run did."""
 
     def __init__(self, verb: str, weights: Sequence[float], pieces: Sequence[Sequence[Job]]) -> None:
-        console = Console(stderr=True)
-        self.verb, self.weights, self.sizes = verb, weights, [len(piece) for piece in pieces]
-        self.left, self.worked, self.jobs = sum(weights), 0.0, 0
-        self.began = self.told = time.monotonic()
-        self.terminal = console.is_terminal
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[said]}"))
-        self.progress = Progress(*columns, console=console, transient=True, disable=not self.terminal)
-        self.task = self.progress.add_task(verb or "records", total=self.left, said="")
-
-    def __enter__(self) -> _Remaining:
-        self.progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.progress.stop()
+        super().__init__(verb, *columns, total=sum(weights))
+        self.weights, self.sizes = weights, [len(piece) for piece in pieces]
+        self.left, self.worked, self.jobs = sum(weights), 0.0, 0
 
     def done(self, pieces: Iterable[int]) -> None:
         """These were done by an earlier run."""
@@ -149,13 +137,10 @@ class _Remaining:
         self.worked += self.weights[k]
         self.left -= self.weights[k]
         self.jobs += self.sizes[k]
-        now = time.monotonic()
-        rest_s = (now - self.began) * self.left / self.worked if self.worked else 0.0
+        rest_s = (time.monotonic() - self.began) * self.left / self.worked if self.worked else 0.0
         said = f"{self.jobs} of {sum(self.sizes)}, {_spoken(rest_s)} more"
         self.progress.update(self.task, advance=self.weights[k], said=said)
-        if self.verb and not self.terminal and now - self.told >= EVERY_S:
-            self.told = now
-            note(f"{self.verb}: {said}")
+        self.tell(said)
 
 
 def _spoken(seconds: float) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaln
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError
 from selfcal.batch.drift import Drift, Series, drifts_of
@@ -26,9 +26,9 @@ from selfcal.batch.population import (
     Measured,
     Population,
     populations,
-    sd_of,
+    sd_off,
 )
-from selfcal.batch.unit_table import Unit, best, bias_of
+from selfcal.batch.unit_table import Unit
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
@@ -230,15 +230,14 @@ def _of_recording(axis: Mapping[str, Any], law: str, group: Group, regressors: S
     parameters: Mapping[str, Mapping[str, Any]] = axis["parameters"][law]
     quantities = {name: _parameter(estimate, group.priors.get(name)) for name, estimate in parameters.items()}
     if quantities.get("N") is None:
-        quantities["N"] = _parameter(axis["parameters"][best(axis)]["N"], group.priors.get("N"))
+        quantities["N"] = _parameter(axis["parameters"][likeliest(axis["hypotheses"])]["N"], group.priors.get("N"))
     for regressor in regressors:
         for column, estimate in (
             axis.get("regressors", {}).get(regressor.name, {"coefficients": {}})["coefficients"].items()
         ):
             quantities[column] = _coefficient(estimate, regressor.sd[group.name])
     bias = bias_of(axis)
-    s = (bias["q95"] - bias["q05"]) / (2.0 * HALF_90)
-    quantities["bias"] = Known(bias["median"], s, identified=True, unit=group.unit, logarithm=False)
+    quantities["bias"] = Known(bias["median"], sd_of(bias), identified=True, unit=group.unit, logarithm=False)
     return {name: known for name, known in quantities.items() if known is not None}
 
 
@@ -322,7 +321,7 @@ def _series(known: Mapping[str, OfAxis], names: Sequence[str]) -> Iterator[Serie
 
 def _off(population: Population, off: float, log_p: float) -> str:
     measured = population.measured
-    far = f"{sd_of(log_p):.1f} sd off"
+    far = f"{sd_off(log_p):.1f} sd off"
     if measured.logarithm:
         return f"{measured.name} {math.exp(off):.3g} times the batch's median, {far}"
     return f"{measured.name} {off:+.3g} {measured.unit} from the batch's mean, {far}"
@@ -413,9 +412,9 @@ def document_of(batch: Batch) -> dict[str, Any]:
     drift: dict[str, dict[str, Any]] = {}
     drifting: dict[str, list[str]] = {}
     for slope in batch.drifts:
-        drift.setdefault(names[slope.at], {})[slope.quantity] = slope.entry()
+        drift.setdefault(names[slope.of.at], {})[slope.of.quantity] = slope.entry()
         if slope.significant:
-            drifting.setdefault(names[slope.at], []).append(_drift_words(slope))
+            drifting.setdefault(names[slope.of.at], []).append(_drift_words(slope))
     return {
         "population": {population.measured.name: _entry(population, names) for population in batch.populations},
         "unlike": batch.unlike,
@@ -506,9 +505,10 @@ def seen_from_words(population: Population) -> str:
 
 
 def _drift_words(drift: Drift) -> str:
-    rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if drift.logarithm else f"{drift.per_day:+.3g} {drift.unit}"
-    seen = f"{drift.recordings} recordings in {drift.days:.3g} days, {sd_of(drift.log_p):.1f} sd"
-    return f"{drift.quantity} {rate} a day, {seen}"
+    of = drift.of
+    rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if of.logarithm else f"{drift.per_day:+.3g} {of.unit}"
+    seen = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
+    return f"{of.quantity} {rate} a day, {seen}"
 
 
 def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:
@@ -516,12 +516,12 @@ def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> 
     also = f"; the same units are {', '.join(apart.also)}" if apart.also else ""
     how = f"{math.exp(apart.offset):.3g} times" if measured.logarithm else f"{apart.offset:+.3g} {measured.unit} from"
     if apart.against is None:
-        return f"{measured.name} is {how} the other units', {sd_of(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
+        return f"{measured.name} is {how} the other units', {sd_off(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
     if apart.kind == TWO_GROUPS:
         of = _some([names[device] for device in apart.members])
         return f"{measured.name} of {of} is {how} the others': no column of the batch explains it"
     other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
-    said = f"the two differ, {sd_of(apart.log_p):.1f} sd: which one is off, two alone do not show"
+    said = f"the two differ, {sd_off(apart.log_p):.1f} sd: which one is off, two alone do not show"
     return f"{measured.name} is {how} {other}, {said}{also}"
 
 

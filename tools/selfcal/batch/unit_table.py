@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.result import bias_of, likeliest
 from selfcal.base.errors import UserError, cell, install
 from selfcal.base.output import whole
 from selfcal.batch.files import Source, moment, stem
@@ -62,19 +62,6 @@ class Unit:
         }
 
 
-def best(axis: Mapping[str, Any]) -> str:
-    """The most probable law of an axis."""
-    probability: Mapping[str, float] = axis["hypotheses"]
-    return max(probability, key=lambda law: probability[law])
-
-
-def bias_of(axis: Mapping[str, Any]) -> dict[str, Any]:
-    """The bias at the end of the record, as the other parameters are."""
-    bias = axis["bias_now"]
-    half = HALF_90 * bias["sd"]
-    return {"median": bias["mean"], "q05": bias["mean"] - half, "q95": bias["mean"] + half, "unit": bias["unit"]}
-
-
 def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
     """The rows of a recording. A recording, or an axis, without a result is a row with its `error`."""
     source = unit.source
@@ -86,7 +73,7 @@ def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
         if "error" in axis:
             yield head | {"axis": name, "error": axis["error"]}
             continue
-        law = best(axis)
+        law = likeliest(axis["hypotheses"])
         known = {"law": law, "probability": axis["hypotheses"][law], "adequate": axis["adequate"]}
         known["causes"] = ";".join(unit.causes(name))
         unjudged = unit.record.get("diagnosis", {}).get(name, {}).get("error")

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.result import HALF_90, bias_of, likeliest
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, shown
 from selfcal.base.output import check_writable, whole
@@ -196,14 +196,12 @@ def _judged(limit: Limit, axis: Mapping[str, Any] | None, duration_s: float) -> 
 def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
     """The posterior of a quantity, or why the axis has none. A constant drift bounds what it lacks from above."""
     probability = axis["hypotheses"]
-    best = max(probability, key=lambda law: probability[law])
+    best = likeliest(probability)
     constant = set(axis["parameters"][best]) <= {"N"}
     if parameter == "bias":
         if "bias_now" not in axis:
             return "diagnose states no bias: identify --limits does"
-        bias, half = axis["bias_now"], HALF_90 * axis["bias_now"]["sd"]
-        bounds = {"median": bias["mean"], "q05": bias["mean"] - half, "q95": bias["mean"] + half}
-        return {**bounds, "unit": bias["unit"], "identified": True, "off_grid": False, "sharpens": constant}
+        return {**bias_of(axis), "identified": True, "off_grid": False, "sharpens": constant}
     having = [law for law in probability if parameter in axis["parameters"][law]]
     if not having:
         return f"no law of the model has {parameter}"

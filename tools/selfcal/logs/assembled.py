@@ -38,9 +38,8 @@ class _Stamps:
     fail: Callable[[int, str], Any]
 
 
-def assembled(rate: float | None, rows: Rows, header: Header, mend: bool) -> Recording:
-    """The recording of the rows of a table; it empties `rows.columns`: no second copy stays. `rate`: as the user states
-    it. `mend`: rows with a damaged stamp are left out, rows out of order are sorted. Raises UserError."""
+def assembled(rows: Rows, header: Header) -> Recording:
+    """The recording of the rows of a table; it empties `rows.columns`: no second copy stays. Raises UserError."""
     columns: dict[str, Column] = {}
     count = rows.columns[0].size
     for number, field in enumerate(rows.fields):
@@ -55,21 +54,23 @@ def assembled(rate: float | None, rows: Rows, header: Header, mend: bool) -> Rec
     _check_truth(rows.path, rows.meta)
     stamps, part = columns.pop("t", None), columns.pop(PART, None)
     if stamps is None:
-        rate = rate if rate is not None else _meta_rate(rows.path, rows.meta)
+        rate = header.rate if header.rate is not None else _meta_rate(rows.path, rows.meta)
         if rate is None:
             mapped = f", map yours with --column t={shlex.quote(header.dated)}" if header.dated else ""
             raise UserError(f"{rows.path}: there is no time column: add t[s]{mapped} or give --rate HZ")
         return _on_clocks(rows, rate, columns, count, None, header)
     if header.written and np.isfinite(stamps.values).all():
         return _as_written(rows, columns, units.convert(stamps.values, stamps.unit, "s"), header)
-    ordered, kept = _ordered(rows, stamps, part, header, mend)
+    ordered, kept = _ordered(rows, stamps, part, header)
     if kept.size < count or (np.diff(kept) < 0).any():
         columns = {name: replace(one, values=one.values[kept]) for name, one in columns.items()}
-    return _on_clocks(rows, rate, columns, kept.size, ordered, header)
+    return _on_clocks(rows, header.rate, columns, kept.size, ordered, header)
 
 
-def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header, mend: bool) -> tuple[_Stamps, Places]:
-    """The stamps in their order, and the rows of the table that they are of. `part`: what is added to the stamps."""
+def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header) -> tuple[_Stamps, Places]:
+    """The stamps in their order, and the rows of the table that they are of. `part`: what is added to the stamps. With
+    `skip_bad` rows with a damaged stamp are left out, rows out of order are sorted."""
+    mend = header.asked.skip_bad
     number = [field.name for field in rows.fields].index("t")
     known = np.flatnonzero(np.isfinite(stamps.values))
     unknown = stamps.values.size - known.size

@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -33,30 +33,51 @@ NAME_YOURS = "name yours with --column gx=NAME, and --unit gx=UNIT where its hea
 _COUNTS_FROM = 3
 
 
+@dataclass(frozen=True)
+class Asked:
+    """How the user wants a log to be read: the arguments of `load()`, `units` and `scale` by name."""
+
+    rate: float | None
+    columns: Mapping[str, str]
+    units: Mapping[str, str]
+    scale: Mapping[str, Scale]
+    sensors: Collection[str]
+    no_time: bool
+    skip_bad: bool
+    sources: Sequence[str]
+    dbc: Path | str | None
+
+    @property
+    def options(self) -> tuple[tuple[str, str], ...]:
+        """The same as the command line says it."""
+        given = [] if self.rate is None else [("--rate", f"{self.rate:.15g}")]
+        for option, pairs in (("--column", self.columns), ("--unit", self.units)):
+            given += [(option, f"{name}={value}") for name, value in pairs.items()]
+        for name, (size, unit) in self.scale.items():
+            text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
+            given.append(("--scale", f"{name}={text}" if name else text))
+        given += [("--source", name) for name in self.sources]
+        given += [] if self.dbc is None else [("--dbc", str(self.dbc))]
+        switches = (("--no-time", self.no_time), ("--skip-bad", self.skip_bad))
+        return (*given, *((option, "") for option, wanted in switches if wanted))
+
+
 class Header:
     """Works out from the keys of a table which columns to read, and in which unit."""
 
-    def __init__(
-        self,
-        path: Path,
-        columns: Mapping[str, str],
-        stated: Mapping[str, str],
-        scale: Mapping[str, Scale],
-        sensors: Collection[str],
-        no_time: bool,
-    ) -> None:
-        self.path, self.columns, self.stated, self.scale, self.sensors = path, columns, stated, scale, sensors
-        self.no_time = no_time
+    def __init__(self, path: Path, asked: Asked, several: bool) -> None:
+        self.path, self.asked, self.columns, self.sensors = path, asked, asked.columns, asked.sensors
+        self.stated, self.scale, self.rate, self.no_time = asked.units, asked.scale, asked.rate, asked.no_time
         #: `meta` states the clocks of the table.
         self.written = False
         #: The table is not alone: a column may be in another.
-        self.several = False
+        self.several = several
         self.notes: list[str] = []
         self.damaged = SOUND
         #: Heading of a column of dates that is not taken for the time.
         self.dated = ""
         #: Columns whose unit the user states, or scales.
-        self.decided = {*stated, *(scale if "" not in scale else sensors)}
+        self.decided = {*self.stated, *(self.scale if "" not in self.scale else self.sensors)}
         #: Names that the user gives of columns, here or in the file, and that are there.
         self.found: set[str] = set()
         #: The headings of all tables of the file.
@@ -163,11 +184,9 @@ class Header:
             raise UserError(f"{none}{NAME_YOURS}")
         return fields
 
-    def marks(
-        self, keys: Sequence[str], meta: Mapping[str, Any], rate: float | None, fields: Sequence[Field]
-    ) -> list[Field]:
+    def marks(self, keys: Sequence[str], meta: Mapping[str, Any], fields: Sequence[Field]) -> list[Field]:
         """The columns that state the clocks of a table that `convert` wrote. The user's rate, or no time, decides."""
-        self.written = written.stated(meta) and rate is None and any(field.name == "t" for field in fields)
+        self.written = written.stated(meta) and self.rate is None and any(field.name == "t" for field in fields)
         marks = written.marks_of(meta) if self.written else ()
         return [Field(key, f"{key} ", "1", 1.0) for key in keys if key in marks]
 

@@ -10,13 +10,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from selfcal.base.grid import Array, Rows
 from selfcal.logs.sampling import common_step, overlapping
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 #: Rows from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM = 100
@@ -38,12 +35,12 @@ class Order:
     `damaged`: rows with a damaged or repeated stamp that are left out."""
 
     rows: Rows
-    time: Floats
+    time: Array
     notes: tuple[str, ...] = ()
     damaged: int = 0
 
 
-def in_order(time: Floats, tick_s: float, mend: bool) -> Order:
+def in_order(time: Array, tick_s: float, mend: bool) -> Order:
     """The order of rows with the stamps `time` [n], s. `tick_s`: a count of their column, s. `mend`: rows are sorted
     within their neighbourhood, those of damaged and repeated stamps left out. Stamps may fall in what comes back."""
     rows = np.arange(time.size)
@@ -56,7 +53,7 @@ def in_order(time: Floats, tick_s: float, mend: bool) -> Order:
     return _mended(order) if mend else order
 
 
-def unwrapped(time: Floats, tick_s: float) -> tuple[Floats, list[str]]:
+def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
     """Stamps [n], s, of a clock that went on, and a line for each span by which it begins anew."""
     steps = np.diff(time)
     if time.size < 3 or not (steps < 0.0).any():
@@ -78,7 +75,7 @@ def unwrapped(time: Floats, tick_s: float) -> tuple[Floats, list[str]]:
     return time, []
 
 
-def _spans(time: Floats, steps: Floats, tick_s: float, usual: float) -> list[tuple[float, float]]:
+def _spans(time: Array, steps: Array, tick_s: float, usual: float) -> list[tuple[float, float]]:
     """Spans, s, that a clock may have, and the usual steps that may be lost where it begins anew."""
     found = [(2.0**32 * tick, _LOST_OF_32) for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))]
     found += [(span, _LOST) for span in _CLOCKS]
@@ -91,7 +88,7 @@ def _spans(time: Floats, steps: Floats, tick_s: float, usual: float) -> list[tup
     return found
 
 
-def broken(time: Floats) -> tuple[int, str] | None:
+def broken(time: Array) -> tuple[int, str] | None:
     """The first row whose stamp is not later than the one before, and the words; None where the stamps will do.
 
     Stamps may repeat for being coarse. They may fall where batches of one length overlap."""
@@ -107,7 +104,7 @@ def broken(time: Floats) -> tuple[int, str] | None:
     return None
 
 
-def mends(time: Floats) -> bool:
+def mends(time: Array) -> bool:
     """Whether stamps that are not in order can be mended."""
     order = _mended(Order(np.arange(time.size), time))
     return bool(order.notes) and broken(order.time) is None
@@ -147,13 +144,13 @@ def _mended(order: Order) -> Order:
     return Order(order.rows[kept], time[kept], tuple(notes), left_out)
 
 
-def _far(time: Floats) -> Rows:
+def _far(time: Array) -> Rows:
     """Rows with a damaged stamp: farther from their neighbours' than rows that are out of their order."""
     middle = median_filter(time, 2 * _NEAR + 1, mode="nearest")
     return np.flatnonzero(np.abs(time - middle) > (_NEAR + 0.5) * float(np.median(np.abs(np.diff(time)))))
 
 
-def _coarse(steps: Floats) -> bool:
+def _coarse(steps: Array) -> bool:
     """Whether stamps repeat for being coarse: often, or in a rhythm all the time."""
     rows = np.flatnonzero(steps == 0.0)
     if steps.size < _REPEATS_FROM or rows.size < 2:

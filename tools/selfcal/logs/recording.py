@@ -24,7 +24,7 @@ from selfcal.base.options import Scale
 from selfcal.base.units import SENSORS
 from selfcal.logs import arrays, written
 from selfcal.logs.assembled import assembled
-from selfcal.logs.headers import NAME_YOURS, Header
+from selfcal.logs.headers import NAME_YOURS, Asked, Header
 from selfcal.logs.loaders import check_library, format_of, texts
 from selfcal.logs.loaders.child import tables_of
 from selfcal.logs.loaders.damage import SOUND, bytes_of
@@ -99,15 +99,9 @@ def load(
         raise UserError(f"the rate must be above 0 Hz ({LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz), not {rate:g}")
     if len(paths) > 1 and (rate is not None or no_time):
         raise UserError("several files are joined by their time stamps: leave --rate and --no-time out")
-    hints = {} if dbc is None else {"dbc": str(dbc)}
-    headers = [Header(one, columns, units, by_name, sensors, no_time) for one in paths]
-    for header in headers:
-        header.several = len(paths) > 1
-    found = [
-        part
-        for one, header in zip(paths, headers, strict=True)
-        for part in _load(one, rate, header, skip_bad, sources, hints, tables)
-    ]
+    asked = Asked(rate, columns, units, by_name, sensors, no_time, skip_bad, sources, dbc)
+    headers = [Header(one, asked, len(paths) > 1) for one in paths]
+    found = [part for header in headers for part in _load(header, tables)]
     there = {text for header in headers for key in header.seen for text in (key, split(key)[0])}
     for name, wanted in columns.items():
         if wanted not in there:
@@ -118,7 +112,7 @@ def load(
     recording = replace(
         recording,
         notes=tuple(dict.fromkeys((*recording.notes, *_rates(recording)))),
-        options=() if tables else _options(rate, columns, units, by_name, no_time, skip_bad, sources, dbc),
+        options=() if tables else asked.options,
     )
     for text in recording.notes:
         note(f"{recording.path}: {text}")
@@ -131,29 +125,6 @@ def _rate(rate: Any) -> float | None:
         return None if rate is None else float(rate)
     except (TypeError, ValueError) as error:
         raise UserError(f"the rate must be a number of Hz, not {shown(rate)}") from error
-
-
-def _options(
-    rate: float | None,
-    columns: Mapping[str, str],
-    units: Mapping[str, str],
-    scale: Mapping[str, Scale],
-    no_time: bool,
-    skip_bad: bool,
-    sources: Sequence[str],
-    dbc: Path | str | None,
-) -> tuple[tuple[str, str], ...]:
-    """How a recording is read, as the command line says it."""
-    given = [] if rate is None else [("--rate", f"{rate:.15g}")]
-    for option, pairs in (("--column", columns), ("--unit", units)):
-        given += [(option, f"{name}={value}") for name, value in pairs.items()]
-    for name, (size, unit) in scale.items():
-        text = f"{size:.15g}" + ("" if unit is None else f"[{unit}]")
-        given.append(("--scale", f"{name}={text}" if name else text))
-    given += [("--source", name) for name in sources]
-    given += [] if dbc is None else [("--dbc", str(dbc))]
-    given += [(option, "") for option, wanted in (("--no-time", no_time), ("--skip-bad", skip_bad)) if wanted]
-    return tuple(given)
 
 
 def from_arrays(
@@ -182,23 +153,17 @@ def list_of(paths: Data) -> list[Path]:
     return [Path(paths)] if isinstance(paths, Path | str) else [Path(one) for one in paths]
 
 
-def _load(
-    path: Path,
-    rate: float | None,
-    header: Header,
-    skip_bad: bool,
-    wanted: Sequence[str],
-    hints: Hints,
-    there: Sequence[Table] | None = None,
-) -> list[Recording]:
+def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
     """The sensors of one file that are meant, or of the tables that are `there`, and the temperatures beside them, each
     by its own clock."""
+    path, wanted = header.path, header.asked.sources
+    hints: Hints = {} if header.asked.dbc is None else {"dbc": str(header.asked.dbc)}
     with reading(path, "not a sound recording"):
         form = format_of(path, frames="dbc" in hints) if there is None else None
         if there is not None:
             tables = [*there]
         elif form is None:
-            tables = texts.read(path, header.knows_in, skip_bad)
+            tables = texts.read(path, header.knows_in, header.asked.skip_bad)
         else:
             check_library(path, form)
             if form.here:
@@ -207,7 +172,7 @@ def _load(
                 tables = tables_of(path, form, hints)
         several = len(tables) > 1
         header.seen = {key for table in tables for key in table.keys}
-        parts = [part for table in tables for part in _parts(path, rate, header, table, several, skip_bad)]
+        parts = [part for table in tables for part in _parts(header, table, several)]
         if not parts or (several and not any(part.axes for part in parts)):
             listed = ", ".join(f"{one.source}: {', '.join(one.keys)}" for one in tables)
             why = next((f"; {one}" for table in tables for one in table.notes), "")
@@ -227,7 +192,7 @@ def _load(
     return [first, *(replace(one, damaged=SOUND) for one in sound[1:])]
 
 
-def _parts(path: Path, rate: float | None, header: Header, table: Table, several: bool, mend: bool) -> list[Part]:
+def _parts(header: Header, table: Table, several: bool) -> list[Part]:
     """The sensors of a table, and the temperature in one without any."""
     keys = table.keys
     sensors = header.sensors_of(keys, table.name, table.before)
@@ -238,7 +203,7 @@ def _parts(path: Path, rate: float | None, header: Header, table: Table, several
     for sensor in sensors or [sides or Sensor("", {})]:
         others = {key for one in sensors if one is not sensor for key in one.meant} - sensor.meant.keys()
         kept = [key for key in keys if key not in others]
-        one = _Sensor(path, rate, header, table, sensor, kept, bool(sides), mend)
+        one = _Sensor(header, table, sensor, kept, bool(sides))
         names = set(map(one.name, kept))
         source = "/".join(name for name in (table.source, sensor.source) if name)
         found.append(Part(source, frozenset(names & set(header.sensors)), "temp" in names, one.span, one.read))
@@ -249,14 +214,11 @@ def _parts(path: Path, rate: float | None, header: Header, table: Table, several
 class _Sensor:
     """A sensor in a table: its headings `keys`. `side`: a temperature alone."""
 
-    path: Path
-    rate: float | None
     header: Header
     table: Table
     sensor: Sensor
     keys: Sequence[str]
     side: bool
-    mend: bool
 
     @cached_property
     def _mapped(self) -> dict[str, str]:
@@ -274,33 +236,33 @@ class _Sensor:
             if self.name(key) == "t":
                 unit = self.sensor.meant.get(key, Meaning(*split(key))).unit
                 field = Field(key, "t", "s", 1.0, dates=is_date(self.table.cells.get(key, "")))
-                return _span(self.table.rows(self.path, [field]).columns[0], unit)
+                return _span(self.table.rows(self.header.path, [field]).columns[0], unit)
         wanted = [Field(key, self.name(key), "", 1.0) for key in self.sensor.meant or self.keys]
-        return self.table.rows(self.path, wanted[:1]).columns[0].size, 0.0
+        return self.table.rows(self.header.path, wanted[:1]).columns[0].size, 0.0
 
     def read(self, several: bool, side: bool = False) -> Recording | None:
         """The recording of this sensor, or of its temperature only; None for a temperature that cannot be read."""
         header = self.header.of_part(several)
         if not (self.side or side):
             header.notes += self.table.notes
-            return self._read(header, self.rate, self.keys)
-        header.sensors, header.columns = list(SIDE_UNITS), {}
+            return self._read(header, self.keys)
+        header.sensors, header.columns, header.rate = list(SIDE_UNITS), {}, None
         try:
-            return self._read(header, None, [key for key in self.keys if self.name(key) in ("t", *header.sensors)])
+            return self._read(header, [key for key in self.keys if self.name(key) in ("t", *header.sensors)])
         except UserError as error:
             note(f"{error}; {self.table.source} is left out")
             return None
 
-    def _read(self, header: Header, rate: float | None, keys: Sequence[str]) -> Recording:
+    def _read(self, header: Header, keys: Sequence[str]) -> Recording:
         if not keys:
-            raise UserError(f"{self.path}: there are no columns")
+            raise UserError(f"{header.path}: there are no columns")
         table = self.table
         fields = header.fields(keys, table.where, table.meta.get("columns", {}), table.cells, self.sensor.meant)
-        fields += header.marks(keys, table.meta, rate, fields)
-        rows = table.rows(self.path, fields)
+        fields += header.marks(keys, table.meta, fields)
+        rows = table.rows(header.path, fields)
         header.damaged += rows.damaged
         header.notes += rows.notes
-        return assembled(rate, rows, header, self.mend)
+        return assembled(rows, header)
 
 
 def _span(stamps: NDArray[Any], unit: str | None) -> tuple[int, float]:

@@ -123,7 +123,7 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     found, missing = _sampling(path, time, noise_s, rate, fail)
     lossy = 2 * np.count_nonzero(missing) > missing.size
     if rate is not None and (not 0.9 < found / rate < 1.1 or (lossy and not thinned_grid(time, 1.0 / rate))):
-        raise _disagrees(path, rate)
+        raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
     rate = found if rate is None else rate
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
@@ -205,7 +205,3 @@ def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:
     row = int(np.argmax(steps))
     what = f"a recording spans at most {LONGEST_S:g} s, and {LONGEST:.2g} samples: leave the row out"
     fail(row, f"the time stamp is {steps[row]:.3g} s after the one before: {what}")
-
-
-def _disagrees(path: object, rate: float) -> UserError:
-    return UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")

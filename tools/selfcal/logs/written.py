@@ -21,15 +21,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, cell
+from selfcal.base.grid import Array, Rows
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_COLUMNS, MOST_RATE_HZ
 from selfcal.base.output import together, whole
 from selfcal.logs.loaders import WRITTEN
 from selfcal.logs.loaders.table import heading, meta_place
 from selfcal.logs.recorded import Recording
 from selfcal.logs.timebase import Clock
-
-Floats = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 #: Headings, without a unit, of the columns beside those of the recording.
 SAMPLE, LATE = "sample", "late"
@@ -45,8 +43,8 @@ _OF_TABLE = ("columns", "rows", "rate_hz")
 class Laid:
     """A recording for `save`: columns by name, the unit and float64[n], NaN without a sample; stamps float64[n], s."""
 
-    columns: Mapping[str, tuple[str, Floats]]
-    t: Floats
+    columns: Mapping[str, tuple[str, Array]]
+    t: Array
     meta: Mapping[str, Any]
 
 
@@ -59,7 +57,7 @@ def laid_out(recording: Recording) -> Laid:
     stamps = [one.time_s if one.off_grid_s is None else one.time_s + one.off_grid_s for one in clocks]
     t, rows = _rows(stamps, _ONE_ROW / recording.rate_hz)
 
-    def cells(values: NDArray[Any], at: Rows) -> Floats:
+    def cells(values: NDArray[Any], at: Rows) -> Array:
         full = np.full(t.size, np.nan)
         full[at] = values
         return full
@@ -95,7 +93,7 @@ def stated(meta: Mapping[str, Any]) -> bool:
     return isinstance(meta.get("clocks"), list) and 0 < len(meta["clocks"]) <= MOST_COLUMNS
 
 
-def _rows(stamps: Sequence[Floats], near_s: float) -> tuple[Floats, list[Rows]]:
+def _rows(stamps: Sequence[Array], near_s: float) -> tuple[Array, list[Rows]]:
     """Stamps of the rows, float64[n], s, and the rows of each clock's samples. Stamps of several clocks that are nearer
     than `near_s` share a row; each sample of one clock has a row of its own."""
     if len(stamps) == 1:
@@ -117,7 +115,7 @@ def _rows(stamps: Sequence[Floats], near_s: float) -> tuple[Floats, list[Rows]]:
 
 
 def clocks_of(
-    path: object, meta: Mapping[str, Any], t: Floats, marks: Mapping[str, Floats], places: Rows | None
+    path: object, meta: Mapping[str, Any], t: Array, marks: Mapping[str, Array], places: Rows | None
 ) -> list[tuple[list[str], Clock, Rows]]:
     """Of each clock that `meta` states the columns' names, the clock and the rows of its samples in a table with the
     stamps `t` [n], s, and the columns `marks` beside the recording's. `places` [n]: lines of the rows, some of which

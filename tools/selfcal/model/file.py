@@ -446,6 +446,12 @@ class _Reader:
                 raise self.fail(where, f"unknown entry '{short(str(key))}' (known: {', '.join(allowed)})")
         return tree
 
+    def flag(self, tree: Mapping[str, Any], key: str, where: str) -> bool:
+        value = tree.get(key, False)
+        if not isinstance(value, bool):
+            raise self.fail(f"{where}.{key}", f"must be true or false, not {shown(value)}")
+        return value
+
     def number(self, value: Any, where: str, *, low: float = 0.0, strict: bool = True) -> float:
         try:
             number = float(value)  # YAML reads 1e-3 without a dot as text
@@ -679,12 +685,11 @@ class _Reader:
         outlier_sd = self.number(fields.get("outlier_sd", 0.0), "handle.outlier_sd", strict=False)
         if 0.0 < outlier_sd < LEAST_OUTLIER_SD:
             raise self.fail("handle.outlier_sd", f"must be 0 or at least {LEAST_OUTLIER_SD:g}, not {outlier_sd:g}")
-        for name in ("steps", "variance_changes"):
-            if not isinstance(fields.get(name, False), bool):
-                raise self.fail(f"handle.{name}", f"must be true or false, not {shown(fields[name])}")
-            if fields.get(name) and regressors:
+        chosen = {name: self.flag(fields, name, "handle") for name in ("steps", "variance_changes")}
+        for name in chosen:
+            if chosen[name] and regressors:
                 raise self.fail(f"handle.{name}", "does not go with regressors: leave one of them out")
-        return Handling(outlier_sd, fields.get("steps", False), fields.get("variance_changes", False))
+        return Handling(outlier_sd, **chosen)
 
     def nodes(self, tree: Any, where: str, laws: Mapping[str, Law]) -> GridNodes:
         fields = self.only(tree, tuple(dict.fromkeys((*NAMED, *laws))), where)
@@ -736,9 +741,7 @@ class _Reader:
 
     def law(self, tree: Any, where: str) -> Law:
         terms = self.entry(tree, "terms", where)
-        coloured = tree.get("coloured_noise", False)
-        if not isinstance(coloured, bool):
-            raise self.fail(f"{where}.coloured_noise", f"must be true or false, not {shown(coloured)}")
+        coloured = self.flag(tree, "coloured_noise", where)
         if not isinstance(terms, list):
             raise self.fail(f"{where}.terms", f"must be a list of terms, not {shown(terms)}")
         most = MOST_TERMS - (1 if coloured else 0)

@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import _library32
-
-Array = NDArray[np.float64]
+from selfcal.base.grid import Array
 
 #: Forms, the simplest first.
 FORMS = ("static", "lag", "rate", "square", "cube", "play", "free")

@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
+from selfcal.base.units import STANDARD_GRAVITY
+
 Floats = NDArray[np.float64]
 
 #: Axes of a part, and the unit of each.
@@ -27,11 +29,11 @@ TRUTHS: dict[str, dict[str, dict[str, float]]] = {
 }
 LAWS = tuple(TRUTHS["deg/s"])
 #: sd of the turn-on bias: the data sheet's initial bias errors, 3 deg/s and 50 mg.
-TURN_ON = {"deg/s": 3.0, "m/s^2": 0.05 * 9.80665}
+TURN_ON = {"deg/s": 3.0, "m/s^2": 0.05 * STANDARD_GRAVITY}
 #: The ADIS16405's data sheet: random walk 2 deg/sqrt(h) and 0.2 m/s/sqrt(h), in-run bias stability 0.007 deg/s and 0.2
 #: mg.
 SHEET_N = {"deg/s": 2.0 / 60.0, "m/s^2": 0.2 / 60.0}
-SHEET_STABILITY = {"deg/s": 0.007, "m/s^2": 0.2e-3 * 9.80665}
+SHEET_STABILITY = {"deg/s": 0.007, "m/s^2": 0.2e-3 * STANDARD_GRAVITY}
 #: s over which a filter designer lets the bias walk by its stability.
 SHEET_TIME_S = 100.0
 

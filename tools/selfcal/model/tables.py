@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
 from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior, Regressor
 from selfcal.model.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, SWING_MOST, Law
 from selfcal.model.regressors import channels_of, sources_of
 
-#: Hz; beyond these the bank interval has no meaning for a drift.
-RATE_LIMITS = (1e-6, 1e6)
 #: Samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
 #: Bank intervals of a stated correlation time, at most: ALPHA_DT_MAX in lib/bank_inside.h, TIME_MAX in bank_states.c.
@@ -122,8 +121,8 @@ class HypothesisTable:
 
 @dataclass(frozen=True)
 class GateTable:
-    """The gate for one sampling rate: `window` in samples; of each axis `sigma` (infinite: left out), and if it is a
-    gyro."""
+    """The gate for one sampling rate, its fields as the bindings take them: `window` in samples; of each axis `sigma`
+    (infinite: left out), and if it is a gyro."""
 
     window: int
     false_alarm: float
@@ -237,49 +236,14 @@ def make_tables(
     nodes = model.nodes[target]
     bank_rate = bank_rate_hz or model.bank_rate_hz
     for rate, what in ((rate_hz, "the sampling rate"), (bank_rate, "the bank rate")):
-        if not RATE_LIMITS[0] <= rate <= RATE_LIMITS[1]:
-            low, high = RATE_LIMITS
-            raise UserError(f"{what}, {rate:g} Hz, is outside {low:g} to {high:g} Hz")
+        if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
+            raise UserError(f"{what}, {rate:g} Hz, is outside {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz")
     names = model.axes if axes is None else axes
     block = bank_block(rate_hz, bank_rate)
     if block > MOST_BLOCK:
         raise UserError(f"{block} samples a bank interval ({rate_hz:g} to {bank_rate:g} Hz) are more than {MOST_BLOCK}")
-    axis_tables = []
-    for name in names:
-        group = model.group_of(name)
-        priors = [group.priors[key] for key in PARAMETERS]
-        axis_tables.append(
-            AxisTable(
-                name=name,
-                unit=group.unit,
-                ln_min=tuple(math.log(p.min) for p in priors),
-                ln_max=tuple(math.log(p.max) for p in priors),
-                law=tuple(_law(p) for p in priors),
-                bias_sd=group.priors["bias"].sd,
-                range=group.range,
-                stuck_limit=group.stuck_limit,
-            )
-        )
-    if 0.0 < model.half_life_s < _library32.BATCH * block / rate_hz:
-        raise UserError(
-            f"{model.path}: half_life_s: {model.half_life_s:g} s are less than {_library32.BATCH} bank intervals "
-            f"({_library32.BATCH * block / rate_hz:g} s)"
-        )
-    dt = block / rate_hz
-    for name, law in model.laws.items():
-        for period_s in (2.0 * math.pi / term.bandwidth for term in law.terms if term.kind == "oscillation"):
-            if not SWING_LEAST * dt <= period_s <= 2.0 * math.pi * SWING_MOST * dt:
-                raise UserError(
-                    f"{model.path}: hypotheses.{name}: period_s: must be from {SWING_LEAST * dt:.3g} to "
-                    f"{2.0 * math.pi * SWING_MOST * dt:.3g} s at bank intervals of {dt:g} s, not {period_s:g}"
-                )
-        for time_s in (1.0 / term.bandwidth for term in law.terms if term.stated and term.kind == "markov"):
-            if not dt / ALPHA_DT_MAX <= time_s <= TIME_MAX * dt:
-                where = "correlation_time_s" if name in NAMED else f"hypotheses.{name}: correlation_time_s"
-                raise UserError(
-                    f"{model.path}: {where}: must be from {dt / ALPHA_DT_MAX:.3g} to {TIME_MAX * dt:.3g} s at bank "
-                    f"intervals of {dt:g} s, not {time_s:g}"
-                )
+    axis_tables = tuple(_axis_table(name, model.group_of(name)) for name in names)
+    _check_times(model, block / rate_hz)
 
     def grids(name: str) -> tuple[Grid | None, Grid | None]:
         counts = nodes.of.get(name, ())
@@ -289,7 +253,7 @@ def make_tables(
     return Tables(
         dt_s=float(np.float32(block / rate_hz)),
         block=block,
-        axes=tuple(axis_tables),
+        axes=axis_tables,
         hypotheses=tuple(
             HypothesisTable(
                 name,
@@ -317,6 +281,44 @@ def make_tables(
         half_life_s=model.half_life_s,
         handling=model.handling,
     )
+
+
+def _axis_table(name: str, group: Group) -> AxisTable:
+    priors = [group.priors[key] for key in PARAMETERS]
+    return AxisTable(
+        name=name,
+        unit=group.unit,
+        ln_min=tuple(math.log(p.min) for p in priors),
+        ln_max=tuple(math.log(p.max) for p in priors),
+        law=tuple(_law(p) for p in priors),
+        bias_sd=group.priors["bias"].sd,
+        range=group.range,
+        stuck_limit=group.stuck_limit,
+    )
+
+
+def _check_times(model: Model, dt: float) -> None:
+    """Raise UserError for a time of the model that bank intervals of `dt` s are too long or too short for."""
+
+    def check(where: str, time_s: float, least: float, most: float) -> None:
+        if not least <= time_s <= most:
+            limits = f"{least:.3g} to {most:.3g} s at bank intervals of {dt:g} s"
+            raise UserError(f"{model.path}: {where}: must be from {limits}, not {time_s:g}")
+
+    least_s = _library32.BATCH * dt
+    if 0.0 < model.half_life_s < least_s:
+        what = f"{model.half_life_s:g} s are less than {_library32.BATCH} bank intervals ({least_s:g} s)"
+        raise UserError(f"{model.path}: half_life_s: {what}")
+    for name, law in model.laws.items():
+        where = f"hypotheses.{name}: "
+        for term in law.terms:
+            if term.kind == "oscillation":
+                most_s = 2.0 * math.pi * SWING_MOST * dt
+                check(f"{where}period_s", 2.0 * math.pi / term.bandwidth, SWING_LEAST * dt, most_s)
+        for term in law.terms:
+            if term.stated and term.kind == "markov":
+                stated = "correlation_time_s" if name in NAMED else f"{where}correlation_time_s"
+                check(stated, 1.0 / term.bandwidth, dt / ALPHA_DT_MAX, TIME_MAX * dt)
 
 
 def priors_of(group: Group, law: str) -> tuple[PriorRow, ...]:

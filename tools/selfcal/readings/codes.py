@@ -16,18 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from selfcal.base.grid import counts_of_pieces
+from selfcal.base.grid import Array, counts_of_pieces
 from selfcal.readings.budget import nats_of
-from selfcal.readings.lattice import Lattice
+from selfcal.readings.lattice import COARSEST, Lattice
 
-Array = NDArray[np.float64]
 Codes = NDArray[np.int64]
 
 #: Codes between the smallest and the largest reading, and readings, at least and at most.
 CODES, READINGS_LEAST = (5, 160), 300
-#: Steps of the lattice in the noise of a reading at most: beyond, heavy tails look like a dead band. Share of the codes
-#: that come at least: on a comb they are no neighbours.
-COARSEST, COME = 1.0, 0.5
+#: Share of the codes that come at least: on a comb they are no neighbours.
+COME = 0.5
 #: Pieces of a record that have a level each, at most, and readings in one at least.
 PIECES, PIECE = 200, 64
 #: Steps of the levels, in codes or in noises if these are more, and factors of the noise that are tried about its best.
@@ -48,7 +46,7 @@ CELLS, PILE, PILE_SHARE = 4.0, 20, 0.01
 STANDS_OUT = 3.0
 #: Times that the shares and the levels are found in turn.
 TURNS = 3
-#: Chance of a reading that the noise and the codes do not make.
+#: Chance of a reading that the noise and the codes, or a map, do not make.
 ODD = 1e-6
 
 
@@ -116,6 +114,11 @@ class _Fit:
     chance: Array
 
 
+def ln_of(count: Array | Codes, chance: Array) -> Array:
+    """ln likelihood [pieces, levels] of counts [pieces, codes] of what is read with a chance [codes, levels]."""
+    return np.asarray(count @ np.log((1.0 - ODD) * chance + ODD / len(chance)))
+
+
 def _of_pieces(count: Array, to: Array, sigma: float) -> float:
     """ln likelihood of counts [pieces, codes] where each piece has the noise and the level that suit it best."""
     return float(np.max([_values(count, to, factor * sigma)[0].max(axis=1) for factor in WIDE], axis=0).sum())
@@ -128,7 +131,7 @@ def _values(count: Array, to: Array, sigma: float) -> tuple[Array, Array]:
     below = ndtr(ends / sigma)
     below[0], below[-1] = 0.0, 1.0
     true = np.diff(below, axis=0)
-    return count @ np.log((1.0 - ODD) * (to @ true) + ODD / many), true
+    return ln_of(count, to @ true), true
 
 
 def _fit(count: Array, to: Array, sigma: float) -> _Fit:

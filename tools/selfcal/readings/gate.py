@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import astuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,26 +25,13 @@ def table_of(recording: Recording, model: Model, axes: tuple[str, ...]) -> GateT
     return table
 
 
-def make_gate(table: GateTable) -> _library32.Gate:
-    """As the model file configures it."""
-    return _library32.Gate(
-        table.window,
-        table.false_alarm,
-        table.hold,
-        table.settle,
-        table.memory,
-        list(table.sigma),
-        list(table.is_rate),
-    )
-
-
 class Learning:
     """A gate that takes the noise it has measured, as the application has it do: after the least number of windows of
     rest that it can be measured on, and whenever there are twice as many."""
 
     def __init__(self, table: GateTable) -> None:
         self.window, self.axes = table.window, len(table.sigma)
-        self.gate = make_gate(table)
+        self.gate = _library32.Gate(*astuple(table))
         self.learn_at = _library32.GATE_MEASURED_MIN
 
     def push(self, samples: NDArray[np.float32]) -> NDArray[np.bool_]:

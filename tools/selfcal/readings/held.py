@@ -12,19 +12,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import next_fast_len, rfft
 
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.logs.sampling import followed_phase
 from selfcal.readings.budget import nats_of
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
-
-#: Runs of equal readings that show held ones at least.
-RUNS_LEAST = 50
-#: Of a beat: repeats beyond those by chance, their share of the rows and their standard deviations, at least.
+#: Runs of equal readings that show held ones, at least; of a beat repeats beyond those by chance, their share of the
+#: rows and their standard deviations.
 REPEATS_LEAST, SHARE_LEAST, SURE = 50, 0.008, 6.0
 #: Rows that show its line, the power of a line over the mean beyond the largest by chance, and that over the mean in
 #: the blocks that follow its phase.
@@ -68,7 +63,7 @@ def held(columns: Sequence[Array], at: Rows, off: Array | None) -> Held | None:
         found[lag:] = np.logical_and.reduce([column[lag:] == column[:-lag] for column in columns])
         return found
 
-    if at.size < 4 * RUNS_LEAST:
+    if at.size < 4 * REPEATS_LEAST:
         return None
     same, again = equal(1), equal(2)
     regular = _in_runs(same, at) or _at_a_beat(same, again, at, off)
@@ -190,7 +185,7 @@ def _in_runs(same: Mask, at: Rows) -> Held | None:
     of the usual run. A run of several lengths is of as many readings that are equal by chance."""
     n = same.size
     starts = np.flatnonzero(~same)
-    if not RUNS_LEAST < starts.size < 0.55 * n:
+    if not REPEATS_LEAST < starts.size < 0.55 * n:
         return None
     lengths = np.diff(starts, append=n)
     inner = lengths[1:-1]

@@ -26,6 +26,9 @@ WHITE_REMAINDERS = 0.1
 #: Values nearer than this share of the largest are one: differences of a counter are rounded so. Those of a float32 are
 #: six times as far apart.
 ROUNDED = 1e-8
+#: Steps in the noise of a reading at most where codes are compared: beyond, heavy tails look like a dead band, and ln
+#: of the counts is not smooth.
+COARSEST = 1.0
 #: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
 FINE = 0.01
 #: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.

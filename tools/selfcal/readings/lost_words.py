@@ -10,16 +10,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import ndtr
 
-from selfcal.base.grid import MEDIAN_SD, equal_runs
+from selfcal.base.grid import MEDIAN_SD, Array, Mask, equal_runs
 from selfcal.readings.budget import nats_of
-from selfcal.readings.lattice import Lattice, lattice_of
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from selfcal.readings.lattice import COARSEST, Lattice, lattice_of
 
 #: Readings that are one value: how many at least, and the share up to which they are left out.
 #: Of a value with more, either the value or the others may be the noise. Then most averages have too few readings too,
@@ -30,18 +26,14 @@ LEAST, MOST = 5, 0.5
 COMMON, COMMON_EXCESS = 0.2, 0.7
 #: Share from which on a value beside the lattice of the others shows, and distinct values of theirs, at least.
 SHOWS, CODES = 0.02, 8
-#: Readings of a value whose neighbours are looked at, at most.
+#: Readings of a value whose neighbours are looked at, at most, and steps that their noise is taken of, about.
 SAMPLED = 50_000
 #: Far ones: candidates that are looked at, neighbours on either side that make their level, how far off they are in the
 #: noise and how far their neighbours may be, and readings of a candidate that are looked at first, at most.
 LOOKED, AROUND, FAR, NEAR, SHOWN = 6, 8, 5.0, 3.0, 500
-#: Steps that their noise is taken of, about.
-STEPS = 50_000
 #: Within the noise: steps of the lattice in the noise from which on single codes are compared; else distinct values so
 #: near, in the noise; ln of the count over the expected one, and over the largest of any other value, at least.
 COARSE, BESIDE, EXCESS, OVER_OTHERS = 0.1, 0.25, 0.15, 2.5
-#: On a lattice of more steps in the noise of a reading ln of the counts is not smooth.
-COARSEST = 1.0
 #: Of the readings that are too many, the share that the levels about them must not explain, at least.
 LOCAL = 0.25
 #: Counts of three codes from which on they alone show the next one's.
@@ -86,7 +78,7 @@ def recurring_of(values: Array, rate_hz: float) -> Recurring | None:
         return None
     steps = np.abs(np.diff(rest if most > COMMON * y.size else y))
     # On a lattice coarser than the noise most steps are none.
-    some = steps[:: max(1, steps.size // STEPS)]
+    some = steps[:: max(1, steps.size // SAMPLED)]
     sigma = max(float(np.median(some)) / MEDIAN_SD, float(np.quantile(some, 0.6)) / 0.8416) / math.sqrt(2.0)
     del steps, some
     if not sigma > 0.0:

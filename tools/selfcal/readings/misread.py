@@ -14,15 +14,13 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import ndtr
 
-from selfcal.base.grid import counts_of_pieces, noise_of
+from selfcal.base.grid import Array, counts_of_pieces, noise_of
 from selfcal.readings.budget import nats_of
+from selfcal.readings.codes import ODD, PIECE, ln_of
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
-
-Array = NDArray[np.float64]
 
 #: Noises of a jump at least, jumps at least, the share of them that have one size, and how far off they are, in noises.
 JUMP, JUMPS_LEAST, ALIKE, OFF = 12.0, 5, 0.9, 6.0
@@ -34,8 +32,8 @@ TORN_MOST = 0.25
 BITS_LEAST, INNER = 5, (0.1, 0.9)
 #: Noises of a reading in the circle of a count from which on each reading has its turn.
 WHOLE = 8.0
-#: Pieces of a record that have a level each, at most, and readings in one at least.
-PIECES, PIECE = 100, 64
+#: Pieces of a record that have a level each, at most.
+PIECES = 100
 #: Values that are told apart at most. Points of a cell of half a value.
 VALUES_MOST, POINTS = 200, 16
 #: Steps of the lattice in the noise of a reading at most: beyond, skewed noise looks like a map.
@@ -44,10 +42,6 @@ COARSEST = 1.2
 FACTORS, LEVEL_STEP = np.geomspace(0.1, 3.0, 36), 0.1
 #: Shares of the readings that are one value, which is tried in place of a map.
 SHARES_OF_ONE = np.geomspace(0.005, 0.4, 10)
-#: Chance of a reading that no map makes.
-ODD = 1e-6
-
-
 #: What may have happened, by kind.
 MISREAD = MappingProxyType(
     {
@@ -203,10 +197,6 @@ def range_change_of(values: Array, lattice: Lattice | None) -> Misread | None:
     return best if best.nats > nats_of("misread") else None
 
 
-def _truncated(x: Array, step: float) -> Array:
-    return np.asarray(step * np.trunc(x / step))
-
-
 def _no_zeros(x: Array) -> Array:
     """Zeros behind the point are lost: 0.05 is read as 0.5."""
     size = np.abs(x)
@@ -230,7 +220,7 @@ def _maps(y: Array, noise: float, step: float) -> list[tuple[str, Callable[[Arra
     if gap > noise:
         found += [("sign_lost", unsigned), ("digits_lost", lambda x: printed(unsigned(x)))]
     if step > 0.0:
-        found.append(("truncated", lambda x: _truncated(x, step)))
+        found.append(("truncated", lambda x: step * np.trunc(x / step)))
     return found
 
 
@@ -275,7 +265,7 @@ def about_zero(values: Array, lattice: Lattice | None) -> Misread | None:
         best, each, share = -math.inf, np.full(len(count), -math.inf), 0.0
         for sigma in noise * FACTORS:
             true = np.diff(ndtr((edges[:, None] - level) / sigma), axis=0)
-            ln = count @ np.log((1.0 - ODD) * (to @ true) + ODD / many)
+            ln = ln_of(count, to @ true)
             own = ln.max(axis=1)
             each = np.maximum(each, own)
             if own.sum() > best:

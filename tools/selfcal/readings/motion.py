@@ -17,23 +17,22 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter1d, median_filter
 from scipy.special import bdtrc, fdtrc, gammaincinv
 
-from selfcal.base.grid import MEDIAN_SD, block_means, runs
+from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means, runs
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.readings.budget import SHARES
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-Rows = NDArray[np.int64]
 Interval = tuple[int, int]
 Time = TypeVar("Time", int, float)
 
-#: Length of a piece, s, and pieces at most. Lengths of the means whose differences are taken beside the readings', s,
-#: and readings in one at least.
-PIECE_S, PIECES_MOST, BANDS_S, BAND_LEAST = 0.1, 40_000, (0.1, 0.5), 5
+#: Length of a piece, s, and pieces at most.
+PIECE_S, PIECES_MOST = 0.1, 40_000
+#: Lengths of the means whose differences are taken beside the readings', and of the blocks that hands are looked for
+#: in, s: a knock is short, and a hand that turns slowly shows in long ones alone. Readings in one at least: with fewer
+#: each sample is a block, as no median leaves one out.
+BANDS_S, BAND_LEAST = (0.1, 0.5), 5
 #: Standard deviations of the median about a wild reading at most, and of itself at least.
 WILD = (3.0, 8.0)
 #: Readings whose median is the level of the middle one: ramps, jumps and slow waves have no part in what is apart from
@@ -61,9 +60,6 @@ SHARED = 0.05
 #: Standard deviations of a correlation by chance from which on axes depend on each other, and that of a copy.
 CORRELATED, COPY = 5.0, 0.999
 
-#: Lengths of a block, s: a knock is short, and a hand that turns slowly shows in long ones alone. With fewer samples
-#: than `BLOCK_LEAST` in it each sample is a block: no median leaves one out.
-BLOCKS_S, BLOCK_LEAST = (0.1, 0.5), 5
 #: The minutes about a block that its level and its noise are compared with, s. What lasts longer than half is no motion
 #: but the record's own. At either end of the record they lie on one side.
 AROUND_S = 240.0
@@ -399,12 +395,12 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
 def loud(y: Array, rate_hz: float, lsb: float = 0.0) -> Moved | None:
     """The stretches in which readings [n] on an even grid, NaN where missing, are far louder than in the minutes about
     them. `lsb`: their lattice. O(n)."""
-    block = round(BLOCKS_S[0] * rate_hz)
-    block = block if block >= BLOCK_LEAST else 1
+    block = round(BANDS_S[0] * rate_hz)
+    block = block if block >= BAND_LEAST else 1
     level, noise = _blocks(y, block)
     found = _loud_blocks(y, rate_hz, lsb, block, level, noise)
-    share = round(BLOCKS_S[1] * rate_hz / block)
-    if share >= BLOCK_LEAST:
+    share = round(BANDS_S[1] * rate_hz / block)
+    if share >= BAND_LEAST:
         found += _loud_blocks(y, rate_hz, lsb, block * share, *_blocks(level, share), knocks=False)
     intervals = joined([interval for interval, _ in found])
     if not found or sum(b - a for a, b in intervals) > SHARE_MOST * y.size:

@@ -17,20 +17,18 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
-from selfcal.base.grid import block_means, equal_runs, noise_of, runs
+from selfcal.base.grid import Array, Mask, block_means, equal_runs, noise_of, runs
 from selfcal.logs.recording import Column, Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import Uneven, uneven_of
+from selfcal.readings.codes import PIECE, PIECES, Uneven, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import Recurring, recurring_of
 from selfcal.readings.misread import ABOUT_ZERO, Misread, misread_of, spans_of
 from selfcal.readings.motion import Moved, loud, moves_of
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 #: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
@@ -45,14 +43,13 @@ COMMON_S, COMMON_OFF = 1.0, 3e-3
 GAP_MOST_S = 240.0
 #: ln of the probability, a record, of a run of equal readings that is no chance.
 LN_STUCK = -nats_of("stuck")
-#: Readings in a piece of the record that shows how common a code is, at least; nats of the runs that are counted; times
-#: that there are as many as chance makes, at least. Beyond so many steps in the noise chance is not well known.
-HELD_PIECE, HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 64, 1.5, 0.8
+#: Nats of the runs that are counted; times that there are as many as chance makes, at least. Beyond so many steps in
+#: the noise chance is not well known.
+HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 1.5, 0.8
 #: Samples on either side that make the level of one.
 AROUND = 32
-#: On a lattice coarser than the noise: the evidence in nats, pieces of a record that have a level each, and codes, at
-#: most.
-PILED_LEAST, PIECES, CODES_MOST = 30.0, 200, 40
+#: On a lattice coarser than the noise: the evidence in nats, and codes at most.
+PILED_LEAST, CODES_MOST = 30.0, 40
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
 #: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
@@ -466,7 +463,7 @@ def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]
     By chance a code of the share p of its piece of the record makes n (1 - p) p^k runs longer than k: a run is worth
     -k ln p. A dependence of neighbours raises every p alike: as much as runs of two and of three readings say."""
     n, none = values.size, np.zeros(values.size, bool)
-    size = max(HELD_PIECE, -(-n // PIECES))
+    size = max(PIECE, -(-n // PIECES))
     if lengths.max(initial=0) < 3 or n < 2 * size:
         return none, 0.0
     piece = np.minimum(np.arange(n) // size, n // size - 1)

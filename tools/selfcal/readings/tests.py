@@ -8,15 +8,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from selfcal.base.grid import Mask
 from selfcal.readings.budget import SHARES
 from selfcal.readings.codes import Uneven
 from selfcal.readings.lost_words import Recurring
 from selfcal.readings.misread import Misread
 from selfcal.readings.readings import Clipped, Readings
-
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import starmap
 from typing import Literal
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array, runs
 from selfcal.show.template import number, render
 
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
@@ -23,6 +23,8 @@ LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
 #: Share of a strip's points that may lie beyond each of its edges.
 USUAL = 0.02
+#: Points of a curve at most.
+POINTS = 400
 #: Rows of a table behind a picture at most.
 ROWS = 25
 #: Approximate number of ticks of an axis.
@@ -295,7 +297,7 @@ def _area(band: Band, x: _Scale, y: _Scale, stairs: bool) -> str:
     low, high = y.at(band.low), y.at(band.high)
     px = x.at(band.x)
     out = ""
-    for piece in _pieces(np.isfinite(band.low) & np.isfinite(band.high)):
+    for piece in starmap(slice, runs(np.isfinite(band.low) & np.isfinite(band.high))):
         upper, lower = (_stairs(px[piece], edge[piece], stairs) for edge in (high, low))
         out += _path(np.concatenate([upper[0], lower[0][::-1]]), np.concatenate([upper[1], lower[1][::-1]])) + "z"
     return out
@@ -306,7 +308,7 @@ def _line(curve: Curve, x: _Scale, y: _Scale, stairs: bool) -> str:
     good = np.isfinite(py) & np.isfinite(px)
     if curve.kind == "dots":
         return "".join(f"M{px[k] - 3:.1f} {py[k]:.1f}l3-3 3 3-3 3z" for k in np.flatnonzero(good))
-    return "".join(_path(*_stairs(px[piece], py[piece], stairs)) for piece in _pieces(good))
+    return "".join(_path(*_stairs(px[piece], py[piece], stairs)) for piece in starmap(slice, runs(good)))
 
 
 def _stairs(px: Array, py: Array, stairs: bool) -> tuple[Array, Array]:
@@ -331,9 +333,3 @@ def _tenth(value: int, before: str) -> str:
     sign = "-" if value < 0 else before
     whole, tenth = divmod(abs(value), 10)
     return f"{sign}{whole}.{tenth}" if tenth and whole else (f"{sign}.{tenth}" if tenth else f"{sign}{whole}")
-
-
-def _pieces(good: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
-    """Runs of indices that are good."""
-    where = np.flatnonzero(good)
-    return [run for run in np.split(where, np.flatnonzero(np.diff(where) > 1) + 1) if run.size]

@@ -23,7 +23,7 @@ from selfcal.diagnosis.extend import fitted_law
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
-from selfcal.show import pictures
+from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outside_of, strips
 from selfcal.show.findings import before_after, noisier_of
 from selfcal.show.template import number, render, spaced
@@ -227,7 +227,7 @@ def _readings(findings: Sequence[Entry], axes: Sequence[_Axis]) -> Markup:
     for axis in axes:
         unit, record, state = str(axis.entry["unit"]), axis.diagnosed.record, axis.diagnosed.first
         factor = units.factor(axis.diagnosed.state.unit, unit)
-        x, mean, low, high = envelope(record.time_s + record.start_s, state.y, pictures.POINTS)
+        x, mean, low, high = envelope(record.time_s + record.start_s, state.y, chart.POINTS)
         band = Band("lowest to highest reading", x, factor * low, factor * high, "spread")
         curve = Curve("mean", x, factor * mean)
         panels.append(

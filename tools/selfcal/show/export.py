@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.overbound import overbound, upper_limit
+from selfcal.bank.result import likeliest
 from selfcal.base import units
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import write_text
@@ -118,17 +119,10 @@ def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
     for law in ("random_walk", "gauss_markov"):
         if any(law not in axis["parameters"] for axis in axes.values()):
             raise UserError(f"--export needs the hypothesis {law} in the model")
-    worst_axis = {
-        "N": worst("random_walk", "N"),
-        "K": worst("random_walk", "K"),
-        "sigma_m": worst("gauss_markov", "sigma_m"),
-    }
-    medians = {
-        "N": median(worst_axis["N"], "random_walk", "N"),
-        "K": median(worst_axis["K"], "random_walk", "K"),
-        "sigma_m": median(worst_axis["sigma_m"], "gauss_markov", "sigma_m"),
-        "alpha": median(worst_axis["sigma_m"], "gauss_markov", "alpha"),
-    }
+    law_of = {"N": "random_walk", "K": "random_walk", "sigma_m": "gauss_markov"}
+    worst_axis = {parameter: worst(law, parameter) for parameter, law in law_of.items()}
+    medians = {parameter: median(worst_axis[parameter], law, parameter) for parameter, law in law_of.items()}
+    medians["alpha"] = median(worst_axis["sigma_m"], "gauss_markov", "alpha")
     curves = [axis["allan"] for axis in axes.values() if axis["allan"] and axis["allan"]["tau_s"]]
     tau = [np.array(curve["tau_s"]) for curve in curves]
     limits = [
@@ -142,8 +136,7 @@ def _kind(document: Mapping[str, Any], unit: str, level: float | None) -> Kind:
     n, k = overbound(tau, limits)
     if level is not None and not math.isfinite(n):
         raise UserError("--overbound: the record is too short for an Allan deviation; leave the option out")
-    probability = axes[worst_axis["K"]]["hypotheses"]
-    law = max(probability, key=lambda name: probability[name])
+    law = likeliest(axes[worst_axis["K"]]["hypotheses"])
     unexplained = [name for name, axis in axes.items() if not axis["adequate"]]
     verdict = f"NOT ADEQUATE: no law explains {', '.join(unexplained)}" if unexplained else "adequate"
     notes = [

@@ -14,19 +14,19 @@ from rich.table import Table
 from selfcal.adequacy.document import as_typed, since
 from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
+from selfcal.bank.result import likeliest
 from selfcal.base import units
 from selfcal.base.errors import called, printable
 from selfcal.base.output import TABLE_WIDTH, console_of, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
+from selfcal.readings.rest import MOST_LISTED
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 
 #: Least probability of a law that is named if the grid is too coarse for it.
 TOLD_OF = 0.01
-#: Most stretches of motion in a line.
-TIMES_MOST = 4
 #: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
 #: Largest distance of jumps of one event, s.
@@ -179,8 +179,8 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
 
 def _times(intervals: Sequence[Sequence[float]]) -> str:
     """The first few stretches, and how many more there are."""
-    times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in intervals[:TIMES_MOST])
-    more = len(intervals) - TIMES_MOST
+    times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in intervals[:MOST_LISTED])
+    more = len(intervals) - MOST_LISTED
     return f"{times}{f' and {more} more' if more > 0 else ''}"
 
 
@@ -195,7 +195,7 @@ def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table
     headings = ("law", "P", "N", drift, second)
     table = table_of(headings, caption=caption, collapse_padding=left_out > 0, pad_edge=left_out == 0)
     for name, axis in axes.items():
-        best = max(axis["hypotheses"], key=lambda law: axis["hypotheses"][law])
+        best = likeliest(axis["hypotheses"])
         bias = axis["bias_now"]
         level = f"bias {bias['mean']:.6g} ± {bias['sd']:.2g}"
         heading = f"{name} \\[{bias['unit']}]"

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
+from selfcal.base.grid import runs
 from selfcal.diagnosis.causes import CAUSES, shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
@@ -19,12 +20,10 @@ from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
-from selfcal.show.chart import Band, Curve, Figure, Panel, envelope
+from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope
 
 #: Simulated records of a band.
 RECORDS = 20
-#: Points of a curve at most.
-POINTS = 400
 #: Averaging times a decade, and frequencies a decade, of the overview.
 TAUS_A_DECADE, BINS_A_DECADE = 8, 24
 #: Standard deviations within which 99 % of a normal deviate lie.
@@ -426,12 +425,11 @@ def _missing(finding: Finding, record: Record) -> Figure:
     before, after = finding.before.y, finding.after.y
     held = np.append(False, np.diff(before) == 0.0) & ~np.isfinite(after)
     gone = held | ~record.present.astype(bool)
-    where = np.flatnonzero(gone)
-    runs = np.split(where, np.flatnonzero(np.diff(where) > 1) + 1) if where.size else []
-    longest = max((run.size for run in runs), default=0)
+    gaps = runs(gone)
+    longest = max((end - begin for begin, end in gaps), default=0)
     return Figure(
         "Missing samples",
-        f"{where.size} samples in {len(runs)} gaps; the longest is of {longest} samples.",
+        f"{np.count_nonzero(gone)} samples in {len(gaps)} gaps; the longest is of {longest} samples.",
         [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, 100.0 * _reduced(edges, gone))])],
     )
 

@@ -68,34 +68,17 @@ def plot_run(
     for row, axis in zip(grid, axes, strict=True):
         reports = history[axis]
         time = np.array([report.time_s for report in reports])
-        late = int(SETTLING * len(time))
         axis_truth = (truth or {}).get(axis)
         newest = reports[-1].values
         last = {k: newest[f"h{k}_probability"] for k in range(count) if f"h{k}_probability" in newest}
-        shown = {k: 1.0 if probability >= FAINT else 0.2 for k, probability in last.items()}
         for k in last:
-            row[0].plot(time, _values(reports, f"h{k}_probability"), color=COLORS[k], alpha=shown[k])
+            row[0].plot(time, _values(reports, f"h{k}_probability"), color=COLORS[k], alpha=_opacity(last[k]))
         row[0].set_ylim(-0.03, 1.03)
         row[0].set_ylabel(axis, rotation=0, fontweight="bold", labelpad=15)
         _write(row[0], *_verdict(last, axis_truth, hypotheses))
         for panel, (parameter, candidates) in zip(row[1:], panels.items(), strict=True):
             scale = factor(own[axis], unit[axis]) if _scales(parameter) else 1.0
-            spans[axis, parameter] = []
-            best = -1
-            for k, place in ((k, place) for k, place in candidates.items() if k in last):
-                signals = (f"h{k}_{place}_{key}" for key in ("q05", "median", "q95"))
-                low, middle, high = (_values(reports, signal) * scale for signal in signals)
-                if parameter == "alpha":
-                    low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
-                panel.fill_between(time, low, high, color=COLORS[k], alpha=0.25 * shown[k], linewidth=0)
-                panel.plot(time, middle, color=COLORS[k], alpha=shown[k])
-                if last[k] >= FAINT and math.isfinite(middle[-1]):
-                    spans[axis, parameter] += [*low[late:], *high[late:]]
-                    if last[k] > last.get(best, 0.0):
-                        best = k
-                        _write(panel, f"{middle[-1]:.3g} [{low[-1]:.3g}, {high[-1]:.3g}]", COLORS[k])
-                elif len(candidates) == 1:  # nothing else in this panel
-                    spans[axis, parameter] += middle[late:].tolist()
+            spans[axis, parameter] = _draw(panel, time, reports, parameter, candidates, last, scale)
             value = _true(axis_truth, parameter, unit[axis])
             if value is not None:
                 spans[axis, parameter].append(value)
@@ -118,6 +101,41 @@ def plot_run(
     for panel in grid[-1]:
         panel.set_xlabel("time, s")
     save_picture(figure, path, dpi=100)
+
+
+def _opacity(probability: float) -> float:
+    return 1.0 if probability >= FAINT else 0.2
+
+
+def _draw(
+    panel: Any,
+    time: NDArray[np.float64],
+    reports: Sequence[AxisReport],
+    parameter: str,
+    candidates: Mapping[int, str],
+    last: Mapping[int, float],
+    scale: float,
+) -> list[float]:
+    """Draw a parameter's median and interval for each law that came; what the panel's scale has to hold. `last`: the
+    probabilities at the end."""
+    span: list[float] = []
+    late, best = int(SETTLING * len(time)), -1
+    for k, place in ((k, place) for k, place in candidates.items() if k in last):
+        signals = (f"h{k}_{place}_{key}" for key in ("q05", "median", "q95"))
+        low, middle, high = (_values(reports, signal) * scale for signal in signals)
+        if parameter == "alpha":
+            low, middle, high = 1.0 / high, 1.0 / middle, 1.0 / low
+        opacity = _opacity(last[k])
+        panel.fill_between(time, low, high, color=COLORS[k], alpha=0.25 * opacity, linewidth=0)
+        panel.plot(time, middle, color=COLORS[k], alpha=opacity)
+        if last[k] >= FAINT and math.isfinite(middle[-1]):
+            span += [*low[late:], *high[late:]]
+            if last[k] > last.get(best, 0.0):
+                best = k
+                _write(panel, f"{middle[-1]:.3g} [{low[-1]:.3g}, {high[-1]:.3g}]", COLORS[k])
+        elif len(candidates) == 1:  # nothing else in this panel
+            span += middle[late:].tolist()
+    return span
 
 
 def _panels(history: Mapping[str, Sequence[AxisReport]], names: Names, count: int) -> dict[str, dict[int, str]]:

@@ -8,12 +8,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from jinja2 import Environment
+from jinja2 import Environment, FileSystemLoader
 from markupsafe import Markup
 
 import selfcal
 from selfcal.base.errors import printable
-from selfcal.base.templates import of_pages
 from selfcal.base.units import typeset
 from selfcal.diagnosis import words
 
@@ -55,7 +54,8 @@ def shortened(text: str) -> str:
 
 @cache
 def _environment() -> Environment:
-    made = of_pages(Path(__file__).parent / "templates")
+    folder = FileSystemLoader(Path(__file__).parent / "templates")
+    made = Environment(loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True)
     made.filters |= {function.__name__: function for function in (number, interval, spaced, shortened, typeset)}
     made.filters["tenth"] = "{:.1f}".format
     made.globals |= {"words": words, "version": selfcal.__version__}

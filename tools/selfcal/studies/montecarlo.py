@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
+from selfcal.bank.result import HALF_90, likeliest
 from selfcal.base.output import console_of, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
@@ -88,7 +89,7 @@ def summary(rows: Sequence[Row], records: int, duration_s: float, axis: str) -> 
         laws[law] = {
             "parameters": parameters,
             "false_identification": float(np.mean([_chosen(row) != law for row in mine])),
-            "bias_coverage_90": float((np.abs(errors) < 1.6449).mean()),
+            "bias_coverage_90": float((np.abs(errors) < HALF_90).mean()),
             "without_nodes": float(1.0 - len(mine) / sum(row["drawn"] for row in mine)),
         }
     top = np.array([max(_probability(row).values()) for row in rows])
@@ -114,8 +115,7 @@ def _probability(row: Row) -> dict[str, float]:
 
 def _chosen(row: Row) -> str:
     """The most probable law."""
-    probability = _probability(row)
-    return max(probability, key=lambda name: probability[name])
+    return likeliest(_probability(row))
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:

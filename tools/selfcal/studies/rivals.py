@@ -27,6 +27,7 @@ from selfcal.adequacy.identify import chosen_axes
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
+from selfcal.base.grid import runs
 from selfcal.base.output import check_writable, console_of, table_of, write_json
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
@@ -95,8 +96,7 @@ def of_recording(
                 "rivals": entries,
             }
     document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": answers}
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
@@ -163,8 +163,7 @@ def ensemble(
         "cells": entries,
         "choice": over_laws(entries),
     }
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
@@ -201,10 +200,8 @@ def problem_of(recording: Recording, name: str, model: Model, decimate: float | 
 
 def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
     """The longest run of finite values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], np.isfinite(mean), [False]])))
-    starts, ends = edges[::2], edges[1::2]
-    longest = int(np.argmax(ends - starts))
-    return mean[starts[longest] : ends[longest]]
+    start, end = max(runs(np.isfinite(mean)), key=lambda run: run[1] - run[0])
+    return mean[start:end]
 
 
 def measured(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import wraps
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
@@ -83,6 +84,22 @@ T = TypeVar("T")
 def to_stderr(given: Mapping[str, Any]) -> bool:
     """Whether tables go to stderr, because stdout has the JSON."""
     return str(given.get("json")) == "-"
+
+
+def shown_by(module: str, *options: str, judged: bool = False) -> Callable[[Any, Mapping[str, Any]], int]:
+    """The `show` of a verb whose answer another module's `show` prints, which is imported then. `options`: switches
+    that it takes too. `judged`: the exit code is that of `--fail-on` and the limits."""
+
+    def show(answer: Any, given: Mapping[str, Any]) -> int:
+        switches = {name: bool(given.get(name)) for name in options}
+        import_module(f"selfcal.{module}").show(answer, to_stderr=to_stderr(given), **switches)
+        if not judged:
+            return 0
+        from selfcal.batch.fail_on import exit_code
+
+        return exit_code(answer, given.get("fail_on"))
+
+    return show
 
 
 def on_a_line(verb: Callable[P, T]) -> Callable[P, T]:

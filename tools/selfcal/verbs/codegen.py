@@ -53,9 +53,8 @@ def codegen(
     return tables
 
 
-def show(tables: Tables, given: Mapping[str, Any]) -> int:
+def show(tables: Tables, given: Mapping[str, Any]) -> None:
     """Print what the tables take for granted."""
     from selfcal.wire.c_tables import assumption
 
     print(f"{given['output']}: {assumption(tables)}")
-    return 0

@@ -35,7 +35,7 @@ def command(
     named or cannot be opened, or no answer.
     """
     from selfcal.wire import command as wire
-    from selfcal.wire.dbc_file import NODES
+    from selfcal.wire.dbc_file import check_node
     from selfcal.wire.frames import open_bus, serial_ports
 
     if order == "new-key":
@@ -47,8 +47,7 @@ def command(
     if order not in orders:
         raise UserError(f"no such command: {order} (there are {', '.join((*orders, *wire.OWN_ORDERS))})")
     argument = wire.argument_of(order, value)
-    if not 0 <= node < NODES:
-        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
+    check_node(node)
     if not channel:
         raise UserError(
             f"to which module? --channel names its serial port ({serial_ports()}), or the --interface's channel"

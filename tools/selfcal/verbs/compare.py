@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Unpack
 
@@ -54,11 +54,9 @@ def compare(
     `limits`, `junit`, `verdicts`: as `identify` has them, of each recording.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
-    from itertools import pairwise
-
     from selfcal.base.ending import Held
     from selfcal.base.output import check_writable, write_json
-    from selfcal.batch.compare import LIMIT, SCHEMA, Compared, changes, incomparable, quantities, verdict
+    from selfcal.batch.compare import LIMIT, SCHEMA, compared_of, quantities, verdict
     from selfcal.batch.fail_on import CHANGED, check
     from selfcal.batch.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
     from selfcal.logs.recording import list_of
@@ -99,16 +97,7 @@ def compare(
             if axis.get("allan"):
                 curves.setdefault(name, {})[path] = axis["allan"]
         seen.append({name: quantities(identified.get(name, {}), diagnosed.get(name, {})) for name in diagnosed})
-    compared = {name: Compared() for name in sorted(set().union(*by_log.values()))}
-    for (first, before), (second, after) in pairwise(zip(names, seen, strict=True)):
-        for name, axis in compared.items():
-            error = incomparable({log: by_log[log].get(name) for log in (first, second)})
-            if error is not None:
-                axis.errors += [error] if error not in axis.errors else []
-            elif name in before and name in after:
-                axis.pairs += 1
-                rows = changes(before[name], after[name])
-                axis.changes += [{"from": first, "to": second, **row} for row in rows]
+    compared = compared_of(list(zip(names, seen, strict=True)), by_log)
     document = {
         "schema": SCHEMA,
         "recordings": names,
@@ -135,10 +124,4 @@ def compare(
     return Comparison(document)
 
 
-def show(document: Comparison, given: Mapping[str, Any]) -> int:
-    """Print one line a change; the exit code of `--fail-on` and the limits."""
-    from selfcal.batch.compare import show as table
-    from selfcal.batch.fail_on import exit_code
-
-    table(document, to_stderr=shared.to_stderr(given))
-    return exit_code(document, given.get("fail_on"))
+show = shared.shown_by("batch.compare", judged=True)

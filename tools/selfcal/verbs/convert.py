@@ -40,9 +40,8 @@ def convert(
     return recording
 
 
-def show(recording: Recording, given: Mapping[str, Any]) -> int:
+def show(recording: Recording, given: Mapping[str, Any]) -> None:
     """Print what was written."""
     axes = ", ".join(f"{name}[{column.unit}]" for name, column in recording.columns.items())
     rows = f"{recording.samples:,} rows, {recording.rate_hz:.6g} Hz, {recording.duration_s:.6g} s"
     print(f"{given['output']}: {rows}: {axes}")
-    return 0

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
@@ -27,12 +26,11 @@ def dbc(
     """
     from selfcal.base.output import check_writable, write_text
     from selfcal.model.file import Model
-    from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, NODES
+    from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, check_node
     from selfcal.wire.dbc_file import dbc as text_of
     from selfcal.wire.frames import AXES, axis_unit, carries, names_of
 
-    if not 0 <= node < NODES:
-        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
+    check_node(node)
     check_writable(output)
     loaded = Model.load(model)
     names = names_of(loaded)
@@ -48,8 +46,3 @@ def dbc(
     else:
         write_text(output, text)
     return text
-
-
-def show(_: str, given: Mapping[str, Any]) -> int:
-    """The text is written already."""
-    return 0

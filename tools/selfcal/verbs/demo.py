@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from selfcal.base.errors import UserError, called
 from selfcal.base.options import argument, option
@@ -36,7 +35,7 @@ def demo(
     from selfcal.adequacy.identify import chosen_axes
     from selfcal.logs.recording import load
     from selfcal.model.file import Model
-    from selfcal.wire.dbc_file import NODES
+    from selfcal.wire.dbc_file import check_node
     from selfcal.wire.demo import FASTEST, FOREVER_S, GROUP, PORT, REPORT_S, SHIPPED, wait
     from selfcal.wire.replay import build, check_sent, running, write_rows
 
@@ -44,8 +43,7 @@ def demo(
         raise UserError(f"--speed must be above 0 and at most {FASTEST:g}, not {speed:g}")
     if channel and transport != "can":
         raise UserError(f"--channel {channel}: goes with --transport can")
-    if not 0 <= node < NODES:
-        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
+    check_node(node)
     path = Path(log or SHIPPED)
     loaded = Model.load(model)
     check_sent(loaded)
@@ -80,8 +78,3 @@ def demo(
                 return
             if module.returncode != 0:
                 raise UserError(complaint or f"the firmware stopped (exit code {module.returncode})")
-
-
-def show(_: None, given: Mapping[str, Any]) -> int:
-    """Nothing is left to print."""
-    return 0

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Unpack
+from typing import TYPE_CHECKING, Annotated, Unpack
 
 from selfcal.base.errors import UserError, note
 from selfcal.base.options import option
@@ -121,8 +121,7 @@ def diagnose(
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
                         write_page(report, document, record, {})
-                    if json is not None:
-                        write_json(document, json)
+                    write_json(document, json)
                 ending.check()
                 reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
                 raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
@@ -163,8 +162,7 @@ def diagnose(
                 write_page(report, document, record, diagnosed, given)
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return Diagnosis(document)
 
 
@@ -212,10 +210,4 @@ def _looked(
     return record, first, diagnosed, errors
 
 
-def show(document: Diagnosis, given: Mapping[str, Any]) -> int:
-    """Print each finding in words; the exit code of `--fail-on` and the limits."""
-    from selfcal.batch.fail_on import exit_code
-    from selfcal.show.findings import show as table
-
-    table(document, to_stderr=shared.to_stderr(given), details=bool(given.get("details")))
-    return exit_code(document, given.get("fail_on"))
+show = shared.shown_by("show.findings", "details", judged=True)

@@ -81,7 +81,7 @@ def fleet(
     from selfcal.batch.fleet import document_with, judged_units
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
-    from selfcal.batch.record import ByContent, Options, Verbs, examined, killed, own_pages, settings_of
+    from selfcal.batch.record import KILLED, ByContent, Options, Verbs, examined, own_pages, settings_of
     from selfcal.batch.spread import spread
     from selfcal.batch.summary import document_of, lines_of, summed_up
     from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
@@ -125,7 +125,7 @@ def fleet(
         scheduler=scheduler,
         results=keeper,
         count=workers,
-        lost=killed,
+        lost=lambda _: [{"error": KILLED}],
         weights=[source.size + 1.0 for source in sources],
         verb="fleet",
     )
@@ -148,8 +148,7 @@ def fleet(
     document = {**document_with(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
     if write_model is not None:
         document["words"] += lines_of_priors(write_priors(write_model, loaded, summary), loaded)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     if report is not None:
         from selfcal.batch.fleet_page import write_page
 

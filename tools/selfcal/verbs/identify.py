@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 
@@ -112,8 +112,7 @@ def identify(
     check_writable(
         json, plot, None if export is None else export[1], junit, verdicts, inputs=(*list_of(log), model, limits)
     )
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     if overbound is not None and export is None:
@@ -169,8 +168,7 @@ def identify(
                 weigh_more_laws(document, recording, [name for name in doubtful if name not in again])
     if bounds is not None:
         add_verdicts(document, bounds, junit, verdicts)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     if export is not None:
         write_export(document, *export, overbound)
     if plot is not None:
@@ -196,10 +194,4 @@ def _suspect(document: dict[str, Any], recording: Recording, model: Model, names
     return suspected
 
 
-def show(document: Identification, given: Mapping[str, Any]) -> int:
-    """Print the table; the exit code of `--fail-on` and the limits."""
-    from selfcal.batch.fail_on import exit_code
-    from selfcal.show.identification import show as table
-
-    table(document, to_stderr=shared.to_stderr(given), datasheet=given.get("datasheet", False))
-    return exit_code(document, given.get("fail_on"))
+show = shared.shown_by("show.identification", "datasheet", judged=True)

@@ -65,7 +65,7 @@ def monitor(
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.logs.framelog import FrameLog, check_suffix
     from selfcal.show.plot import plot_run
-    from selfcal.wire.dbc_file import NODES
+    from selfcal.wire.dbc_file import check_node
     from selfcal.wire.frame_writer import FrameWriter
     from selfcal.wire.frames import Streams, axis_unit, open_bus, serial_ports
     from selfcal.wire.known_models import KnownModels
@@ -80,16 +80,15 @@ def monitor(
         )
     for axis in axes:
         axis_unit(axis)
-    if node is not None and not 0 <= node < NODES:
-        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
+    if node is not None:
+        check_node(node)
     if speed is not None and (read is None or not 0.0 < speed < math.inf):
         raise UserError("--speed is above 0, and goes with --read")
     if log is not None:
         check_suffix(log)
     if duration is not None and not duration > 0.0:
         raise UserError(f"--duration must be above 0 s, not {duration:g}")
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     for kind in stream:
         check_stream(kind)
     on_stdout = [kind for kind in (wanted.split(":")[0] for wanted in stream) if kind in LINES]
@@ -135,8 +134,7 @@ def monitor(
                 outcome.twins = True
                 say(f"{name}: {decoder.twins}")
     reported = run.reported(needed=json is not None or plot is not None)
-    if json is not None:
-        write_json(run.document(reported), json)
+    write_json(run.document(reported), json)
     if plot is not None:
         for number, history in reported.items():
             several = len(reported) > 1

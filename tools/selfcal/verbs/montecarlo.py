@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
-from selfcal.verbs._shared import Json, ModelFile, Results, Scheduler, Workers, to_stderr
+from selfcal.verbs._shared import Json, ModelFile, Results, Scheduler, Workers, shown_by
 
 
 def montecarlo(
@@ -60,14 +59,8 @@ def montecarlo(
         count=workers,
     )
     document = summary(rows, records, duration_s, axis)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
-def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
-    """Print calculated against actual errors."""
-    from selfcal.studies.montecarlo import show as table
-
-    table(document, to_stderr=to_stderr(given))
-    return 0
+show = shown_by("studies.montecarlo")

@@ -92,9 +92,8 @@ def paper(
     return figures
 
 
-def show(figures: list[Reproduction], given: Mapping[str, Any]) -> int:
+def show(figures: list[Reproduction], given: Mapping[str, Any]) -> None:
     """Print a line a figure."""
     from selfcal.studies.paper import show as table
 
     table(figures, given["output"])
-    return 0

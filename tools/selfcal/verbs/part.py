@@ -62,9 +62,8 @@ def part(
     return model
 
 
-def show(model: Model, given: Mapping[str, Any]) -> int:
+def show(model: Model, given: Mapping[str, Any]) -> None:
     """Print what was written."""
     from selfcal.adequacy.part import show as lines
 
     lines(model)
-    return 0

@@ -83,27 +83,12 @@ def plan(
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.batch.plan import SCHEMA, SHARE, SWEEP_S, Ensemble, Wish, cycling, picture, rates, refusal
     from selfcal.batch.spread import record_seeds
-    from selfcal.logs.loaders import is_recording
-    from selfcal.logs.recording import list_of, load
-    from selfcal.model.file import Model
+    from selfcal.logs.recording import list_of
     from selfcal.model.regressors import coefficient_unit
 
     check_writable(json, plot, inputs=list_of(model))
-    if plot is not None:
-        check_picture(plot)
-    if not isinstance(model, Path | str) or is_recording(model):
-        from selfcal.adequacy.part import tree_of
-        from selfcal.base.units import SENSORS
-
-        sensors = SENSORS if axis is None else (*SENSORS, axis)
-        recording = load(model, sensors=sensors, **reading).between(start_s, end_s)
-        loaded = Model.of_tree(tree_of(recording, () if axis is None else (axis,))[0], recording.path)
-    elif reading or start_s is not None or end_s is not None:
-        raise UserError(f"{model}: the options of a recording (--rate, --column, --start ...) are for plan LOG")
-    else:
-        loaded = Model.load(model)
-    if loaded.half_life_s:
-        raise UserError(f"{loaded.path}: plan takes no half_life_s: leave it out of the model")
+    check_picture(plot)
+    loaded = _model_of(model, axis, start_s, end_s, reading)
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
     if tumble:
@@ -112,8 +97,7 @@ def plan(
         if plot is not None or axis is not None:
             raise UserError("--tumble plans all axes together, and has no picture: leave --axis and --plot out")
         answer = plan_of(loaded, want)
-        if json is not None:
-            write_json(answer, json)
+        write_json(answer, json)
         return answer
     name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
     group = loaded.group_of(name)
@@ -163,11 +147,32 @@ def plan(
         "wishes": entries,
         "rates": rates(loaded, wishes, lengths, ensemble.typical),
     }
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     if plot is not None:
         picture(document, plot)
     return document
+
+
+def _model_of(given: Data, axis: str | None, start_s: float | None, end_s: float | None, reading: Reading) -> Model:
+    """The model file, or the part of a recording. Raises UserError."""
+    from selfcal.logs.loaders import is_recording
+    from selfcal.logs.recording import load
+    from selfcal.model.file import Model
+
+    if not isinstance(given, Path | str) or is_recording(given):
+        from selfcal.adequacy.part import tree_of
+        from selfcal.base.units import SENSORS
+
+        sensors = SENSORS if axis is None else (*SENSORS, axis)
+        recording = load(given, sensors=sensors, **reading).between(start_s, end_s)
+        model = Model.of_tree(tree_of(recording, () if axis is None else (axis,))[0], recording.path)
+    elif reading or start_s is not None or end_s is not None:
+        raise UserError(f"{given}: the options of a recording (--rate, --column, --start ...) are for plan LOG")
+    else:
+        model = Model.load(given)
+    if model.half_life_s:
+        raise UserError(f"{model.path}: plan takes no half_life_s: leave it out of the model")
+    return model
 
 
 def _pair(option: str, text: str | None, said: str) -> tuple[float, float]:
@@ -228,26 +233,16 @@ def _response(
             write_text(drive, f"t[s],{input}[{units_of[input]}]\n{text}")
     elif drive is not None:
         raise UserError("no record that can be simulated suffices: wider --levels, or a wider --want")
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
-def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     """Print how long for each wish."""
-    from selfcal.base.errors import printable
-    from selfcal.base.output import console_of
-
     if "levels" in document:
-        from selfcal.batch.design import lines_of
-
-        console = console_of(to_stderr=to_stderr(given))
-        for line in lines_of(document):
-            console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
-        return 0
-    if given.get("tumble"):
+        from selfcal.batch.design import show as table
+    elif given.get("tumble"):
         from selfcal.calibration.plan import show as table
     else:
         from selfcal.batch.plan import show as table
     table(document, to_stderr=to_stderr(given))
-    return 0

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
+from typing import TYPE_CHECKING, Annotated, Literal, Unpack
 
 from selfcal.base.errors import UserError, note, say_once
 from selfcal.base.options import option
@@ -79,8 +78,7 @@ def replay(
         raise UserError(f"--channel {channel}: goes with --transport can")
     if report_every is not None and not 0.001 <= report_every <= LONGEST_PERIOD_S:
         raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)
     say_once(loaded_model.left_out)
@@ -119,8 +117,7 @@ def replay(
     document = document_of(recording, loaded_model, history, why, gate)
     add_sources(document, of_file, loaded_model)
     document["recording"] |= {"start_s": known_s, "since_power_on_s": since_power_on_s}
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     if plot is not None:
         simulated = bool(recording.meta.get("simulated"))
         title = f"{recording.path.name}{' (SIMULATED)' if simulated else ''}: the firmware's telemetry"
@@ -133,9 +130,4 @@ def replay(
     return Identification(document)
 
 
-def show(document: Identification, given: Mapping[str, Any]) -> int:
-    """Print the table of `identify`."""
-    from selfcal.show.identification import show as table
-
-    table(document, to_stderr=shared.to_stderr(given))
-    return 0
+show = shared.shown_by("show.identification")

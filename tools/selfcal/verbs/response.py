@@ -58,8 +58,7 @@ def response(
     from selfcal.model.file import Model
 
     check_writable(json, plot, inputs=(*list_of(log), model))
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     loaded = Model.load(model)
     recording = stretch_of(load(log, **reading), loaded, start_s, end_s, gate)
     names = [input] if isinstance(input, str) else list(dict.fromkeys(input))
@@ -110,12 +109,11 @@ def response(
     }
     if plot is not None:
         plot_response(document, plot)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
-def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     """Print the answer in a few lines. A signal that came ends the command here."""
     from selfcal.base.ending import Held
     from selfcal.diagnosis.response import show as table
@@ -123,4 +121,3 @@ def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     for part in document.get("inputs", [document]):
         table({**document, **part}, to_stderr=to_stderr(given))
     Held().check()
-    return 0

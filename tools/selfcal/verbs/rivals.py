@@ -61,10 +61,9 @@ def rivals(
     )
 
 
-def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
+def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     """Print a table an axis, or a table for each number of samples and law."""
     from selfcal.studies import rivals as study
 
     shown = study.show if "axes" in document else study.show_ensemble
     shown(document, to_stderr=to_stderr(given))
-    return 0

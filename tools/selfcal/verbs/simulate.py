@@ -102,9 +102,8 @@ def simulate(
     return {**meta, "samples": rows, "rate_hz": scene.rate_hz}
 
 
-def show(meta: dict[str, Any], given: Mapping[str, Any]) -> int:
+def show(meta: dict[str, Any], given: Mapping[str, Any]) -> None:
     """Print what was written, and the truth."""
     from selfcal.diagnosis.simulate import show as lines
 
     lines(meta, given["output"])
-    return 0

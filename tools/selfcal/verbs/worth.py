@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ
-from selfcal.verbs._shared import Axes, Json, ModelFile, Results, Scheduler, to_stderr
+from selfcal.verbs._shared import Axes, Json, ModelFile, Results, Scheduler, shown_by
 
 
 def worth(
@@ -64,14 +64,8 @@ def worth(
         "cases": cases,
         "regret": study.regret(cases),
     }
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
-def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
-    """Print a table a case."""
-    from selfcal.studies.worth import show as table
-
-    table(document, to_stderr=to_stderr(given))
-    return 0
+show = shown_by("studies.worth")

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from selfcal.base.grid import Array
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.model.regressors import columns_of, offered
 from selfcal.wire.frames import AxisReport, names_of
-
-Array = NDArray[np.float64]
 
 #: Time from a report to the middle of the readings that test it, and their length, s: white noise averages out.
 AHEAD_S, MEAN_S = 300.0, 60.0

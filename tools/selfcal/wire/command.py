@@ -7,12 +7,12 @@ import shlex
 import struct
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from selfcal.base.errors import UserError, called
 from selfcal.base.limits import MOST_META_BYTES, read_text
 from selfcal.wire.dbc_file import NODE_IDS
-from selfcal.wire.frames import ANSWER, AXES, COMMAND, Decoder, Link, load_dbc, node_of
+from selfcal.wire.frames import ANSWER, AXES, COMMAND, Decoder, Link, choices, load_dbc, node_of
 
 if TYPE_CHECKING:
     import can
@@ -60,8 +60,7 @@ def siphash(key: bytes, message: bytes) -> int:
 
 def codes(signal: str) -> dict[str, int]:
     """Names of an answer's `command` or `result`, with their numbers in the DBC."""
-    choices: Any = load_dbc().get_message_by_name(ANSWER).get_signal_by_name(signal).choices or {}
-    return {str(name): int(number) for number, name in choices.items()}
+    return {name: number for number, name in choices(ANSWER, signal).items()}
 
 
 def payload(command: str, argument: int = 0, *, key: bytes | None = None, challenge: int = 0) -> bytes:

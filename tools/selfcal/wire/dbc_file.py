@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from selfcal.base.errors import remark
+from selfcal.base.errors import UserError, remark
 from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
 
@@ -79,6 +79,12 @@ BY_PLACE = Names(
     (PLACE_NAMES,) * HYPOTHESES,
     tuple((f"c{column}", "") for column in range(COLUMNS)),
 )
+
+
+def check_node(node: int) -> None:
+    """Raise UserError for a node that no bus has."""
+    if not 0 <= node < NODES:
+        raise UserError(f"--node {node}: a bus has nodes 0 to {NODES - 1}")
 
 
 def identifier(node: int, offset: int) -> int:

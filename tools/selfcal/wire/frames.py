@@ -404,48 +404,28 @@ class Decoder:
     def feed(self, message: can.Message) -> list[AxisReport]:
         """Take a frame; return the reports that it closes (none, one or two)."""
         kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
-        if (
-            kind is None
-            or message.is_extended_id
-            or message.is_remote_frame
-            or message.is_error_frame
-            or message.is_fd
-            or message.dlc != 8
-            or len(message.data) != 8
-        ):
-            self.statistics.refused += 1
-            return []
+        if kind is None or not _is_plain(message):
+            return self._refused()
         data = bytes(message.data)
         bits = int.from_bytes(data, "little")
         if bits >> 52 != frame_crc(message.arbitration_id, data):
             self.statistics.damaged += 1
             return []
         item, counter, second = bits >> 32 & 0x3F, bits >> 38 & 0x3F, bits >> 44 & 0xFF
-        try:
-            decoded: dict[str, Any] = dict(kind.message.decode(data, decode_choices=False))  # type: ignore[arg-type]
-        except Exception:  # cantools has a class of its own for an item that the DBC does not have
-            self.statistics.refused += 1
-            return []
-        values = {
-            name: float(value) for name, value in decoded.items() if name not in ("item", "counter", "time", "crc")
-        }
+        values = _values(kind, data)
+        if (
+            values is None
+            or int(values.get("time_ms", 1000.0 * second)) // 1000 % 256 != second
+            or int(values.get("frames_sent", counter)) % COUNTER != counter
+        ):
+            return self._refused()
         name = kind.message.name
-        if not all(_possible(kind, signal, value) for signal, value in values.items()):
-            self.statistics.refused += 1
-            return []
-        if "time_ms" in values and int(values["time_ms"]) // 1000 % 256 != second:
-            self.statistics.refused += 1
-            return []
-        if "frames_sent" in values and int(values["frames_sent"]) % COUNTER != counter:
-            self.statistics.refused += 1
-            return []
         self._good += 1
         if "frames_sent" in values:
             self._look_for_twin(int(values["frames_sent"]))
         jump = self._accept(counter)
         if jump == 0:
-            self.statistics.refused += 1
-            return []
+            return self._refused()
         self._corrects = self._corrects and jump == 1  # the frame that opens the next sample may be among the lost
         self.statistics.received += 1
         self.statistics.lost = self._sent - self.statistics.received
@@ -471,6 +451,10 @@ class Decoder:
         order = _order(kind, item)
         named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
         return self._assemble(kind.axis, order, jump, second, told_ms / 1000.0, named)
+
+    def _refused(self) -> list[AxisReport]:
+        self.statistics.refused += 1
+        return []
 
     def _take_status(self, values: Mapping[str, float]) -> None:
         """Take an item of the status. Of another version nothing is believed but the version."""
@@ -607,6 +591,22 @@ def _starts() -> tuple[int, ...]:
 def _order(kind: _Kind, item: int) -> int:
     """Place of a frame among all that a report may have. Two places differ by the most frames between them."""
     return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
+
+
+def _is_plain(message: can.Message) -> bool:
+    """Whether a frame is a classic one of 8 bytes with an identifier of 11 bits."""
+    special = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
+    return not special and message.dlc == 8 == len(message.data)
+
+
+def _values(kind: _Kind, data: bytes) -> dict[str, float] | None:
+    """Signals of a frame; None where the DBC has no such item, or a value cannot be."""
+    try:
+        decoded: dict[str, Any] = dict(kind.message.decode(data, decode_choices=False))  # type: ignore[arg-type]
+    except Exception:  # cantools has a class of its own for an item that the DBC does not have
+        return None
+    values = {name: float(value) for name, value in decoded.items() if name not in ("item", "counter", "time", "crc")}
+    return values if all(_possible(kind, signal, value) for signal, value in values.items()) else None
 
 
 def _possible(kind: _Kind, signal: str, value: float) -> bool:

@@ -198,6 +198,7 @@ class Module:
         return time_s
 
 
+@dataclass
 class View:
     """The last report of each axis, the status and the frame counts of each module, fitted to the terminal.
 
@@ -208,27 +209,18 @@ class View:
     there are none.
     """
 
-    def __init__(
-        self,
-        streams: Streams | Decoder,
-        source: Source,
-        title: str,
-        total_s: float | None = None,
-        contact: Contact | None = None,
-        axes: Sequence[str] = (),
-        contacts: Mapping[int, Contact] | None = None,
-        names: Callable[[Mapping[str, float]], Names] = lambda status: BY_PLACE,
-        advice: Callable[[Mapping[str, float]], str] = lambda status: "",
-    ) -> None:
-        self._streams = Streams.of(streams) if isinstance(streams, Decoder) else streams
-        self._source = source
-        self._title = title
-        self._total_s = total_s
-        self._contact = contact
-        self._contacts = {} if contacts is None else contacts
-        self._axes = axes
-        self._names = names
-        self._advice = advice
+    heard: Streams | Decoder
+    source: Source
+    title: str
+    total_s: float | None = None
+    contact: Contact | None = None
+    axes: Sequence[str] = ()
+    contacts: Mapping[int, Contact] = field(default_factory=dict)
+    names: Callable[[Mapping[str, float]], Names] = lambda status: BY_PLACE
+    advice: Callable[[Mapping[str, float]], str] = lambda status: ""
+
+    def __post_init__(self) -> None:
+        self.streams = Streams.of(self.heard) if isinstance(self.heard, Decoder) else self.heard
         self._modules: dict[int, Module] = {}
         self._console = Console(stderr=True)
         self._live = Live(
@@ -241,20 +233,20 @@ class View:
 
     def show(self, reports: Sequence[AxisReport]) -> None:
         """Take new reports."""
-        for node in list(self._streams.decoders):
+        for node in list(self.streams.decoders):
             self._module(node).now()
         for report in reports:
-            if not self._axes or report.axis in self._axes:
+            if not self.axes or report.axis in self.axes:
                 last = self._module(report.node).last
                 _, trend = last.get(report.axis, (report, deque(maxlen=SPARK[1])))
                 trend.append(report.value("bias_mean"))
                 last[report.axis] = report, trend
 
     def _module(self, node: int) -> Module:
-        return self._modules.setdefault(node, Module(self._streams.decoders[node]))
+        return self._modules.setdefault(node, Module(self.streams.decoders[node]))
 
     def _contact_of(self, module: Module | None) -> Contact | None:
-        return self._contact if module is None else self._contacts.get(module.decoder.node, self._contact)
+        return self.contact if module is None else self.contacts.get(module.decoder.node, self.contact)
 
     def __enter__(self) -> View:
         try:
@@ -274,13 +266,13 @@ class View:
     def renderable(self, *, whole: bool = False) -> RenderableType:
         """What is to be seen now; unless `whole`, no higher than the terminal."""
         width = self._console.width
-        modules = {node: self._module(node) for node in self._streams.known}
+        modules = {node: self._module(node) for node in self.streams.known}
         first = next(iter(modules.values()), None)
         numbered = not set(modules) <= {0}  # a bus with other nodes than node 0
-        title = Text(self._title, "bold") if numbered else self._title_of(self._title, first)
+        title = Text(self.title, "bold") if numbered else self._title_of(self.title, first)
         parts: list[RenderableType] = [_line(self._verdict(modules)), _line(title)]
-        if self._total_s is not None and not whole:
-            done = round(min(1.0, (first.now() if first else 0.0) / self._total_s) * (width // 2))
+        if self.total_s is not None and not whole:
+            done = round(min(1.0, (first.now() if first else 0.0) / self.total_s) * (width // 2))
             parts.append(Text.assemble(("━" * done, "green"), ("━" * (width // 2 - done), "dim")))
         height = None if whole else self._console.height - len(parts) - (len(modules) > 1)
         for row, (node, module) in enumerate(modules.items()):
@@ -290,7 +282,7 @@ class View:
             height = None if height is None else height - len(lines)
             parts += lines
         if len(modules) != 1:
-            said = frame_counts(self._streams, self._source)
+            said = frame_counts(self.streams, self.source)
             parts.append(_line(Text(f"all {said}" if modules else said, "dim")))
         return Group(*parts)
 
@@ -299,7 +291,7 @@ class View:
         axes, ready, oldest_s, step = 0, 0, 0.0, ""
         for node, module in modules.items():
             contact, why, last = self._contact_of(module), module.reasons, dict(module.last)
-            shown = [axis for axis in AXES if (axis in last or axis in why) and axis in (self._axes or AXES)]
+            shown = [axis for axis in AXES if (axis in last or axis in why) and axis in (self.axes or AXES)]
             axes += len(shown)
             ready += sum(axis in last and axis not in why and last[axis][0].complete for axis in shown)
             silent_s = contact.silent_s if contact is not None else 0.0
@@ -308,8 +300,8 @@ class View:
             todo = self._next_step(module, shown)
             if todo and not step:
                 step = f"node {node}: {todo}" if len(modules) > 1 else todo
-        contact = self._contact
-        if contact is not None and self._source.closed:
+        contact = self.contact
+        if contact is not None and self.source.closed:
             step = "plug the port in again"
         elif not modules:
             step = "no module heard: check channel, cable and power" if contact is not None else "no module heard"
@@ -342,14 +334,14 @@ class View:
         lines.append(self._counts(module))
         if module.decoder.statistics.foreign:
             lines.append(_line(Text("items of the status that state another wire version are left out", "yellow")))
-        advice = self._advice(module.decoder.status)
+        advice = self.advice(module.decoder.status)
         if advice:
             lines += _flow([Text(word, "yellow") for word in advice.split()], width, 1)
         last = dict(module.last)  # Live asks from a thread of its own
         lines += self._unreported(module, last, width)
         lines += self._sufficiency(last)
         if last:
-            names = self._names(module.decoder.status)
+            names = self.names(module.decoder.status)
             count = max((report.hypotheses or told_of(report) for report, _ in last.values()), default=0)
             named = (names.hypotheses if count <= len(names.hypotheses) else BY_PLACE.hypotheses)[:count]
             lines.append(_line(_heading(named, _bar_cells(len(named), width))))
@@ -378,7 +370,7 @@ class View:
         """Why axes have no report, a line for each reason."""
         axes: dict[str, list[str]] = {}
         for axis, word in module.reasons.items():
-            if axis not in last and (not self._axes or axis in self._axes):
+            if axis not in last and (not self.axes or axis in self.axes):
                 axes.setdefault(word, []).append(axis)
         return [
             line
@@ -390,8 +382,8 @@ class View:
 
     def _counts(self, module: Module) -> Text:
         """The frames of a module, and of strangers if it is alone."""
-        whole = len(self._streams.known) == 1
-        said = frame_counts(self._streams, self._source) if whole else counted(module.decoder.statistics)
+        whole = len(self.streams.known) == 1
+        said = frame_counts(self.streams, self.source) if whole else counted(module.decoder.statistics)
         return _line(Text(said, "dim"))
 
     def _title_of(self, name: str, module: Module | None) -> Text:
@@ -404,14 +396,14 @@ class View:
         status = module.decoder.status if module is not None else {}
         finished = module is not None and module.decoder.finished
         said = {1.0: "running", 2.0: "finished"}.get(status.get("state", 0.0), "waiting for the module")
-        if contact is not None and self._source.closed:
+        if contact is not None and self.source.closed:
             return Text(f"port gone for {contact.silent_s:.0f} s, waiting for it", "bold red")
         if contact is not None and contact.lost and not finished:
             word = "lost contact: no word" if contact.ever else "no word"
             return Text(f"{word} for {contact.silent_s:.0f} s", "bold red")
         if contact is not None and contact.waiting and not finished:
             return Text(f"waiting: no word for {contact.silent_s:.0f} s, a status comes every 10 s", "yellow")
-        end = contact is None and self._total_s is None and self._source.closed
+        end = contact is None and self.total_s is None and self.source.closed
         return Text(f"{said}, end of the log" if end else said, "bold")
 
     def _status(self, module: Module, width: int) -> list[Text]:

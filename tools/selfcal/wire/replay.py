@@ -238,14 +238,7 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
         rows["value"][:, index] = as_float(recording.in_unit(name, unit)) if known else np.nan
     header = np.array(
         [(MAGIC, len(axes), len(channels) + len(SIDE), recording.rate_hz, recording.samples, recording.powered)],
-        dtype=[
-            ("magic", "S8"),
-            ("axes", "<u4"),
-            ("channels", "<u4"),
-            ("rate", "<f8"),
-            ("rows", "<u8"),
-            ("powered", "<u8"),
-        ],
+        dtype="S8, <u4, <u4, <f8, <u8, <u8",
     )
     with path.open("wb") as file:
         file.write(header.tobytes())
@@ -487,7 +480,8 @@ def document_of(
         if "error" not in axis:
             judgement = history[name][-1].adequacy
             axis["module_says"] = asdict(judgement) if judgement is not None else None
-            axis["ahead"] = None if gate else _ahead(recording, model, name, history[name])
+            known = [] if gate else [of_report(report, model) for report in history[name]]
+            axis["ahead"] = None if gate else error_ahead(recording, model, name, known)
             axis["outliers_kept_out"] = int(history[name][-1].values.get("outliers", 0))
             if judgement is not None and judgement.change is not None and judgement.state != "inadequate":
                 note(f"{name}: the module says {judgement.change}; the checks here look at the record as one")
@@ -497,10 +491,6 @@ def document_of(
         for axis in (axis for axis in document["axes"].values() if "error" not in axis):
             axis["adequate"] = None  # which samples were at rest is not in the telemetry
     return document
-
-
-def _ahead(recording: Recording, model: Model, name: str, history: Sequence[AxisReport]) -> dict[str, Any] | None:
-    return error_ahead(recording, model, name, [of_report(report, model) for report in history])
 
 
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:

@@ -26,7 +26,7 @@ from selfcal.base.output import finite
 from selfcal.base.units import parameter_unit
 from selfcal.logs.framelog import FRAMES
 from selfcal.wire.dbc_file import PLACE_NAMES, Names
-from selfcal.wire.frames import AXES, AxisReport, axis_unit
+from selfcal.wire.frames import AXES, STATISTICS, AxisReport, axis_unit
 from selfcal.wire.live import told_of
 from selfcal.wire.ros_messages import diagnostics, imu
 
@@ -39,8 +39,6 @@ PORTS = {"udp-json": 9870, "foxglove": 8765}
 LINES = ("jsonl", "ros")
 KINDS = (*PORTS, *LINES)
 HOST = "127.0.0.1"
-#: Statistics of a parameter in a report.
-TOLD = ("mean", "median", "sd", "q05", "q95")
 
 
 class Stream(Protocol):
@@ -73,7 +71,7 @@ def content(report: AxisReport, names: Names) -> dict[str, Any]:
         if f"h{k}_probability" in v:
             law["probability"] = v[f"h{k}_probability"]
         for place, parameter in zip(PLACE_NAMES, names.parameters[k] if known else PLACE_NAMES, strict=False):
-            statistics = {key: v[f"h{k}_{place}_{key}"] for key in TOLD if f"h{k}_{place}_{key}" in v}
+            statistics = {key: v[f"h{k}_{place}_{key}"] for key in STATISTICS if f"h{k}_{place}_{key}" in v}
             if statistics:
                 law[parameter] = {**statistics, "unit": parameter_unit(parameter, unit)}
         laws[names.hypotheses[k] if known else f"h{k}"] = law

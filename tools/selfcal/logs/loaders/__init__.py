@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, TypedDict
 
 from selfcal.base.errors import UserError, install
-from selfcal.base.options import Scale, option, parse_pairs
+from selfcal.base.options import Option, Scale, option, parse_pairs
 
 #: Text, each with .gz too.
 TEXT = (".csv", ".tsv", ".txt", ".log", ".dat", ".lvm")
@@ -72,30 +72,21 @@ def _scales(texts: Sequence[str]) -> dict[str, Scale]:
     return parse_scales(texts)
 
 
+def _pairs(help: str, name: str, metavar: str) -> Option:
+    return option(help, name, metavar=metavar, kind=list[str], made=partial(parse_pairs, name))
+
+
 class Reading(TypedDict, total=False):
     """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
 
     rate: Annotated[float | None, option("Sampling rate, for recordings without a t column", metavar="HZ")]
     rate_hz: float | None
     columns: Annotated[
-        Mapping[str, str] | None,
-        option(
-            "Column of a foreign header (repeat for more)",
-            "--column",
-            metavar="gx=NAME",
-            kind=list[str],
-            made=partial(parse_pairs, "--column"),
-        ),
+        Mapping[str, str] | None, _pairs("Column of a foreign header (repeat for more)", "--column", "gx=NAME")
     ]
     units: Annotated[
         Mapping[str, str] | str | None,
-        option(
-            "Unit of a column whose header states none (repeat for more)",
-            "--unit",
-            metavar="gx=rad/s",
-            kind=list[str],
-            made=partial(parse_pairs, "--unit"),
-        ),
+        _pairs("Unit of a column whose header states none (repeat for more)", "--unit", "gx=rad/s"),
     ]
     scale: Annotated[
         Mapping[str, Scale] | float | None,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_META_BYTES
-from selfcal.logs.loaders.table import Hints, Table, check_numbers, of_arrays, parse_meta
+from selfcal.logs.loaders.table import Hints, Table, check_numbers, of_groups, parse_meta
 
 #: Columns of a matrix.
 _WIDEST = 64
@@ -45,13 +45,8 @@ def read(path: Path, _: Hints) -> list[Table]:
             group, _slash, label = name.rpartition("/")
             for heading, column in _columns(label, dataset):
                 tables.setdefault((group, column.size), {})[heading] = column
-    parsed = parse_meta(path, meta) if meta else {}
-    longest = {group: max(size for of, size in tables if of == group) for group, _ in tables}
-    return [
-        of_arrays(group if size == longest[group] else f"{group}:{size}", columns, parsed)
-        for (group, size), columns in tables.items()
-        if size > 1
-    ]
+    whole = {key: columns for key, columns in tables.items() if key[1] > 1}
+    return of_groups(whole, parse_meta(path, meta) if meta else {})
 
 
 def _text(dataset: Any) -> str:

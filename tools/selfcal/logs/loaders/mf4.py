@@ -6,6 +6,7 @@ A conversion by a formula is code to asammdf, and never run: its channel is left
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: {without[0]}")
     names = [table.source for table in tables]
     if len(set(names)) < len(names):
-        tables = [
-            of_arrays(f"{one.source} {k}", {n: m.read() for n, m in one.members.items()}, notes=one.notes)
-            for k, one in enumerate(tables)
-        ]
+        tables = [replace(one, source=f"{one.source} {k}") for k, one in enumerate(tables)]
     return tables
 
 

@@ -154,6 +154,21 @@ def of_arrays(
     return Table(source, {name: in_memory(array) for name, array in arrays.items()}, meta or {}, notes, damaged)
 
 
+def of_groups(
+    columns: Mapping[tuple[str, int], Mapping[str, NDArray[Any]]],
+    meta: Mapping[str, Any] | None = None,
+    notes: tuple[str, ...] = (),
+    damaged: Damaged = SOUND,
+) -> list[Table]:
+    """A table for the columns of each group and length: the longest has the group's name, others their length beside
+    it."""
+    longest = {group: max(size for of, size in columns if of == group) for group, _ in columns}
+    return [
+        of_arrays(group if size == longest[group] else f"{group}:{size}", arrays, meta, notes, damaged)
+        for (group, size), arrays in columns.items()
+    ]
+
+
 def left_out(names: Sequence[str], by: str) -> tuple[str, ...]:
     """The note on channels that are left out, if there are any. `by`: what their values take that is not done."""
     more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""

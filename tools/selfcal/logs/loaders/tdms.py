@@ -16,7 +16,7 @@ from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_NUMBERS
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import TIMES
-from selfcal.logs.loaders.table import Hints, Table, heading, left_out, of_arrays
+from selfcal.logs.loaders.table import Hints, Table, heading, left_out, of_groups
 
 #: Bytes before a segment's content; the bit of its second number that says in which order the others' bytes are.
 _LEAD, _BIG_ENDIAN, _NEVER_ENDED = 28, 1 << 6, 2**64 - 1
@@ -59,11 +59,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     for key, columns in tables.items():
         if key in clocks and not any(name.split("[")[0].lower() in ("t", *TIMES) for name in columns):
             columns["t[s]"] = clocks[key]
-    longest = {group: max(size for of, size in tables if of == group) for group, _ in tables}
-    return [
-        of_arrays(group if size == longest[group] else f"{group}:{size}", columns, notes=notes, damaged=damaged)
-        for (group, size), columns in tables.items()
-    ]
+    return of_groups(tables, notes=notes, damaged=damaged)
 
 
 def _unknown_scale(*stated: Mapping[str, Any]) -> str:

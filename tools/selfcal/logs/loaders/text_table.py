@@ -222,7 +222,8 @@ class TextReader:
                     "that --column names"
                 )
             skipped = len(self._skipped)
-            table = self._parse(batch[:filled], [index[place] for place in wanted], _place(wanted, time))
+            dated = None if time is None else wanted.index(time)
+            table = self._parse(batch[:filled], [index[place] for place in wanted], dated)
             if table is None:
                 table = self._scan(batch[:filled], lines, index, names, optional, time, parts)
                 wanted = [place for place in wanted if parts[place] is not None]
@@ -513,10 +514,6 @@ def is_date(cell: str) -> bool:
 def is_clock(cell: str) -> bool:
     """Whether a cell is a date, or a time of day, in any form."""
     return _CLOCK.fullmatch(cell) is not None
-
-
-def _place(wanted: Sequence[int], place: int | None) -> int | None:
-    return None if place is None else wanted.index(place)
 
 
 def _bare(line: str) -> str:

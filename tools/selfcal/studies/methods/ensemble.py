@@ -82,7 +82,9 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
     for samples in dict.fromkeys(row["samples"] for row in rows):
         for law in dict.fromkeys(row["law"] for row in rows):
             cell = [row for row in rows if row["samples"] == samples and row["law"] == law]
-            by_rival = {name: [row for row in cell if row["rival"] == name] for name in _rivals(cell)}
+            by_rival: dict[str, list[Row]] = {}
+            for row in cell:
+                by_rival.setdefault(str(row["rival"]), []).append(row)
             for name, mine in by_rival.items():
                 entry: dict[str, Any] = {"samples": samples, "law": law, "rival": name, "records": len(mine)}
                 entry["seconds"] = float(np.median([row["seconds"] for row in mine]))
@@ -93,10 +95,6 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
                 entry["choice"] = {one: _choice(mine, one, law) for one in _criteria(mine)}
                 entries.append(entry)
     return entries
-
-
-def _rivals(rows: Sequence[Row]) -> list[str]:
-    return list(dict.fromkeys(str(row["rival"]) for row in rows))
 
 
 def _criteria(rows: Sequence[Row]) -> list[str]:

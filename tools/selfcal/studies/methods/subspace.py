@@ -12,10 +12,11 @@ from scipy import linalg
 from statsmodels.tsa.stattools import levinson_durbin
 
 from selfcal.studies.methods.arma_form import of_coefficients
+from selfcal.studies.methods.autocorrelation import PART
 from selfcal.studies.methods.problem import Answer, Floats, Problem
 
-#: Lags at most, and as a part of the record: as many parameters take ten samples each.
-MOST, PART = 60, 0.1
+#: Lags at most; of a short record PART: as many parameters take ten samples each.
+MOST = 60
 
 
 def subspace(problem: Problem) -> Answer:

@@ -8,12 +8,12 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import signal
 
 from selfcal.adequacy.allan import terms_of
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.result import AxisResult
+from selfcal.base.grid import Array
 from selfcal.batch.spread import Row, spread
 from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED
@@ -23,8 +23,6 @@ from selfcal.studies.methods.allan import curve, fit
 from selfcal.studies.methods.problem import Problem
 from selfcal.studies.methods.whittle import whittle
 from selfcal.studies.paper_figures.reproduction import Reproduction
-
-Floats = NDArray[np.float64]
 
 #: Times of the bank's reports, s: the ticks of the paper's axes (Fig. 1 to 600 s, Fig. 2 to 400 s), the T of its text,
 #: and times between. At 0 the prior holds.
@@ -46,7 +44,7 @@ SHOWN = {SECOND: "Gauss–Markov", "random_walk": "random walk"}
 PAPER = DEFAULT.with_name("paper.yaml")
 
 
-def over_time(model: Model, axis: str, dt_s: float, y: Floats, marks: Sequence[int]) -> list[AxisResult]:
+def over_time(model: Model, axis: str, dt_s: float, y: Array, marks: Sequence[int]) -> list[AxisResult]:
     """The bank's reports after `marks` samples of `y`."""
     from selfcal.bank.library import Bank
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.base.grid import Array
 from selfcal.logs.recording import as_float, load
 from selfcal.model.file import Model, Prior
 from selfcal.model.laws import NAMED
@@ -21,8 +21,6 @@ from selfcal.studies.methods.allan import fit
 from selfcal.studies.methods.problem import Problem, Value
 from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section3 import PAPER, over_time
-
-Floats = NDArray[np.float64]
 
 AXIS = "ax"
 #: The paper's result, of which the simulated records are made: m/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
@@ -76,12 +74,12 @@ def short_memory(model: Model) -> Model:
     return replace(model, groups=(replace(group, priors=priors),))
 
 
-def simulated(seed: int, count: int = len(STRETCHES)) -> dict[str, Floats]:
+def simulated(seed: int, count: int = len(STRETCHES)) -> dict[str, Array]:
     """Random walks with the paper's values."""
     return {f"simulated {k + 1}": y for k, y in enumerate(_drawn("random_walk", TRUTHS["random_walk"], seed, count))}
 
 
-def _drawn(law: str, truth: Mapping[str, float], seed: int, count: int) -> list[Floats]:
+def _drawn(law: str, truth: Mapping[str, float], seed: int, count: int) -> list[Array]:
     """`count` records of DURATION s, each with a seed of its own."""
     return [simulate_bank_samples(law, truth, 1.0, DURATION, seed + 1_000_003 * k)[0] for k in range(count)]
 
@@ -90,11 +88,11 @@ def _drawn(law: str, truth: Mapping[str, float], seed: int, count: int) -> list[
 class Rms:
     """Of the logarithm of a parameter over an ensemble, at ALLAN_MARKS: the error, and what the method computes."""
 
-    real: Floats
-    computed: Floats
+    real: Array
+    computed: Array
 
     @property
-    def ratio(self) -> Floats:
+    def ratio(self) -> Array:
         return self.computed / self.real
 
 
@@ -156,7 +154,7 @@ def _within(value: float, prior: Prior) -> float:
     return float(np.clip(value, prior.min, prior.max))
 
 
-def real(folder: Path, model: Model) -> dict[str, Floats]:
+def real(folder: Path, model: Model) -> dict[str, Array]:
     """1 s means of the stretches; those whose file is absent are left out."""
     records, loaded = {}, {}
     for name, start in STRETCHES:
@@ -192,7 +190,7 @@ def _far_off(titles: Iterable[str], last_of: Mapping[str, Sequence[Estimate]]) -
 
 
 def _figure_5(
-    model: Model, records: Mapping[str, Floats], reports: Mapping[str, Sequence[AxisResult]], kind: str, where: str
+    model: Model, records: Mapping[str, Array], reports: Mapping[str, Sequence[AxisResult]], kind: str, where: str
 ) -> Reproduction:
     """Probability of the random walk over time. `reports` at MARKS; `kind`, `where`: words for the records."""
     t = np.array(MARKS, dtype=float)
@@ -224,7 +222,7 @@ def _figure_5(
     )
 
 
-def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool, seed: int) -> list[Reproduction]:
+def figures_5_and_6(model: Model, records: Mapping[str, Array], real_ones: bool, seed: int) -> list[Reproduction]:
     """Probability of the random walk, its parameters, and their rms, over time."""
     reports = {name: over_time(model, AXIS, 1.0, y, MARKS) for name, y in records.items()}
     t = np.array(MARKS, dtype=float)
@@ -296,15 +294,15 @@ def figures_5_and_6(model: Model, records: Mapping[str, Floats], real_ones: bool
     ]
 
 
-def _sd(seen: Sequence[AxisResult], name: str) -> Floats:
+def _sd(seen: Sequence[AxisResult], name: str) -> Array:
     return np.array([one.parameters["random_walk"][name].sd for one in seen])
 
 
-def _span(values: Floats) -> str:
+def _span(values: Array) -> str:
     return f"{values.min():.3g} to {values.max():.3g}"
 
 
-def _parameter(title: str, seen: Sequence[AxisResult], name: str, t: Floats, line: Sequence[Curve]) -> Panel:
+def _parameter(title: str, seen: Sequence[AxisResult], name: str, t: Array, line: Sequence[Curve]) -> Panel:
     estimates = [one.parameters["random_walk"][name] for one in seen]
     unit, scale, _ = SHOWN[name]
     low, middle, high = (np.array([getattr(e, key) for e in estimates]) / scale for key in ("q05", "median", "q95"))
@@ -312,7 +310,7 @@ def _parameter(title: str, seen: Sequence[AxisResult], name: str, t: Floats, lin
     return Panel(title, "time, s", unit, curves, [Band("5 to 95 %", t, low, high, "spread")], log_y=name == "K")
 
 
-def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[Reproduction]:
+def figures_7(model: Model, records: Mapping[str, Array], seed: int) -> list[Reproduction]:
     """N and K by the Allan variance; the rms that it computes against the real one; and both on the other law."""
     group = replace(model.group_of(AXIS), axes=(AXIS,))
     t = np.array(ALLAN_MARKS, dtype=float)
@@ -364,7 +362,7 @@ def figures_7(model: Model, records: Mapping[str, Floats], seed: int) -> list[Re
 
 
 def _both_ways(
-    allan: Mapping[str, Mapping[tuple[str, str], Rms]], bank: Mapping[str, Mapping[tuple[str, str], Rms]], t: Floats
+    allan: Mapping[str, Mapping[tuple[str, str], Rms]], bank: Mapping[str, Mapping[tuple[str, str], Rms]], t: Array
 ) -> Reproduction:
     """The claim of Fig. 7 on both truths, for the right law and the wrong one."""
     panels: dict[str, list[Panel]] = {"N": [], "drift": []}
@@ -415,7 +413,7 @@ def map_tables(model: Model) -> Tables:
     return make_tables(model, 1.0 / AREA_STEP_S, ("gravity",), bank_rate_hz=1.0 / AREA_STEP_S)
 
 
-def of_map_error(tables: Tables, y: Floats) -> tuple[float, tuple[float, float, float]]:
+def of_map_error(tables: Tables, y: Array) -> tuple[float, tuple[float, float, float]]:
     """P(Gauss-Markov) of a record [samples] in m/s^2; its rms in mGal, correlation interval in min, noise in mGal."""
     from selfcal.bank.library import Bank
 

@@ -16,17 +16,15 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.output import check_place
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.show.chart import Curve, Figure, Panel
 from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section4 import AREA_SAMPLES, AREA_STEP_S, MGAL, map_tables, of_map_error
-
-Floats = NDArray[np.float64]
 
 #: The field: rms, mGal, and length, km. The vessel: km between readings of AREA_STEP_S, at 8 knots.
 FIELD_MGAL, FIELD_KM, STEP_KM = 10.0, 12.0, 8.0 * 1.852 * AREA_STEP_S / 3600.0
@@ -39,7 +37,7 @@ WIDTH_KM = 24.0
 DRAWN = 4
 
 
-def left_out(tracks: int, rng: np.random.Generator) -> Floats:
+def left_out(tracks: int, rng: np.random.Generator) -> Array:
     """Differences of each track from the map of all others, mGal, [tracks, AREA_SAMPLES]."""
     along, across = np.arange(AREA_SAMPLES) * STEP_KM, np.linspace(0.0, WIDTH_KM, tracks)
     x, y = (grid.ravel() for grid in np.meshgrid(along, across))
@@ -54,7 +52,7 @@ def left_out(tracks: int, rng: np.random.Generator) -> Floats:
     return differences(field + (SLOW_MGAL**2 + NOISE_MGAL**2) * np.eye(count), measured, tracks)
 
 
-def differences(covariance: Floats, measured: Floats, tracks: int) -> Floats:
+def differences(covariance: Array, measured: Array, tracks: int) -> Array:
     """Each track of `measured` [tracks * n] less its optimal interpolation of all other tracks, [tracks, n]."""
     inverse = np.linalg.inv(covariance)
     weighted = (inverse @ measured).reshape(tracks, -1)
@@ -63,12 +61,12 @@ def differences(covariance: Floats, measured: Floats, tracks: int) -> Floats:
     return np.stack([np.linalg.solve(blocks[k, :, k], weighted[k]) for k in range(tracks)])
 
 
-def surveys(seed: int) -> dict[str, Floats]:
+def surveys(seed: int) -> dict[str, Array]:
     """By area: the differences of its tracks, mGal, [tracks, AREA_SAMPLES]."""
     return {area: left_out(count, np.random.default_rng([seed, count])) for area, count in TRACKS.items()}
 
 
-def write_tracks(folder: Path, areas: Mapping[str, Floats]) -> None:
+def write_tracks(folder: Path, areas: Mapping[str, Array]) -> None:
     """A recording a track, `gravity[mGal]` every AREA_STEP_S, in a folder that exists or whose parent does."""
     try:
         folder.mkdir(exist_ok=True)
@@ -81,7 +79,7 @@ def write_tracks(folder: Path, areas: Mapping[str, Floats]) -> None:
             save(path, {"gravity": ("mGal", track)}, 1.0 / AREA_STEP_S, t=AREA_STEP_S * np.arange(track.size))
 
 
-def figure(model: Model, areas: Mapping[str, Floats]) -> Reproduction:
+def figure(model: Model, areas: Mapping[str, Array]) -> Reproduction:
     """The law of the errors by area, and whether more tracks make them smaller and longer."""
     tables = map_tables(model)
     fits = {area: [of_map_error(tables, MGAL * error) for error in errors] for area, errors in areas.items()}
