@@ -290,13 +290,14 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     padded = 2 * next_fast_len(n, real=True)
     V = rfft(weights, padded, axis=0)
     place = np.minimum(np.rint(np.arange(V.shape[0]) * n / padded).astype(int), U.shape[0] - 1)
-    gain = np.where(usable[place], full(V.real, known[place]) + full(V.imag, known[place]), 0.0)
-    alone = 0.5 * np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place] * usable[place][:, None]
-    turns = np.arange(gain.size) * n / padded
-    gain, alone = gain - ln_lines(turns, n, gain), alone - ln_lines(turns[:, None], n, alone)
+    turns = np.arange(V.shape[0]) * n / padded
+    gain = full(V.real, known[place]) + full(V.imag, known[place])
+    alone = 0.5 * np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place]
+    gain = np.where(usable[place], gain - ln_lines(turns, n, gain), -math.inf)
+    alone = np.where(usable[place][:, None], alone - ln_lines(turns[:, None], n, alone), -math.inf)
     t = np.arange(n)
     places = [int(np.argmax(gain)), *(int(k) for k in np.argmax(alone, axis=0))]
-    for at in dict.fromkeys(places):
+    for at in dict.fromkeys(places) if usable.any() else ():
         f = _sharpest(weights, known[place[at]], at / padded, 0.5 / padded)
         pair = np.array([np.cos(2.0 * math.pi * f * t), np.sin(2.0 * math.pi * f * t)])
         # Of few turns: the record ends, and a spectrum does not.
