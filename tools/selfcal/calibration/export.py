@@ -71,7 +71,7 @@ def _whole(
     lost = _unknown(document, "accelerometer", ("misalignment",))
     if lost and not diagonal:
         lines.append(f"accelerometers, not identified and left at 0: {', '.join(lost)}")
-    theta = accel.refitted(held).theta if held.any() else accel.fit.theta
+    theta = accel.refitted(held).theta
     # A common error of gravity is not theirs to correct: gravity is as stated.
     bias, matrix = theta[accelerometer.BIAS], matrix_of(theta)
     if diagonal:

@@ -27,9 +27,6 @@ NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not
 IDENTIFIED, WIDER = 0.2, 8.0
 #: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
 FALSE_ALARM = 0.005
-#: Shares of a drift's mean square under a wide prior that are weighed: three decades of its deviation.
-#: A fit that is only weighed settles earlier.
-SHARES, ROUGHLY = 10.0 ** -np.arange(0.0, 6.5, 0.75), 0.1
 #: Residuals beyond the parameters that a check takes at least.
 FREE_LEAST = 0.5
 
@@ -38,7 +35,8 @@ FREE_LEAST = 0.5
 class Fit:
     """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
     `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
-    makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares."""
+    makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step` [n]:
+    to the least sum of squares by these derivatives, which takes `gain` off it."""
 
     theta: Array
     covariance: Array
@@ -47,6 +45,8 @@ class Fit:
     columns: Array
     root: Array
     pulled: float
+    step: Array
+    gain: float
 
     @property
     def squares(self) -> float:
@@ -55,12 +55,12 @@ class Fit:
 
     @property
     def evidence(self) -> float:
-        """ln of the likelihood under the prior, but for a constant (Laplace)."""
+        """ln of the likelihood under the prior, but for a constant (Laplace), at the end of the step."""
         factor = np.linalg.cholesky(self.prior)
         seen = self.columns @ factor
         size = float(np.linalg.slogdet(np.eye(factor.shape[0]) + seen.T @ seen)[1])
         noise = 2.0 * float(np.log(np.diag(self.root)).sum())
-        return -0.5 * (self.squares + noise + size)
+        return -0.5 * (self.squares - self.gain + noise + size)
 
     def widened(self) -> Array:
         """The covariance [n, n] were every prior WIDER times as wide: no parameter is known by another's prior."""
@@ -99,6 +99,8 @@ class Fit:
     def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
         """Of causes, each in words and by its columns [m, k] of the residuals, those that explain more than chance, the
         surest first; with their probability by chance, corrected for the number of causes."""
+        if not math.isfinite(self.excess):
+            return []
         more = solve_triangular(self.root, np.hstack([columns for _, columns in tried]), lower=True)
         apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
         found, first = [], 0
@@ -118,56 +120,46 @@ def _explained(normal: Array, pull: Array) -> tuple[float, int]:
     return float((along**2 / values[kept]).sum()), max(int(kept.sum()), 1)
 
 
-def fit(
-    problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None, settled: float = SETTLED
-) -> Fit:
-    """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
-    stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
-    `settled`: the last step, in posterior sd. Raises UserError where none settles."""
-    free = np.ones(start.size, bool) if held is None else ~held
-    theta = np.where(free, start, mean)
+def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
+    """The problem at parameters, as `fit` has it. Raises UserError."""
+    free = np.ones(theta.size, bool) if held is None else ~held
     block = np.ix_(free, free)
     unit = np.sqrt(np.diag(prior))[free]
-    inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
+    r, J, R = problem(theta)
+    if not all(np.isfinite(one).all() for one in (r, J, R)):
+        raise UserError(UNSETTLED)
+    apart = (theta - mean)[free] / unit
+    try:
+        inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
+        root = np.asarray(np.linalg.cholesky(R))
+        white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
+        own = columns[:, free] * unit
+        covariance = np.linalg.inv(own.T @ own + inverse)
+    except np.linalg.LinAlgError:
+        raise UserError(NO_NOISE) from None
+    whole, step = np.zeros(prior.shape), np.zeros(theta.size)
+    whole[block] = covariance * np.outer(unit, unit)
+    pull = own.T @ white + inverse @ apart
+    moved = -covariance @ pull
+    step[free] = moved * unit
+    return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart), step, float(-moved @ pull))
 
-    def at(theta: Array) -> Fit:
-        r, J, R = problem(theta)
-        if not all(np.isfinite(one).all() for one in (r, J, R)):
-            raise UserError(UNSETTLED)
-        apart = (theta - mean)[free] / unit
-        try:
-            root = np.asarray(np.linalg.cholesky(R))
-            white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
-            own = columns[:, free] * unit
-            covariance = np.linalg.inv(own.T @ own + inverse)
-        except np.linalg.LinAlgError:
-            raise UserError(NO_NOISE) from None
-        whole = np.zeros(prior.shape)
-        whole[block] = covariance * np.outer(unit, unit)
-        return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart))
 
-    found = at(theta)
+def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
+    """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
+    stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
+    Raises UserError where none settles."""
+    found = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
     for _ in range(ITERATIONS):
-        apart = (found.theta - mean)[free] / unit
-        pull = found.columns[:, free].T @ found.white + inverse @ apart / unit
-        step = np.zeros(theta.size)
-        step[free] = -found.covariance[block] @ pull
-        far = float(np.max(np.abs(step[free]) / np.sqrt(np.diag(found.covariance)[free])))
-        following = at(found.theta + step)
+        step, sd = found.step, np.sqrt(np.diag(found.covariance))
+        far = float(np.max(np.abs(step[sd > 0.0]) / sd[sd > 0.0]))
+        following = linearized(problem, found.theta + step, mean, prior, held)
         for _ in range(HALVINGS if far > NEAR else 0):
             if following.squares < found.squares:
                 break
-            step *= 0.5
-            following = at(found.theta + step)
+            step = 0.5 * step
+            following = linearized(problem, found.theta + step, mean, prior, held)
         found = following
-        if far < settled:
+        if far < SETTLED:
             return found
     raise UserError(UNSETTLED)
-
-
-def drift_share(fit_at: Callable[[float], Fit]) -> float:
-    """Posterior mean of the share of a drift's prior variance that residuals support, log-uniform before. `fit_at`: the
-    fit at a share."""
-    evidence = np.array([fit_at(float(one)).evidence for one in SHARES])
-    weight = np.exp(evidence - evidence.max())
-    return float(weight @ SHARES / weight.sum())

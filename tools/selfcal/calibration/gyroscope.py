@@ -13,18 +13,18 @@ two level parts of the Earth's rate in its first rest. Residuals: three of each 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.base.errors import UserError
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
-from selfcal.calibration.accelerometer import Accelerometer, matrix_of
-from selfcal.calibration.fit import ROUGHLY, SETTLED, Fit, Mask, drift_share, fit
+from selfcal.calibration.accelerometer import Accelerometer, forces, shaped
+from selfcal.calibration.fit import Fit, Mask, Problem, fit, linearized
 from selfcal.calibration.noise import drift
-from selfcal.calibration.rests import ACCEL, GYRO, Rest, Turn
+from selfcal.calibration.rests import ACCEL, GYRO, Tumble, Turn
 
 Array = NDArray[np.float64]
 
@@ -39,6 +39,10 @@ BIAS_SD, G_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = (
 )
 #: sd of a parameter that the logs do not have.
 NONE = 1e-12
+#: Windows of a turn that show signs and units, s. A gyro's factor may be off by WRONG. Share of the most turned axis,
+#: or of a turn, from which on it is judged. Information below which there is none. Units taken for each other.
+WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
+TAKEN = (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
 #: Where the parameters are, behind the accelerometers'.
 BIAS, G, SCALE, ANGLE, VERTICAL, THERMAL, LEVEL = (
     slice(0, 3),
@@ -69,10 +73,7 @@ class Gyroscope:
 
 def gyro_matrix(theta: Array) -> Array:
     """T K [3, 3] of the gyros' own parameters."""
-    T = np.eye(3)
-    for (row, column), value in zip(PLACES, theta[ANGLE], strict=True):
-        T[row, column] = value
-    return T * theta[SCALE]
+    return shaped(theta[SCALE], theta[ANGLE], PLACES)
 
 
 def cross(v: Array) -> Array:
@@ -109,23 +110,51 @@ def turned(rate: Array, dt: float) -> tuple[Array, Array]:
     return to_end[0], np.swapaxes(to_end, 1, 2)
 
 
+def fault_of(accel: Accelerometer) -> str:
+    """What the turns say is wrong with signs, axes or units of the gyros; "" for nothing. Gravity's direction u moves
+    by u x w, which is linear in the rates: M [3, 3] of w = M y needs no start. An axis of few turns is not judged."""
+    rests, moves, angles, middles = accel.tumble.rests, [], [], []
+    for turn in (one for one in accel.tumble.turns if not one.reason):
+        size = max(2, round(WINDOW_S / turn.dt))
+        first = np.arange(0, len(turn.accel) - size, size)
+        f = accel.force(turn.accel, np.zeros(len(turn.accel)))
+        u = f / np.linalg.norm(f, axis=1)[:, None]
+        rate = turn.gyro - 0.5 * (rests[turn.first].gyro + rests[turn.first + 1].gyro)
+        way = np.cumsum(rate, axis=0) * turn.dt
+        moves.append(u[first + size] - u[first])
+        angles.append(way[first + size] - way[first])
+        middles.append(u[first + size // 2])
+    if not moves:
+        return ""
+    moved, angle, u = (np.concatenate(one) for one in (moves, angles, middles))
+    turned, seen = np.linalg.norm(np.cross(u, moved), axis=0), np.linalg.norm(angle, axis=0)
+    columns = (cross(u)[:, :, :, None] * (angle / np.maximum(seen, 1e-12))[:, None, None, :]).reshape(-1, 9)
+    inverse = np.linalg.inv(columns.T @ columns + FAINT * np.eye(9))
+    found = inverse @ columns.T @ moved.ravel()
+    sd = np.sqrt(np.mean((moved.ravel() - columns @ found) ** 2) * np.diag(inverse)).reshape(3, 3)
+    said = dict[str, list[str]]()
+    for k in np.flatnonzero(turned > SHOWN * turned.max()).tolist():
+        at = int(np.abs(found.reshape(3, 3)[k]).argmax())
+        share, value = (float(found[3 * k + at] / max(one, 1e-12)) for one in (turned[k], seen[at]))
+        if at == k and abs(value - 1.0) < WRONG + 4.0 * float(sd[k, at] / max(seen[at], 1e-12)):
+            continue
+        words = [f"has the turns about {'xyz'[k]}"] * (at != k) + ["is of the other sign"] * (value < 0.0)
+        if not 1.0 - WRONG < abs(value) < 1.0 + WRONG:
+            units = [one for one, size in TAKEN if abs(math.log(abs(value) / size)) < WRONG]
+            words.append(
+                f"reads as if its unit were {units[0]}" if units else f"reads {1 / abs(value):.2g} times the rate"
+            )
+        if abs(share) < SHOWN:
+            at, words = k, ["does not show its turns"]
+        said.setdefault(" and ".join(words), []).append(GYRO[at])
+    return "; ".join(f"{'each of ' * (len(who) > 1)}{', '.join(who)} {words}" for words, who in said.items())
+
+
 def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
-    """The gyros by the rests, and by the turns that are not left out. `held`: own parameters that stay at 0 error."""
-    if any(accel.tumble.noise[name].wide for name in GYRO):
-        near: list[Array] = []
-
-        def fit_at(share: float) -> Fit:
-            found = _calibrate(replace(accel, tumble=accel.tumble.with_drift(GYRO, share)), held, near, ROUGHLY).fit
-            near[:] = [found.theta]
-            return found
-
-        accel = replace(accel, tumble=accel.tumble.with_drift(GYRO, drift_share(fit_at)))
-        return _calibrate(accel, held, near)
-    return _calibrate(accel, held, [])
-
-
-def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array], settled: float = SETTLED) -> Gyroscope:
-    """The same with the drift as it is; from the parameters `near`, if there are any."""
+    """The gyros by the rests, and by the turns that are not left out. `held`: own parameters that stay at 0 error.
+    Raises UserError where the turns are not of these gyros."""
+    if fault := fault_of(accel):
+        raise UserError(f"no numbers: by the turns, {fault}; mend it by --unit or --column, or in the log")
     problem = _Problem(accel)
     of_accel, thermal = problem.of_accel, THERMAL_SD if accel.warmth.size else 0.0
     sd = np.repeat(
@@ -136,10 +165,16 @@ def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array], settl
     prior[:of_accel, :of_accel] = accel.fit.covariance
     mean = np.concatenate([accel.fit.theta, np.zeros(sd.size)])
     mean[of_accel:][SCALE] = 1.0
-    start = mean.copy()
-    start[of_accel:][BIAS] = problem.y.mean(axis=0)
+    near = mean.copy()
+    near[of_accel:][BIAS] = problem.y.mean(axis=0)
     keep = None if held is None else np.concatenate([np.zeros(of_accel, bool), held])
-    found = fit(problem, near[0] if near else start, mean, prior, keep, settled)
+    if accel.tumble.wide(GYRO):
+        near = fit(problem.under(accel.tumble.narrowed(GYRO)), near, mean, prior, keep).theta
+
+    def evidence_of(known: Tumble) -> float:
+        return linearized(problem.under(known), near, mean, prior, keep).evidence
+
+    found = fit(problem.under(accel.tumble.weighed(GYRO, evidence_of)), near, mean, prior, keep)
     return Gyroscope(found, of_accel, problem.turns)
 
 
@@ -166,18 +201,43 @@ class _Problem:
         self.behind = {one.first + 1: k for k, one in enumerate(self.turns)}  # turn that leads to a rest
         self.chain = np.cumsum([k not in self.behind for k in range(self.count)]) - 1
         self.a, self.y = (np.array([getattr(one, name) for one in rests]) for name in ("accel", "gyro"))
+        self.y = np.nan_to_num(self.y)  # one that is not recorded weighs nothing
         self.warm = accel.warmth if accel.warmth.size else np.zeros(self.count)
         self.temp = float(np.mean([one.temp for one in rests])) if accel.warmth.size else math.nan
-        begin = np.concatenate([tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
-        end = np.concatenate([tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])
-        self.slow = [drift(tumble.noise[name], begin, end, accel.reference_s) for name in GYRO]
         self.white = np.array([tumble.noise[name].white for name in GYRO])
         self.of_rests = [self.white / one.seconds + one.rounded[3:] for one in rests]
         self.of_accel_means = [
-            accelerometer.means_covariance(tumble, k, name, accel.reference_s) for k, name in enumerate(ACCEL)
+            accelerometer.means_covariance(tumble, k, name, accel.reference_s, float(accel.fit.theta[k]))
+            for k, name in enumerate(ACCEL)
         ]
 
+        self._last: tuple[Array, tuple[Array, ...]] | None = None
+
+    def _drift(self, tumble: Tumble) -> list[Array]:
+        """Covariances of the gyros' drift over rests and turns."""
+        rests = tumble.rests
+        begin = np.concatenate([tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
+        end = np.concatenate([tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])
+        return [drift(tumble.noise[name], begin, end, self.accel.reference_s) for name in GYRO]
+
+    def under(self, tumble: Tumble) -> Problem:
+        """The problem under the noise of a tumble. The integrals of the last parameters are kept."""
+
+        slow = self._drift(tumble)
+
+        def problem(theta: Array) -> tuple[Array, Array, Array]:
+            if self._last is None or not np.array_equal(theta, self._last[0]):
+                self._last = theta.copy(), self._laid(theta)
+            r, J, R, by_gyro = self._last[1]
+            return r, J, R + sum(by_gyro[:, :, j] @ slow[j] @ by_gyro[:, :, j].T for j in range(3))
+
+        return problem
+
     def __call__(self, theta: Array) -> tuple[Array, Array, Array]:
+        return self.under(self.accel.tumble)(theta)
+
+    def _laid(self, theta: Array) -> tuple[Array, Array, Array, Array]:
+        """Residuals, their derivatives, their covariance without the gyros' drift, and how that drift enters them."""
         count, own = self.count, theta[self.of_accel :]
         at = self._directions(theta)
         size = 3 * count + 2 * len(self.turns)
@@ -214,26 +274,15 @@ class _Problem:
             by_gyro[rows, k] = np.eye(3)
             R[rows, rows] = np.diag(self.of_rests[k])
         for j in range(3):
-            R += by_gyro[:, :, j] @ self.slow[j] @ by_gyro[:, :, j].T
             R += by_accel[:, :, j] @ self.of_accel_means[j] @ by_accel[:, :, j].T
-        return r, J, R
+        return r, J, R, by_gyro
 
     def _directions(self, theta: Array) -> _Directions:
-        A, scale = matrix_of(theta), theta[accelerometer.SCALE]
-        x = self.a - theta[accelerometer.BIAS] - self.warm[:, None] * accelerometer.thermal_of(theta)
-        force = x @ A.T
+        force, to, M = forces(theta[: self.of_accel], self.a, self.warm)
         size = np.linalg.norm(force, axis=1)
         u = force / size[:, None]
         flat = (np.eye(3) - u[:, :, None] * u[:, None, :]) / size[:, None, None]
-        to_reading = flat @ A
-        to = np.zeros((self.count, 3, self.of_accel))
-        to[:, :, accelerometer.BIAS] = -to_reading
-        to[:, :, accelerometer.SCALE] = flat @ (A / scale * x[:, None, :])
-        for k, (row, column) in enumerate(accelerometer.PLACES):
-            to[:, :, accelerometer.ANGLE.start + k] = flat[:, :, row] * (x * scale)[:, [column]]
-        if self.accel.warmth.size:
-            to[:, :, accelerometer.THERMAL] = -to_reading * self.warm[:, None, None]
-        return _Directions(u, force / STANDARD_GRAVITY, to, to_reading, A)
+        return _Directions(u, force / STANDARD_GRAVITY, flat @ to, flat @ M, M)
 
 
 class _Way:
@@ -245,7 +294,7 @@ class _Way:
         offset = theta[accelerometer.BIAS] + warm * accelerometer.thermal_of(theta)
         force = (turn.accel - offset) @ at.matrix.T / STANDARD_GRAVITY
         clean = turn.gyro - own[BIAS] - own[THERMAL] * warm - force @ own[G].reshape(3, 3).T
-        self.matrix, self.dt = gyro_matrix(own), turn.dt
+        self.matrix, self.dt, self.unsure = gyro_matrix(own), turn.dt, turn.unsure
         self.Q, back = turned(clean @ self.matrix.T, turn.dt)
         weight = np.full(len(clean), turn.dt)
         weight[[0, -1]] *= 0.5
@@ -270,7 +319,7 @@ class _Way:
     def white(self, density: Array) -> Array:
         """Covariance [2, 2] of the residual by white noise within the turn, N^2 of each gyro [3]."""
         noisy = self.slope @ self.P @ self.matrix
-        found: Array = np.einsum("kij,j,klj->il", noisy, density / self.dt, noisy)
+        found: Array = np.einsum("kij,kj,klj->il", noisy, density / self.dt + self.unsure, noisy)
         return found
 
 
@@ -280,9 +329,9 @@ def _across(u: Array) -> Array:
     return found
 
 
-def causes(gyro: Gyroscope, rests: Sequence[Rest]) -> list[tuple[str, float]]:
+def causes(gyro: Gyroscope, tumble: Tumble) -> list[tuple[str, float]]:
     """Causes of residuals beyond their sd, as `Fit.surest` has them: each rest and each turn by itself."""
-    one = np.eye(gyro.fit.white.size)
+    one, rests = np.eye(gyro.fit.white.size), tumble.rests
     tried = [
         (f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", one[:, 3 * k : 3 * k + 3])
         for k, rest in enumerate(rests)
