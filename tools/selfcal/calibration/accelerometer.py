@@ -1,7 +1,7 @@
 """Accelerometers: f = T K (a - b - c (temp - reference)), |f| = g, T unit upper triangular, K diagonal.
 
-Parameters [10, 13 with a temperature]: b x y z [m/s^2], K x y z, T xy xz yz [rad], the relative error of g, c x y z
-[m/s^2/degC]. A residual is |f| - g; the noise of its mean acts through (T K)^T f / |f|.
+Parameters [13]: b x y z [m/s^2], K x y z, T xy xz yz [rad], the relative error of g, c x y z [m/s^2/degC]. A residual
+is |f| - g; the noise of its mean acts through (T K)^T f / |f|.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.calibration.earth import Place
-from selfcal.calibration.fit import FALSE_ALARM, Fit, Problem, fit, linearized
+from selfcal.calibration.fit import FALSE_ALARM, Fit, Problem, fit
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import ACCEL, REST_S, Tumble
 
@@ -29,6 +29,8 @@ SQUARE_SD = 3e-5
 BIAS, SCALE, ANGLE, GRAVITY, THERMAL = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 2))
+#: sd of a parameter that the logs do not have.
+NONE = 1e-12
 #: A parameter beyond so many sd of its prior is none of an accelerometer.
 REACH = 10.0
 #: Rests without which there is no answer.
@@ -37,13 +39,11 @@ FEWEST = 3
 
 @dataclass(frozen=True)
 class Accelerometer:
-    """The answer: its fit, the rests that it is of, gravity, and the temperatures [n] about their mean, degC."""
+    """The answer: its fit, the rests that it is of, and gravity."""
 
     fit: Fit
     tumble: Tumble
     place: Place
-    warmth: Array
-    reference_s: float
 
     @property
     def matrix(self) -> Array:
@@ -57,8 +57,8 @@ class Accelerometer:
     def refitted(self, held: Mask) -> Fit:
         """The fit with some parameters [n], and squares of the scale, held at 0 error: what a format cannot state. So
         it comes nearest at 1 g."""
-        problem, mean, prior = _problem(self.tumble, self.place, self.warmth, self.reference_s, 0.0)
-        return fit(problem, mean, mean, prior, held)
+        mean, prior = _prior(self.tumble, self.place)
+        return fit(_problem(self.tumble, self.place, 0.0), mean, mean, prior, held)
 
 
 def shaped(scale: Array, angles: Array, places: Sequence[tuple[int, int]]) -> Array:
@@ -73,52 +73,36 @@ def matrix_of(theta: Array) -> Array:
     return shaped(theta[SCALE], theta[ANGLE], PLACES)
 
 
-def thermal_of(theta: Array) -> Array:
-    """c [3] of parameters; 0 where they have none."""
-    return theta[THERMAL] if theta.size > THERMAL.start else np.zeros(3)
-
-
-def warmth_of(tumble: Tumble) -> Array:
-    """Temperatures of the rests [n] about their mean, degC; empty where not all of them have one."""
-    temp = np.array([one.temp for one in tumble.rests])
-    return temp - temp.mean() if np.isfinite(temp).all() else np.zeros(0)
-
-
-def means_covariance(
-    tumble: Tumble, axis: int, name: str, reference_s: float, bias: float, square_sd: float = SQUARE_SD
-) -> Array:
+def means_covariance(tumble: Tumble, axis: int, bias: float, square_sd: float = SQUARE_SD) -> Array:
     """Covariance [n, n] of an axis' means of the rests: drift, white noise, rounding, a square beyond the `bias`."""
-    noise = tumble.noise[name]
+    noise = tumble.noise[ACCEL[axis]]
     own = np.array([noise.white / one.seconds + one.rounded[axis] for one in tumble.rests])
-    square = square_sd * (np.array([one.accel[axis] for one in tumble.rests]) - bias) ** 2
-    return drift(noise, tumble.begin_s, tumble.end_s, reference_s) + np.diag(own) + np.outer(square, square)
+    square = square_sd * (tumble.accel[:, axis] - bias) ** 2
+    return drift(noise, tumble.begin_s, tumble.end_s, tumble.reference_s) + np.diag(own) + np.outer(square, square)
 
 
 def forces(theta: Array, a: Array, warm: Array) -> tuple[Array, Array, Array]:
     """Specific force [n, 3], m/s^2, of readings [n, 3] at temperatures [n] about the mean, and its derivatives to the
-    parameters [n, 3, k] and to the readings [3, 3]."""
+    parameters [n, 3, 13] and to the readings [3, 3]."""
     M = matrix_of(theta)
-    x = a - theta[BIAS] - warm[:, None] * thermal_of(theta)
-    to = np.zeros((len(a), 3, theta.size))
-    to[:, :, BIAS], to[:, :, SCALE] = -M, M / theta[SCALE] * x[:, None, :]
+    x = a - theta[BIAS] - warm[:, None] * theta[THERMAL]
+    to = np.zeros((len(a), 3, THERMAL.stop))
+    to[:, :, BIAS], to[:, :, SCALE], to[:, :, THERMAL] = -M, M / theta[SCALE] * x[:, None, :], -M * warm[:, None, None]
     for k, (row, column) in enumerate(PLACES):
         to[:, row, ANGLE.start + k] = x[:, column] * theta[SCALE][column]
-    if theta.size > THERMAL.start:
-        to[:, :, THERMAL] = -M * warm[:, None, None]
     return x @ M.T, to, M
 
 
-def _problem(
-    tumble: Tumble, place: Place, warmth: Array, reference_s: float, square_sd: float = SQUARE_SD
-) -> tuple[Problem, Array, Array]:
-    """The fit's problem, the prior's mean and its covariance."""
-    a = np.array([one.accel for one in tumble.rests])
-    thermal = warmth.size > 0
-    sd = np.repeat([BIAS_SD, SCALE_SD, ANGLE_SD], 3)
-    sd = np.concatenate([sd, [max(place.sd / place.gravity, 1e-9)], np.full(3 * thermal, THERMAL_SD)])
-    mean = np.zeros(sd.size)
-    mean[SCALE] = 1.0
-    warm = warmth if thermal else np.zeros(len(a))
+def _prior(tumble: Tumble, place: Place) -> tuple[Array, Array]:
+    """The prior's mean and covariance."""
+    thermal = THERMAL_SD if tumble.has_temp else 0.0
+    sd = np.repeat([BIAS_SD, SCALE_SD, ANGLE_SD, place.sd / place.gravity, thermal], [3, 3, 3, 1, 3])
+    return np.repeat([0.0, 1.0, 0.0], [3, 3, 7]), np.diag(np.maximum(sd, NONE) ** 2)
+
+
+def _problem(tumble: Tumble, place: Place, square_sd: float = SQUARE_SD) -> Problem:
+    """The fit's problem."""
+    a, warm = tumble.accel, tumble.warmth
 
     def problem(theta: Array) -> tuple[Array, Array, Array]:
         f, to, M = forces(theta, a, warm)
@@ -126,13 +110,11 @@ def _problem(
         u = f / size[:, None]
         w, J = u @ M, np.einsum("ni,nik->nk", u, to)
         J[:, GRAVITY] = -place.gravity
-        R = sum(
-            np.outer(w[:, k], w[:, k]) * means_covariance(tumble, k, name, reference_s, float(theta[k]), square_sd)
-            for k, name in enumerate(ACCEL)
-        )
-        return size - place.gravity * (1.0 + theta[GRAVITY]), J, np.asarray(R)
+        cov = [means_covariance(tumble, k, float(theta[k]), square_sd) for k in range(3)]
+        R = np.einsum("ik,jk,kij->ij", w, w, np.array(cov))
+        return size - place.gravity * (1.0 + theta[GRAVITY]), J, R
 
-    return problem, mean, np.diag(sd**2)
+    return problem
 
 
 def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
@@ -142,19 +124,11 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
             f"{len(tumble.rests)} rests found, {FEWEST} are needed: rest the part {REST_S:g} s or longer in each of "
             "six positions or more"
         )
-    warmth = warmth_of(tumble)
-    reference_s = float(tumble.end_s.max())
-
-    def problem_of(known: Tumble) -> tuple[Problem, Array, Array]:
-        return _problem(known, place, warmth, reference_s)
-
-    problem, mean, prior = problem_of(tumble.narrowed(ACCEL))
-    near = fit(problem, mean, mean, prior).theta if tumble.wide(ACCEL) else mean
-    tumble = tumble.weighed(ACCEL, lambda known: linearized(problem_of(known)[0], near, mean, prior).evidence)
-    found = Accelerometer(fit(problem_of(tumble)[0], near, mean, prior), tumble, place, warmth, reference_s)
-    apart = found.fit.theta[: THERMAL.start] - np.repeat([0.0, 1.0, 0.0], [3, 3, 4])
-    if np.abs(apart[:9] / np.sqrt(np.diag(found.fit.prior)[:9])).max() > REACH:
-        bias, scale = (", ".join(f"{one:.3g}" for one in found.fit.theta[part]) for part in (BIAS, SCALE))
+    mean, prior = _prior(tumble, place)
+    found = Accelerometer(*tumble.fitted(ACCEL, lambda known: _problem(known, place), mean, mean, prior), place)
+    theta = found.fit.theta
+    if (np.abs(theta - mean) > REACH * np.sqrt(np.diag(prior)))[:GRAVITY].any():
+        bias, scale = (", ".join(f"{one:.3g}" for one in theta[part]) for part in (BIAS, SCALE))
         raise UserError(
             f"the accelerometers would have biases of {bias} m/s^2 and scales of {scale}: are the readings in the unit "
             "of their headings, and did the part rest?"
@@ -166,10 +140,8 @@ def causes(found: Accelerometer) -> list[tuple[str, float]]:
     """Causes of residuals beyond their sd, as `Fit.surest` has them: a square, hysteresis, each rest by itself; before
     them rests in which the mount moved."""
     tumble, one = found.tumble, found.fit
-    a = np.array([rest.accel for rest in tumble.rests])
-    count = len(a)
-    u = found.force(a, found.warmth if found.warmth.size else np.zeros(count)) / found.place.gravity
-    w = u @ found.matrix / found.place.gravity
+    a, count = tumble.accel, len(tumble.rests)
+    w = found.force(a, tumble.warmth) @ found.matrix / found.place.gravity**2
     before = np.vstack([np.zeros(3), a[:-1]])
     tried = [
         ("a square of the scale: the axes are not linear", w * a**2),

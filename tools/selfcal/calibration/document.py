@@ -49,7 +49,7 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
         "recordings": [recording_entry(one) for one in recordings],
         "gravity": {"value": place.gravity, "sd": place.sd, "unit": "m/s^2", "source": place.words},
         "earth_rate_known": place.vertical is not None,
-        "bias_at_s": accel.reference_s,
+        "bias_at_s": accel.tumble.reference_s,
         "noise": {
             name: {"N": math.sqrt(one.white), "unit": _density(name), "drift": one.words}
             for name, one in tumble.noise.items()
@@ -111,9 +111,9 @@ def _thermal(
     accel: Accelerometer, fit: Fit, start: int, names: Sequence[str], unit: str, size: float
 ) -> dict[str, Any]:
     """Temperature coefficients, where the logs have a temperature."""
-    if not accel.warmth.size:
+    if not accel.tumble.has_temp:
         return {}
-    mean = float(np.mean([one.temp for one in accel.tumble.rests]))
+    mean = float(accel.tumble.temp.mean())
     entries = {name: _entry(fit, start + k, unit, size) for k, name in enumerate(names)}
     return {"temperature": entries, "bias_at_degC": mean}
 
@@ -132,9 +132,7 @@ def _adequacy(fit: Fit, causes: Sequence[tuple[str, float]]) -> dict[str, Any]:
 def _rests(accel: Accelerometer) -> list[dict[str, Any]]:
     """Rests with the side that is up, and the residual of |f| with its sd."""
     tumble, fit = accel.tumble, accel.fit
-    a = np.array([one.accel for one in tumble.rests])
-    warm = accel.warmth if accel.warmth.size else np.zeros(len(a))
-    f = accel.force(a, warm)
+    f = accel.force(tumble.accel, tumble.warmth)
     size = np.linalg.norm(f, axis=1)
     residual = size - accel.place.gravity * (1.0 + fit.theta[accelerometer.GRAVITY])
     sd = np.sqrt(np.diag(fit.root @ fit.root.T))
@@ -210,8 +208,7 @@ def _turns(gyro: Gyroscope, tumble: Tumble) -> list[str]:
 def _told_of_turns(accel: Accelerometer) -> list[str]:
     """Turns that are left out, and those that tell little."""
     tumble, told = accel.tumble, []
-    a = np.array([one.accel for one in tumble.rests])
-    f = accel.force(a, accel.warmth if accel.warmth.size else np.zeros(len(a)))
+    f = accel.force(tumble.accel, tumble.warmth)
     u = f / np.linalg.norm(f, axis=1)[:, None]
     for one in tumble.turns:
         where = f"turn of {tumble.rests[one.first].at_s[1]:.6g} to {tumble.rests[one.first + 1].at_s[0]:.6g} s"

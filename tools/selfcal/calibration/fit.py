@@ -53,33 +53,27 @@ class Fit:
         """Sum of squares of the residuals and the prior."""
         return float(self.white @ self.white) + self.pulled
 
+    def _informed(self, least: float) -> tuple[Array, Array]:
+        """The prior's factor [n, n], and the information in its units, with `least` of the prior's own."""
+        factor = np.asarray(np.linalg.cholesky(self.prior), float)
+        seen = self.columns @ factor
+        return factor, seen.T @ seen + least * np.eye(len(factor))
+
     @property
     def evidence(self) -> float:
         """ln of the likelihood under the prior, but for a constant (Laplace), at the end of the step."""
-        factor = np.linalg.cholesky(self.prior)
-        seen = self.columns @ factor
-        size = float(np.linalg.slogdet(np.eye(factor.shape[0]) + seen.T @ seen)[1])
-        noise = 2.0 * float(np.log(np.diag(self.root)).sum())
-        return -0.5 * (self.squares - self.gain + noise + size)
+        size = float(np.linalg.slogdet(self._informed(1.0)[1])[1])
+        return -0.5 * (self.squares - self.gain + 2.0 * float(np.log(np.diag(self.root)).sum()) + size)
 
     def widened(self) -> Array:
         """The covariance [n, n] were every prior WIDER times as wide: no parameter is known by another's prior."""
-        factor = np.linalg.cholesky(self.prior)
-        seen = self.columns @ factor
-        found: Array = factor @ np.linalg.inv(seen.T @ seen + np.eye(factor.shape[0]) / WIDER**2) @ factor.T
-        return found
-
-    @property
-    def left(self) -> Array:
-        """Share of each prior variance that the data alone leave [n]."""
-        left: Array = np.diag(self.widened()) / np.diag(self.prior)
-        return left
+        factor, information = self._informed(WIDER**-2)
+        return np.asarray(factor @ np.linalg.inv(information) @ factor.T)
 
     @property
     def identified(self) -> Mask:
-        """[n]."""
-        found: Mask = self.left <= IDENTIFIED
-        return found
+        """Whether the data alone leave a small share of each prior variance [n]."""
+        return np.asarray(np.diag(self.widened()) <= IDENTIFIED * np.diag(self.prior))
 
     @property
     def free(self) -> float:
@@ -107,17 +101,11 @@ class Fit:
         for said, columns in tried:
             own = slice(first, first + columns.shape[1])
             first = own.stop
-            explained, count = _explained(more[:, own].T @ apart[:, own], apart[:, own].T @ self.white)
+            normal, pull = more[:, own].T @ apart[:, own], apart[:, own].T @ self.white
+            explained = float(pull @ np.linalg.pinv(normal, 1e-9, hermitian=True) @ pull)
+            count = max(int(np.linalg.matrix_rank(normal, hermitian=True)), 1)
             found.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
         return [(said, min(1.0, p)) for p, _, said in sorted(found) if p < FALSE_ALARM]
-
-
-def _explained(normal: Array, pull: Array) -> tuple[float, int]:
-    """The sum of squares that columns with normal equations [k, k] and right sides [k] take, and how many count."""
-    values, vectors = np.linalg.eigh(normal)
-    kept = values > 1e-9 * max(float(values.max()), 1e-300)
-    along = vectors[:, kept].T @ pull
-    return float((along**2 / values[kept]).sum()), max(int(kept.sum()), 1)
 
 
 def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:

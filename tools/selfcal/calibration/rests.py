@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,6 +14,7 @@ from scipy.stats import chi2
 from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, runs
 from selfcal.base.units import factor
+from selfcal.calibration.fit import Fit, Mask, Problem, fit, linearized
 from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
@@ -99,50 +100,77 @@ class Tumble:
         """With these shares [terms] of the wide drift of axes."""
         return replace(self, noise={**self.noise, **{name: self.noise[name].scaled(shares) for name in names}})
 
-    def narrowed(self, names: Sequence[str]) -> Tumble:
-        """With the wide drift of axes at the middle of its shares."""
-        return self.with_drift(names, np.full(self.wide(names), SHARES[SHARES.size // 2]))
+    def fitted(
+        self, names: Sequence[str], problem_of: Callable[[Tumble], Problem], start: Array, mean: Array, prior: Array,
+        held: Mask | None = None,
+    ) -> tuple[Fit, Tumble]:  # fmt: skip
+        """The fit, and the tumble with the wide drift of axes as this log has it: posterior means of the variances of
+        its terms. Before, each term by itself is as likely, and its deviation uniform. A prior of its logarithm would
+        be decided by the least of SHARES, which no log contradicts (Gelman 2006). A rest in which the mount moved is
+        no drift's: none counts for more than RESTLESS."""
+        known, count = self, self.wide(names)
+        if count:
+            middle = self.with_drift(names, np.full(count, SHARES[SHARES.size // 2]))
+            start = fit(problem_of(middle), start, mean, prior, held).theta
+            tried = [[self.with_drift(names, share * one) for share in SHARES] for one in np.eye(count)]
+            within = np.array([[one.within(names) for one in row] for row in tried])
+            likely = np.maximum(within - within.max(axis=(0, 1)), -RESTLESS).sum(axis=2)
+            likely += [[linearized(problem_of(one), start, mean, prior, held).evidence for one in row] for row in tried]
+            weight = np.sqrt(SHARES) * np.exp(likely - likely.max())
+            known = self.with_drift(names, weight @ SHARES / weight.sum())
+        return fit(problem_of(known), start, mean, prior, held), known
 
-    def weighed(self, names: Sequence[str], evidence_of: Callable[[Tumble], float]) -> Tumble:
-        """With the wide drift of axes as this log has it: posterior means of the variances of its terms. Before, each
-        term by itself is as likely, and its deviation uniform. A prior of its logarithm would be decided by the least
-        of SHARES, which no log contradicts (Gelman 2006). `evidence_of`: ln of the likelihood of the residuals. A rest
-        in which the mount moved is no drift's: none counts for more than RESTLESS."""
-        count = self.wide(names)
-        if not count:
-            return self
-        tried = [[self.with_drift(names, share * one) for share in SHARES] for one in np.eye(count)]
-        within = np.array([[one.within(names) for one in row] for row in tried])
-        likely = np.maximum(within - within.max(axis=(0, 1)), -RESTLESS).sum(axis=2)
-        likely += np.array([[evidence_of(one) for one in row] for row in tried])
-        weight = np.sqrt(SHARES) * np.exp(likely - likely.max())
-        return self.with_drift(names, weight @ SHARES / weight.sum())
+    def _pieces(self, names: Sequence[str]) -> Iterator[tuple[int, Array, Array]]:
+        """Of each rest and axis the number of the rest, its pieces [PIECES], and their covariance but for what they
+        share."""
+        for k, name in enumerate(ACCEL + GYRO):
+            for n, one in enumerate(self.rests if name in names else ()):
+                edges = np.linspace(one.begin_s, one.end_s, PIECES + 1)
+                C = drift(self.noise[name], edges[:-1], edges[1:], one.end_s)
+                white = self.noise[name].white * PIECES / one.seconds + one.rounded[k]
+                if np.isfinite(one.pieces[:, k]).all():
+                    yield n, one.pieces[:, k], C + white * np.eye(PIECES)
 
     def within(self, names: Sequence[str]) -> Array:
         """ln of the likelihood of the differences between neighbouring pieces of each rest [n], but for a constant."""
         found, step = np.zeros(len(self.rests)), np.diff(np.eye(PIECES), axis=0)
-        for k, name in enumerate(ACCEL + GYRO):
-            for n, one in enumerate(self.rests if name in names else ()):
-                d, C = step @ one.pieces[:, k], step @ self._of_pieces(name, one, one.rounded[k]) @ step.T
-                if np.isfinite(d).all():
-                    found[n] -= 0.5 * float(d @ np.linalg.solve(C, d) + np.linalg.slogdet(C)[1])
+        for n, x, C in self._pieces(names):
+            d, R = step @ x, step @ C @ step.T
+            found[n] -= 0.5 * float(d @ np.linalg.solve(R, d) + np.linalg.slogdet(R)[1])
         return found
 
     def moved(self, names: Sequence[str]) -> Array:
         """Probability [n] that the halves of each rest are so far apart by chance, times the number of rests."""
-        square, halves = np.zeros(len(self.rests)), np.repeat([[-1.0, 1.0]], PIECES // 2) / (PIECES // 2)
-        for k, name in enumerate(ACCEL + GYRO):
-            for n, one in enumerate(self.rests if name in names else ()):
-                variance = float(halves @ self._of_pieces(name, one, one.rounded[k]) @ halves)
-                square[n] += np.nan_to_num(halves @ one.pieces[:, k]) ** 2 / variance
-        found: Array = len(self.rests) * chi2.sf(square, len(names))
-        return found
+        square, halves = np.zeros(len(self.rests)), np.repeat([-1.0, 1.0], PIECES // 2)
+        for n, x, C in self._pieces(names):
+            square[n] += float((halves @ x) ** 2 / (halves @ C @ halves))
+        return np.asarray(len(self.rests) * chi2.sf(square, len(names)))
 
-    def _of_pieces(self, name: str, rest: Rest, rounded: float) -> Array:
-        """Covariance of the pieces of a rest, but for what they share."""
-        edges = np.linspace(rest.begin_s, rest.end_s, PIECES + 1)
-        white = self.noise[name].white * PIECES / rest.seconds + rounded
-        return drift(self.noise[name], edges[:-1], edges[1:], rest.end_s) + white * np.eye(PIECES)
+    @property
+    def accel(self) -> Array:
+        """Means [n, 3] of the accelerometers, m/s^2."""
+        return np.array([one.accel for one in self.rests])
+
+    @property
+    def temp(self) -> Array:
+        """[n], degC; 0 where not all rests have one."""
+        temp = np.array([one.temp for one in self.rests])
+        return temp if np.isfinite(temp).all() else np.zeros(temp.size)
+
+    @property
+    def has_temp(self) -> bool:
+        """All rests have a temperature."""
+        return all(math.isfinite(one.temp) for one in self.rests)
+
+    @property
+    def warmth(self) -> Array:
+        """Temperatures [n] about their mean, degC."""
+        return np.asarray(self.temp - self.temp.mean())
+
+    @property
+    def reference_s(self) -> float:
+        """When the bias is to be known: the end of the last rest, s."""
+        return float(self.end_s.max())
 
     @property
     def begin_s(self) -> Array:
