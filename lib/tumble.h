@@ -26,8 +26,8 @@
  *
  * Units: m/s^2, rad/s, s, rad, rad/s per m/s^2. The arithmetic is in selfcal_wide_t: weights of a drift that is large
  * against the noise lose float's digits. Results are right to 1e-4 of their standard deviation.
- * Cortex-M4F: 5.8 KB of flash beside the software doubles, 1.4 KB of stack; 6 million instructions of 12 rests, 20 of
- * 24, 70 with a Gauss-Markov drift. It fits a Cortex-M0 too.
+ * Cortex-M4F: 5.9 KB of flash beside the software doubles, 1.4 KB of stack; 10 million instructions of 12 rests, 36 of
+ * 24, 105 with a Gauss-Markov drift. It fits a Cortex-M0 too.
  * The gyros' scale and misalignment take the turns between the rests: `selfcal tumble` on the host. */
 #ifndef SELFCAL_TUMBLE_H
 #define SELFCAL_TUMBLE_H
