@@ -25,7 +25,7 @@ enum { ACCEL = SELFCAL_TUMBLE_ACCEL, GYRO = SELFCAL_TUMBLE_GYRO, ALL = 3, ROUNDS
 #define ANGLE_SD 0.02
 #define GYRO_BIAS_SD 0.17453292519943295
 #define G_SD (1.7453292519943296e-3 / 9.80665)
-#define SQUARE_SD 3e-5
+#define SQUARE_SD 5e-5
 #define LEFT 0.2
 #define WIDER 8.0
 /* The last step, in units of the prior's sd. A mean beyond `LARGEST` is no reading. */

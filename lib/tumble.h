@@ -18,7 +18,7 @@
  *         y = b + G f + the Earth's rate at rest.
  * The sign of f is not seen by |f|: where a side that points up reads -1 g, take all three readings times -1.
  * A rest is a mean: N^2 / length, and the drift since the end of the last rest, where the bias is to be known. A square
- * of the scale, 3e-5 s^2/m (sd), is in the intervals. The fit is Gauss-Newton on |f| - gravity, weighted by the inverse
+ * of the scale, 5e-5 s^2/m (sd), is in the intervals. The fit is Gauss-Newton on |f| - gravity, weighted by the inverse
  * of that covariance. Its priors, in sd: bias 0.98 m/s^2 and 10 deg/s, scale 2 %, angle 20 mrad, g-sensitivity 0.1
  * deg/s/g. A parameter is identified if the data, with priors eight times as wide, leave 0.2 of its prior variance at
  * most. Six flats within a degree identify bias and scale; an edge in each plane adds the angles. Three rests, or equal

@@ -144,25 +144,25 @@ static void few_positions_have_the_bias_of_the_gyros(void) {
     }
 }
 
-/* Squares of 0.3 mg at 1 g: the intervals of the bias hold them, and corrected flats are near 1 g. */
+/* Squares of 0.5 mg at 1 g: the intervals of the bias hold them, and corrected flats are near 1 g. */
 static void a_square_is_in_the_intervals(void) {
     for (unsigned n = 0; n < TWELVE; n++) {
         for (unsigned i = 0; i < 3U; i++) {
             const float x = rests[n].mean[i] - (float)bias[i];
-            rests[n].mean[i] += (i == 1U ? -3e-5F : 3e-5F) * x * x;
+            rests[n].mean[i] += (i == 1U ? -5e-5F : 5e-5F) * x * x;
         }
     }
     TEST_ASSERT_EQUAL(SELFCAL_TUMBLE_OK, selfcal_tumble(&found, &part, rests, TWELVE, &work));
     for (unsigned i = 0; i < 3U; i++) {
         const float sd = selfcal_tumble_accel_sd(&found, (uint8_t)i);
         TEST_ASSERT_FLOAT_WITHIN(2.0F * sd, (float)bias[i], (float)found.accel[i]);
-        TEST_ASSERT_TRUE(sd < 3e-3F);
+        TEST_ASSERT_TRUE(sd < 5e-3F);
     }
-    for (unsigned n = 0; n < 6U; n++) { /* 3e-5 x^2 is 2.9e-3 */
+    for (unsigned n = 0; n < 6U; n++) { /* 5e-5 x^2 is 4.8e-3 */
         float corrected[6];
         selfcal_tumble_apply(&found, rests[n].mean, corrected);
         const float *f = corrected;
-        TEST_ASSERT_FLOAT_WITHIN(1.5e-3F, (float)gravity, sqrtf(f[0] * f[0] + f[1] * f[1] + f[2] * f[2]));
+        TEST_ASSERT_FLOAT_WITHIN(2.4e-3F, (float)gravity, sqrtf(f[0] * f[0] + f[1] * f[1] + f[2] * f[2]));
     }
 }
 
