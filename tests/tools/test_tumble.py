@@ -374,6 +374,15 @@ def test_a_clipped_axis_is_left_out_and_named() -> None:
     assert len(clipped) == 6 and len(document["rests"]) == 18
 
 
+def test_a_rest_without_an_axis_is_left_out_and_named(twelve: tuple[Recording, Truth]) -> None:
+    begin, end = twelve[1].rests[4]
+    gone = (twelve[0].time_s > begin - 0.3) & (twelve[0].time_s < end + 0.3)
+    lost = with_columns(twelve[0], lambda name, values: np.where(gone & (name == "ay"), math.nan, values))
+    document = selfcal.tumble(lost, gravity=G0)
+    assert sum("more than half of its samples of ay are missing" in one for one in document["notes"]) >= 1
+    assert len(document["rests"]) == 11 and all(of(document, "accelerometer", "bias").values())
+
+
 def test_a_turn_that_clips_is_left_out_and_named() -> None:
     random = np.random.default_rng(25)
     part = draw_part(random, gyro_limit=math.radians(88.0))

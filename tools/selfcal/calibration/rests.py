@@ -213,7 +213,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
         raise UserError(f"more than {MOST} rests: choose a stretch with --start and --end")
     ranges = {name: _range(model, name) if part_stated else math.inf for name in axes}
     typical = {
-        name: _median([float(np.nanstd(log.own[name][rows])) for log in logs for rows in log.rests]) for name in axes
+        name: _median([float(np.std(log.bridged[name][rows])) for log in logs for rows in log.rests]) for name in axes
     }
     rests: list[Rest] = []
     turns: list[Turn] = []
@@ -222,7 +222,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
         end = -1  # the row behind the rest before, if that one counts
         for rows in log.rests:
             rest = _rest(k, log, rows)
-            if reason := _clipped_at_rest(log, rows, ranges, typical):
+            if reason := _unfit(log, rows, ranges, typical):
                 where = f"{recordings[k].path}, " if len(logs) > 1 else ""
                 left_out.append(f"rest of {where}{rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s: {reason}")
                 end = -1
@@ -261,7 +261,7 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
         end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in found.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
-        if end - begin >= LEAST_S and behind - first > 2:
+        if end - begin >= LEAST_S and behind - first >= PIECES:
             rests.append(slice(first, behind))
     return _Log(recording, begin_s, own, bridged, steps, temp, tuple(rests))
 
@@ -322,12 +322,13 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     cut = np.linspace(rows.start, rows.stop, PIECES + 1).astype(int).tolist()
 
     def means(names: tuple[str, ...], part: slice) -> Array:
-        return np.array([np.nanmean(own[name][part]) if name in own else math.nan for name in names])
+        known = [own[name][part][np.isfinite(own[name][part])] if name in own else np.zeros(0) for name in names]
+        return np.array([one.mean() if one.size else math.nan for one in known])
 
     rounded = []
     for name in ACCEL + GYRO:
         step = log.steps.get(name, 0.0)
-        scatter = float(np.nanvar(own[name][rows])) if name in own else 0.0
+        scatter = float(np.var(log.bridged[name][rows])) if name in own else 0.0
         rounded.append(rounding(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
     begin, end = float(time[rows.start]), float(time[rows.stop - 1]) + 1.0 / recording.rate_hz
     return Rest(
@@ -344,8 +345,11 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     )
 
 
-def _clipped_at_rest(log: _Log, rows: slice, ranges: dict[str, float], typical: dict[str, float]) -> str:
-    """Why a rest does not count: an axis at its range, or without the scatter that it has in the other rests."""
+def _unfit(log: _Log, rows: slice, ranges: dict[str, float], typical: dict[str, float]) -> str:
+    """Why a rest does not count: an axis that is lost, at its range, or without its scatter of the other rests."""
+    for name, values in log.own.items():
+        if 2 * np.isfinite(values[rows]).sum() < rows.stop - rows.start:
+            return f"more than half of its samples of {name} are missing"
     for name in ACCEL:
         part = log.own[name][rows]
         stuck = typical[name] > 0.5 * log.steps[name] and not np.nanstd(part) > 0.0
