@@ -469,12 +469,13 @@ def test_a_gyro_at_fault_is_named(matrix: Array, said: str, tmp_path: Path) -> N
     assert "gyroscope" not in yaml.safe_load((tmp_path / "calibration.yaml").read_text())
 
 
-def test_two_gyros_have_bias_and_sensitivity(twelve: tuple[Recording, Truth]) -> None:
+def test_two_gyros_have_bias_and_sensitivity(twelve: tuple[Recording, Truth], tmp_path: Path) -> None:
     recording, truth = twelve
     document = selfcal.tumble(with_columns(recording, lambda name, v: None if name == "gy" else v), latitude=LATITUDE)
     assert of(document, "gyroscope", "bias") == {"gx": True, "gy": False, "gz": True}
     assert document["gyroscope"]["would_mend"] == ["a log with gy as well"]
     assert any("gy is not recorded" in one for one in document["notes"])
+    assert "bias gy" in exported("yaml", with_columns(recording, lambda name, v: None if name == "gy" else v), tmp_path)
     for k, name in ((0, "gx"), (2, "gz")):
         one = document["gyroscope"]["bias"][name]
         assert abs(one["median"] - math.degrees(truth.gyro_bias[k])) < 4.0 * one["sd"] < 0.02
