@@ -4,8 +4,9 @@
  * intervals apart from each other, with middles m and lengths L, a walk has K^2 min(m_i, m_j), on the diagonal
  * K^2 (end + L/3). A Gauss-Markov drift moves from there by m(t) - m(0), so it has
  *     sigma^2 (e(i, j) - e(i) - e(j) + 1),  e: means of exp(-alpha |t|) over the intervals.
- * The residual of a rest is |f| - g with derivatives J and the covariance R = sum over axes of w_i w_j C_ij, w = (T K)'
- * f / |f|. With R = L L', whitened columns L^-1 J and residuals L^-1 r, in units of the prior's sd, a step solves
+ * A square of the scale adds SQUARE_SD^2 x_i^2 x_j^2, x the reading without its bias. The residual of a rest is |f| - g
+ * with derivatives J and the covariance R = sum over axes of w_i w_j C_ij, w = (T K)' f / |f|. With R = L L', whitened
+ * columns L^-1 J and residuals L^-1 r, in units of the prior's sd, a step solves
  *     (J' J + 1) step = -(J' r + theta).
  * A gyro's mean is linear in its bias and its row of G. */
 #include "tumble.h"
@@ -16,7 +17,7 @@
 
 typedef selfcal_wide_t wide_t;
 
-enum { ACCEL = SELFCAL_TUMBLE_ACCEL, GYRO = SELFCAL_TUMBLE_GYRO, ROUNDS = 30, FEWEST = 3 };
+enum { ACCEL = SELFCAL_TUMBLE_ACCEL, GYRO = SELFCAL_TUMBLE_GYRO, ALL = 3, ROUNDS = 30, FEWEST = 3 };
 
 /* sd of the priors; variance that leaves a parameter unidentified, of priors so many times as wide. */
 #define BIAS_SD 0.98
@@ -24,6 +25,7 @@ enum { ACCEL = SELFCAL_TUMBLE_ACCEL, GYRO = SELFCAL_TUMBLE_GYRO, ROUNDS = 30, FE
 #define ANGLE_SD 0.02
 #define GYRO_BIAS_SD 0.17453292519943295
 #define G_SD (1.7453292519943296e-3 / 9.80665)
+#define SQUARE_SD 5e-5
 #define LEFT 0.2
 #define WIDER 8.0
 /* The last step, in units of the prior's sd. A mean beyond `LARGEST` is no reading. */
@@ -173,7 +175,7 @@ static uint16_t identified(const selfcal_tumble_work_t *work, size_t parameters,
     if (factorize(normal, parameters)) {
         invert(normal, parameters);
         for (size_t i = 0; i < parameters; i++) {
-            bits |= normal[packed(i, i)] <= LEFT ? (uint16_t)(1U << i) : (uint16_t)0U;
+            bits = (uint16_t)(bits | (unsigned)(normal[packed(i, i)] <= LEFT) << i);
         }
     }
     return bits;
@@ -212,52 +214,59 @@ static bool alike(const selfcal_tumble_noise_t *a, const selfcal_tumble_noise_t 
     return a->N == b->N && a->K == b->K && a->sigma_m == b->sigma_m && a->alpha == b->alpha;
 }
 
-/* Residuals, columns and covariance of the accelerometers at `theta`, in units of the prior's sd. */
-static void lay_accel(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], size_t count,
-                      const wide_t theta[ACCEL], selfcal_tumble_work_t *work) {
+/* Residual and columns of the accelerometers in rest `n`, with readings x without bias and the force f, in units of the
+ * prior's sd. */
+static void lay_accel(const wide_t theta[ACCEL], wide_t M[3][3], const wide_t x[3], const wide_t f[3], wide_t length,
+                      size_t n, selfcal_tumble_work_t *work) {
+    wide_t(*const column)[SELFCAL_TUMBLE_MAX] = work->column;
+    for (size_t i = 0; i < 3U; i++) {
+        const wide_t w = (f[0] * M[0][i] + f[1] * M[1][i] + f[2] * M[2][i]) / length;
+        column[i][n] = -w * BIAS_SD; /* -w, by which the means' noise enters */
+        column[3U + i][n] = w * x[i] / (1.0 + theta[3U + i] * SCALE_SD) * SCALE_SD;
+    }
+    const wide_t y = x[1] * (1.0 + theta[4] * SCALE_SD), z = x[2] * (1.0 + theta[5] * SCALE_SD);
+    column[6][n] = f[0] / length * y * ANGLE_SD;
+    column[7][n] = f[0] / length * z * ANGLE_SD;
+    column[8][n] = f[1] / length * z * ANGLE_SD;
+}
+
+/* Covariance of the accelerometers' residuals of rests i and j, with squares of the scale of this sd. */
+static wide_t accel_covariance(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], size_t i,
+                               size_t j, float end, const wide_t theta[ACCEL], wide_t square_sd,
+                               const selfcal_tumble_work_t *work) {
+    wide_t sum = 0.0, C = 0.0;
+    for (size_t axis = 0; axis < 3U; axis++) {
+        const selfcal_tumble_noise_t *noise = &part->noise[axis];
+        if (axis == 0U || !alike(noise, noise - 1)) { /* mostly all are alike */
+            C = covariance(noise, rests, i, j, end);
+        }
+        const wide_t a = (wide_t)rests[i].mean[axis] - theta[axis] * BIAS_SD;
+        const wide_t b = (wide_t)rests[j].mean[axis] - theta[axis] * BIAS_SD;
+        const wide_t square = square_sd * a * b;
+        sum += work->column[axis][i] * work->column[axis][j] * (C + square * square) / (BIAS_SD * BIAS_SD);
+    }
+    return sum;
+}
+
+/* Residuals, columns and covariance at `theta` of the accelerometers: those of a gyro `axis`, or of the accelerometers
+ * themselves at ALL. */
+static void lay(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], size_t count, size_t axis,
+                const wide_t theta[ACCEL], wide_t square_sd, selfcal_tumble_work_t *work) {
     wide_t M[3][3];
     matrix_of(theta, M);
     const float end = rests[count - 1U].end_s;
     for (size_t n = 0; n < count; n++) {
         wide_t x[3], f[3];
         const wide_t length = force_of(theta, M, &rests[n], x, f);
-        wide_t(*const column)[SELFCAL_TUMBLE_MAX] = work->column;
-        work->residual[n] = length - (wide_t)part->gravity;
-        for (size_t i = 0; i < 3U; i++) {
-            const wide_t w = (f[0] * M[0][i] + f[1] * M[1][i] + f[2] * M[2][i]) / length;
-            column[i][n] = -w * BIAS_SD; /* -w, by which the means' noise enters */
-            column[3U + i][n] = w * x[i] / (1.0 + theta[3U + i] * SCALE_SD) * SCALE_SD;
-        }
-        const wide_t y = x[1] * (1.0 + theta[4] * SCALE_SD), z = x[2] * (1.0 + theta[5] * SCALE_SD);
-        column[6][n] = f[0] / length * y * ANGLE_SD;
-        column[7][n] = f[0] / length * z * ANGLE_SD;
-        column[8][n] = f[1] / length * z * ANGLE_SD;
-    }
-    for (size_t i = 0; i < count; i++) {
-        for (size_t j = 0; j <= i; j++) {
-            wide_t sum = 0.0, C = 0.0;
-            for (size_t axis = 0; axis < 3U; axis++) {
-                const selfcal_tumble_noise_t *noise = &part->noise[axis];
-                if (axis == 0U || !alike(noise, noise - 1)) { /* mostly all are alike */
-                    C = covariance(noise, rests, i, j, end);
-                }
-                sum += work->column[axis][i] * work->column[axis][j] * C / (BIAS_SD * BIAS_SD);
+        if (axis == ALL) {
+            work->residual[n] = length - (wide_t)part->gravity;
+            lay_accel(theta, M, x, f, length, n, work);
+            for (size_t j = 0; j <= n; j++) {
+                work->factor[packed(n, j)] = accel_covariance(part, rests, n, j, end, theta, square_sd, work);
             }
-            work->factor[packed(i, j)] = sum;
+            continue;
         }
-    }
-}
-
-/* The same of a gyro, whose rests have the specific forces by `theta` of the accelerometers. */
-static void lay_gyro(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], size_t count, size_t axis,
-                     const wide_t theta[ACCEL], selfcal_tumble_work_t *work) {
-    wide_t M[3][3];
-    matrix_of(theta, M);
-    const float end = rests[count - 1U].end_s;
-    for (size_t n = 0; n < count; n++) {
-        wide_t x[3], f[3];
-        const wide_t up = force_of(theta, M, &rests[n], x, f);
-        const wide_t level = (wide_t)part->level, share = f[axis] / up;
+        const wide_t level = (wide_t)part->level, share = f[axis] / length;
         work->residual[n] = -((wide_t)rests[n].mean[3U + axis] - (wide_t)part->vertical * share);
         work->column[0][n] = GYRO_BIAS_SD;
         for (size_t i = 0; i < 3U; i++) {
@@ -321,64 +330,69 @@ static float ratio_of(const selfcal_tumble_work_t *work, size_t count, const wid
     return free > 0.5 ? (float)sqrt(sum / free) : NAN;
 }
 
-static selfcal_tumble_status_t fit_accel(selfcal_tumble_t *found, const selfcal_tumble_part_t *part,
-                                         const selfcal_tumble_rest_t rests[], size_t count, wide_t theta[ACCEL],
-                                         selfcal_tumble_work_t *work) {
-    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, M[3][3], far = 1.0;
+/* Steps of the accelerometers from `theta` until they settle; false if they do not, or end beyond the priors' reach. */
+static bool find_accel(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], size_t count,
+                       wide_t square_sd, wide_t theta[ACCEL], wide_t normal[], selfcal_tumble_work_t *work) {
+    wide_t far = 1.0;
     for (int round = 0; round < ROUNDS && far >= SETTLED; round++) {
-        lay_accel(part, rests, count, theta, work);
+        lay(part, rests, count, ALL, theta, square_sd, work);
         far = take_step(work, ACCEL, count, theta, normal);
     }
-    if (far < 0.0 || far >= SETTLED) {
-        return SELFCAL_TUMBLE_UNSETTLED;
-    }
+    bool sound = far >= 0.0 && far < SETTLED;
     for (size_t i = 0; i < ACCEL; i++) {
-        if (fabs(theta[i]) > REACH) {
-            return SELFCAL_TUMBLE_UNSETTLED;
+        sound = sound && fabs(theta[i]) <= REACH;
+    }
+    return sound;
+}
+
+/* Values and covariance of parameters in units of the prior's `sd`; NAN without its bit. */
+static void state(wide_t value[], float covariance_of[], const wide_t theta[], const wide_t normal[], const wide_t sd[],
+                  size_t parameters, uint16_t bits) {
+    for (size_t i = 0; i < parameters; i++) {
+        value[i] = (bits >> i & 1U) != 0U ? theta[i] * sd[i] : (wide_t)NAN;
+        for (size_t j = 0; j <= i; j++) {
+            covariance_of[packed(i, j)] = (float)(normal[packed(i, j)] * sd[i] * sd[j]);
         }
+    }
+}
+
+/* Parameters with intervals that have a square of the scale. `bias` and `matrix` come nearest at 1 g: without one. */
+static bool fit_accel(selfcal_tumble_t *found, const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[],
+                      size_t count, wide_t theta[ACCEL], selfcal_tumble_work_t *work) {
+    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, M[3][3], straight[ACCEL];
+    if (!find_accel(part, rests, count, SQUARE_SD, theta, normal, work)) {
+        return false;
     }
     found->accel_identified = identified(work, ACCEL, count);
-    if (found->accel_identified == 0U) {
-        return SELFCAL_TUMBLE_NOTHING;
-    }
     found->ratio = ratio_of(work, count, normal);
-    matrix_of(theta, M);
-    for (size_t i = 0; i < ACCEL; i++) {
-        const bool known = (found->accel_identified >> i & 1U) != 0U;
-        found->accel[i] = known ? theta[i] * accel_sd[i] : (wide_t)NAN;
-        for (size_t j = 0; j <= i; j++) {
-            found->accel_covariance[packed(i, j)] = (float)(normal[packed(i, j)] * accel_sd[i] * accel_sd[j]);
-        }
+    state(found->accel, found->accel_covariance, theta, normal, accel_sd, ACCEL, found->accel_identified);
+    memcpy(straight, theta, sizeof straight);
+    if (!find_accel(part, rests, count, 0.0, straight, normal, work)) {
+        return false;
     }
+    matrix_of(straight, M);
     for (size_t i = 0; i < 3U; i++) {
-        found->bias[i] = (float)(theta[i] * BIAS_SD);
+        found->bias[i] = (float)(straight[i] * BIAS_SD);
         for (size_t j = 0; j < 3U; j++) {
             found->matrix[i][j] = (float)M[i][j];
         }
     }
-    return SELFCAL_TUMBLE_OK;
+    return true;
 }
 
 static bool fit_gyro(selfcal_tumble_t *found, const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[],
                      size_t count, size_t axis, const wide_t accel[ACCEL], selfcal_tumble_work_t *work) {
     wide_t normal[GYRO * (GYRO + 1) / 2], theta[GYRO] = {0.0, 0.0, 0.0, 0.0};
-    lay_gyro(part, rests, count, axis, accel, work);
+    lay(part, rests, count, axis, accel, 0.0, work);
     if (take_step(work, GYRO, count, theta, normal) < 0.0) {
         return false;
     }
     const uint16_t bits = identified(work, GYRO, count);
-    found->gyro_identified |= (uint16_t)(bits << (GYRO * axis));
-    for (size_t i = 0; i < GYRO; i++) {
-        const wide_t value = theta[i] * gyro_sd[i];
-        found->gyro[axis][i] = (bits >> i & 1U) != 0U ? value : (wide_t)NAN;
-        for (size_t j = 0; j <= i; j++) {
-            found->gyro_covariance[axis][packed(i, j)] = (float)(normal[packed(i, j)] * gyro_sd[i] * gyro_sd[j]);
-        }
-        if (i == 0U) {
-            found->gyro_bias[axis] = (float)value;
-        } else {
-            found->G[axis][i - 1U] = (float)value;
-        }
+    found->gyro_identified = (uint16_t)(found->gyro_identified | (unsigned)bits << (GYRO * axis));
+    state(found->gyro[axis], found->gyro_covariance[axis], theta, normal, gyro_sd, GYRO, bits);
+    found->gyro_bias[axis] = (float)(theta[0] * GYRO_BIAS_SD);
+    for (size_t i = 0; i < 3U; i++) {
+        found->G[axis][i] = (float)(theta[1U + i] * G_SD);
     }
     return true;
 }
@@ -395,13 +409,13 @@ selfcal_tumble_status_t selfcal_tumble(selfcal_tumble_t *found, const selfcal_tu
     }
     wide_t theta[ACCEL] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0};
     selfcal_tumble_status_t status = check(part, rests, count);
-    if (status == SELFCAL_TUMBLE_OK) {
-        status = fit_accel(found, part, rests, count, theta, work);
+    bool sound = status == SELFCAL_TUMBLE_OK && fit_accel(found, part, rests, count, theta, work);
+    for (size_t axis = 0; axis < 3U && sound; axis++) {
+        sound = fit_gyro(found, part, rests, count, axis, theta, work);
     }
-    for (size_t axis = 0; axis < 3U && status == SELFCAL_TUMBLE_OK; axis++) {
-        if (!fit_gyro(found, part, rests, count, axis, theta, work)) {
-            status = SELFCAL_TUMBLE_UNSETTLED;
-        }
+    if (status == SELFCAL_TUMBLE_OK) {
+        const bool nothing = (found->accel_identified | found->gyro_identified) == 0U;
+        status = !sound ? SELFCAL_TUMBLE_UNSETTLED : nothing ? SELFCAL_TUMBLE_NOTHING : SELFCAL_TUMBLE_OK;
     }
     if (status != SELFCAL_TUMBLE_OK) {
         clear(found);

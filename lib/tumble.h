@@ -16,16 +16,18 @@
  *
  * Model:  f = T K (a - b),  |f| = gravity at rest;  T unit upper triangular (z keeps its axis), K diagonal.
  *         y = b + G f + the Earth's rate at rest.
- * A rest is a mean: N^2 / length, and the drift since the end of the last rest, where the bias is to be known. The fit
- * is Gauss-Newton on |f| - gravity, weighted by the inverse of that covariance. Its priors, in sd: bias 0.98 m/s^2 and
- * 10 deg/s, scale 2 %, angle 20 mrad, g-sensitivity 0.1 deg/s/g. A parameter is identified if the data, with priors
- * eight times as wide, leave 0.2 of its prior variance at most. Six flats identify bias and scale; an edge in each
- * plane adds the angles. A wrong gravity goes into the scales: no rest shows it.
+ * The sign of f is not seen by |f|: where a side that points up reads -1 g, take all three readings times -1.
+ * A rest is a mean: N^2 / length, and the drift since the end of the last rest, where the bias is to be known. A square
+ * of the scale, 5e-5 s^2/m (sd), is in the intervals. The fit is Gauss-Newton on |f| - gravity, weighted by the inverse
+ * of that covariance. Its priors, in sd: bias 0.98 m/s^2 and 10 deg/s, scale 2 %, angle 20 mrad, g-sensitivity 0.1
+ * deg/s/g. A parameter is identified if the data, with priors eight times as wide, leave 0.2 of its prior variance at
+ * most. Six flats within a degree identify bias and scale; an edge in each plane adds the angles. Three rests, or equal
+ * positions, may identify the gyros' bias alone. A wrong gravity goes into the scales: no rest shows it.
  *
  * Units: m/s^2, rad/s, s, rad, rad/s per m/s^2. The arithmetic is in selfcal_wide_t: weights of a drift that is large
  * against the noise lose float's digits. Results are right to 1e-4 of their standard deviation.
- * Cortex-M4F: 5.8 KB of flash beside the software doubles, 1.4 KB of stack; 6 million instructions of 12 rests, 20 of
- * 24, 70 with a Gauss-Markov drift. It fits a Cortex-M0 too.
+ * Cortex-M4F: 5.9 KB of flash beside the software doubles, 1.4 KB of stack; 10 million instructions of 12 rests, 36 of
+ * 24, 105 with a Gauss-Markov drift. It fits a Cortex-M0 too.
  * The gyros' scale and misalignment take the turns between the rests: `selfcal tumble` on the host. */
 #ifndef SELFCAL_TUMBLE_H
 #define SELFCAL_TUMBLE_H
@@ -53,7 +55,7 @@ typedef enum {
     SELFCAL_TUMBLE_TOO_FEW,      /* fewer than three rests */
     SELFCAL_TUMBLE_BAD_PART,     /* gravity, a noise or a drift that is none */
     SELFCAL_TUMBLE_BAD_REST,     /* a mean that is no number, or times that are not in order */
-    SELFCAL_TUMBLE_NOTHING,      /* no parameter is identified: equal positions */
+    SELFCAL_TUMBLE_NOTHING,      /* no parameter of accelerometers or gyros is identified */
     SELFCAL_TUMBLE_UNSETTLED /* the fit does not settle, or 10 sd off its priors: readings of another unit, no rests */
 } selfcal_tumble_status_t;
 
@@ -77,8 +79,8 @@ typedef struct {
 
 /* The result. Order of accelerometer parameters: bias x y z, scale less 1 x y z, angles xy xz yz; of a gyro's: bias, G
  * of x y z. Covariances are lower triangles by rows. Values that are not identified are NAN in `accel` and `gyro`.
- * `bias` and `matrix` are what selfcal_tumble_apply() takes: there a parameter that is not identified has its
- * likeliest value, near 0 error. */
+ * `bias` and `matrix` are what selfcal_tumble_apply() takes: the straight lines that come nearest at 1 g. There a
+ * parameter that is not identified has its likeliest value, near 0 error. */
 typedef struct {
     selfcal_wide_t accel[SELFCAL_TUMBLE_ACCEL], gyro[3][SELFCAL_TUMBLE_GYRO];
     float accel_covariance[45], gyro_covariance[3][10];

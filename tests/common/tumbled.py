@@ -28,7 +28,7 @@ EARTH = 7.292115e-5
 _EDGE = math.sqrt(0.5)
 FLATS = [(0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0)]
 EDGES = [(_EDGE, _EDGE, 0), (_EDGE, -_EDGE, 0), (_EDGE, 0, _EDGE), (-_EDGE, 0, _EDGE), (0, _EDGE, _EDGE)]
-EDGES += [(0, -_EDGE, _EDGE)]
+EDGES += [(0, _EDGE, -_EDGE)]
 #: Edges without the y-z plane.
 FOUR_EDGES = EDGES[:4]
 _CORNER = math.sqrt(1.0 / 3.0)
@@ -56,7 +56,7 @@ class Part:
     alpha: float = 1.0 / 150.0
     lsb: tuple[float, float] = (0.0, 0.0)
     thermal: tuple[float, float] = (0.0, 0.0)  # m/s^2/degC, rad/s/degC, of every axis
-    square: float = 0.0  # s^2/m, of ax
+    square: tuple[float, ...] = (0.0, 0.0, 0.0)  # s^2/m, of a reading without its bias
     hysteresis: float = 0.0  # of the force of the rest before
     limit: float = math.inf  # m/s^2
     gyro_limit: float = math.inf  # rad/s
@@ -178,7 +178,7 @@ def tumbled(
     mean_temp = float(np.mean([temp[int(a * rate_hz + 0.5) : int(b * rate_hz + 0.5)].mean() for a, b in rests]))
     warm = (temp - mean_temp)[:, None]
     a = f @ A_inv.T + part.bias + drift_a + part.thermal[0] * warm + noise[0] + np.concatenate(shift)
-    a[:, 0] += part.square * a[:, 0] ** 2
+    a += part.square * (a - part.bias) ** 2
     y = w @ M_inv.T + part.gyro_bias + f / G0 @ part.G.T + drift_g + part.thermal[1] * warm + noise[1]
     a, y = np.clip(a, -part.limit, part.limit), np.clip(y, -part.gyro_limit, part.gyro_limit)
     for values, lsb in ((a, part.lsb[0]), (y, part.lsb[1])):

@@ -119,10 +119,51 @@ static void edges_without_the_yz_plane_leave_its_angle(void) {
 static void rests_that_say_nothing(void) {
     refused(SELFCAL_TUMBLE_TOO_FEW, 0);
     refused(SELFCAL_TUMBLE_TOO_FEW, 2);
-    for (unsigned n = 1; n < TWELVE; n++) {
-        memcpy(rests[n].mean, rests[0].mean, sizeof rests[n].mean);
+    for (unsigned axis = 0; axis < 6U; axis++) {
+        part.noise[axis].N = 1e5F; /* the priors are all that is known */
     }
-    refused(SELFCAL_TUMBLE_NOTHING, TWELVE); /* equal positions */
+    refused(SELFCAL_TUMBLE_NOTHING, TWELVE);
+}
+
+/* The gyros' bias is a mean, but for 0.1 deg/s of an unknown G: three rests and equal positions have it. */
+static void few_positions_have_the_bias_of_the_gyros(void) {
+    for (unsigned k = 0; k < 2U; k++) {
+        const uint8_t count = k == 0U ? 3U : TWELVE;
+        for (unsigned n = 1; k == 1U && n < TWELVE; n++) {
+            memcpy(rests[n].mean, rests[0].mean, sizeof rests[n].mean);
+        }
+        TEST_ASSERT_EQUAL(SELFCAL_TUMBLE_OK, selfcal_tumble(&found, &part, rests, count, &work));
+        TEST_ASSERT_EQUAL(0, found.accel_identified);
+        TEST_ASSERT_EQUAL(0x111, found.gyro_identified & 0x111);
+        for (unsigned i = 0; i < 3U; i++) {
+            const float sd = selfcal_tumble_gyro_sd(&found, (uint8_t)i, 0);
+            TEST_ASSERT_TRUE(sd > 0.0F && sd < 2e-3F);
+            TEST_ASSERT_FLOAT_WITHIN(3.0F * sd, (float)gyro_bias[i], (float)found.gyro[i][0]);
+            TEST_ASSERT_TRUE(isnan(found.accel[i]) && isnan(selfcal_tumble_accel_sd(&found, (uint8_t)i)));
+        }
+    }
+}
+
+/* Squares of 0.5 mg at 1 g: the intervals of the bias hold them, and corrected flats are near 1 g. */
+static void a_square_is_in_the_intervals(void) {
+    for (unsigned n = 0; n < TWELVE; n++) {
+        for (unsigned i = 0; i < 3U; i++) {
+            const float x = rests[n].mean[i] - (float)bias[i];
+            rests[n].mean[i] += (i == 1U ? -5e-5F : 5e-5F) * x * x;
+        }
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_TUMBLE_OK, selfcal_tumble(&found, &part, rests, TWELVE, &work));
+    for (unsigned i = 0; i < 3U; i++) {
+        const float sd = selfcal_tumble_accel_sd(&found, (uint8_t)i);
+        TEST_ASSERT_FLOAT_WITHIN(2.0F * sd, (float)bias[i], (float)found.accel[i]);
+        TEST_ASSERT_TRUE(sd < 5e-3F);
+    }
+    for (unsigned n = 0; n < 6U; n++) { /* 5e-5 x^2 is 4.8e-3 */
+        float corrected[6];
+        selfcal_tumble_apply(&found, rests[n].mean, corrected);
+        const float *f = corrected;
+        TEST_ASSERT_FLOAT_WITHIN(2.4e-3F, (float)gravity, sqrtf(f[0] * f[0] + f[1] * f[1] + f[2] * f[2]));
+    }
 }
 
 /* In a plane the axis across it has neither scale nor angle, and no gyro a sensitivity along it. */
@@ -218,6 +259,8 @@ int main(void) {
     RUN_TEST(six_flats_have_no_angles);
     RUN_TEST(edges_without_the_yz_plane_leave_its_angle);
     RUN_TEST(rests_that_say_nothing);
+    RUN_TEST(few_positions_have_the_bias_of_the_gyros);
+    RUN_TEST(a_square_is_in_the_intervals);
     RUN_TEST(rests_in_a_plane_identify_what_they_can);
     RUN_TEST(hostile_rests);
     RUN_TEST(hostile_parts);

@@ -23,6 +23,7 @@ from tumble_rivals import ardupilot, imu_tk, imu_tk_gyro, px4
 from tumbled import EDGES, FLATS, FOUR_EDGES, G0, POSITIONS, TWELVE, Part, Truth, draw_part, matrices, model_of, tumbled
 
 import selfcal
+import selfcal.verbs.tumble as verb
 from selfcal.base.errors import UserError
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
@@ -77,7 +78,8 @@ def covered(count: int, positions: int, seed: int, *, part_known: bool = True) -
     for k in range(count):
         random = np.random.default_rng([seed, positions, k])
         lsb = ((0.0, 0.0), (1.2e-3, 1.3e-4), (6e-3, 1e-3))[k // 3 % 3]
-        part = draw_part(random, law=LAWS[k % 3], lsb=lsb)
+        square = tuple(accelerometer.SQUARE_SD * np.random.default_rng([seed, positions, k, 1]).standard_normal(3))
+        part = draw_part(random, law=LAWS[k % 3], lsb=lsb, square=square)
         recording, truth = tumbled(part, random, POSITIONS[positions], latitude_deg=LATITUDE, rest_s=12.0)
         z, identified = errors(*calibrated(recording, part if part_known else None), truth)
         held += identified & (np.abs(z) < 1.6449)
@@ -136,7 +138,7 @@ def test_derivatives_of_the_turns(twelve: tuple[Recording, Truth]) -> None:
     """Against differences of the residuals themselves: the integral over each turn is done again."""
     accel, gyro = calibrated(twelve[0], twelve[1].part)
     assert gyro is not None
-    problem, theta = gyroscope._Problem(accel), gyro.fit.theta
+    problem, theta = gyroscope._Problem(accel).under(accel.tumble), gyro.fit.theta
     _, J, _ = problem(theta)
     for k in range(theta.size):
         step = np.zeros(theta.size)
@@ -145,7 +147,7 @@ def test_derivatives_of_the_turns(twelve: tuple[Recording, Truth]) -> None:
         # Left out: G f moves with the accelerometers' numbers, by G of 3e-4; the basis across u turns, times the
         # residual, 1e-3. The derivatives are sums over samples, right to
         # (w dt)^2.
-        tolerance = 0.01 if k < problem.of_accel else 5e-3
+        tolerance = 0.01 if k < gyro.of_accel else 5e-3
         assert np.abs(slope - J[:, k]).max() < tolerance * max(float(np.abs(J[:, k]).max()), 1e-3), k
 
 
@@ -183,6 +185,19 @@ def test_coverage_without_a_model() -> None:
     share = held.sum() / known.sum()
     print(f"\nno model: pooled {share:.3f}, least {held.min():.0f}, most {held.max():.0f} of 200")
     assert 0.86 <= share <= 0.95
+
+
+def test_a_weak_drift_is_in_the_bias_without_a_model() -> None:
+    """The bias at the end moves with the drift itself. A walk at the edge of what the log shows: of 60 biases of gyros
+    fewer than 48 once in 100 runs. A prior of the drift's logarithm holds 46. The long run."""
+    held = 0
+    for seed in range(20):
+        random = np.random.default_rng([64, seed])
+        part = draw_part(random, K=(3e-5, 2.5e-6))
+        recording, truth = tumbled(part, random, TWELVE, rest_s=25.0, rate_hz=50.0, finer=2, latitude_deg=LATITUDE)
+        z, _ = errors(*calibrated(recording, None), truth)
+        held += int((np.abs(z[9:12]) < 1.6449).sum())
+    assert held >= binom.ppf(0.01, 60, 0.9)
 
 
 def of(document: dict[str, Any], sensor: str, group: str) -> dict[str, bool]:
@@ -295,7 +310,23 @@ def first_finding(recording: Recording) -> str:
 
 
 def test_a_square_is_named() -> None:
-    assert "a square of the scale" in first_finding(spoilt(np.random.default_rng(20), square=3e-4))
+    assert "a square of the scale" in first_finding(spoilt(np.random.default_rng(20), square=(3e-4, 0.0, 0.0)))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_square_of_any_axis_is_seen_without_a_model(axis: int) -> None:
+    """2.5 mg at 1 g, five sd of its prior, in the default twelve positions, is named: the drift within the rests says
+    that no drift explains it. The interval holds 1 mg."""
+    random = np.random.default_rng([26, axis])
+    square = [0.0, 0.0, 0.0]
+    square[axis] = 2.6e-4
+    recording, truth = tumbled(draw_part(random, square=tuple(square)), random, rest_s=20.0, rate_hz=50.0, finer=2)
+    found = selfcal.tumble(without_gyros(recording), gravity=G0)["accelerometer"]
+    assert found["adequate"] is False and any("a square of the scale" in one["cause"] for one in found["findings"])
+    small = replace(truth.part, square=tuple(0.4 * one for one in square))  # 2 sd
+    recording, truth = tumbled(small, random, rest_s=20.0, rate_hz=50.0, finer=2)
+    one = list(selfcal.tumble(without_gyros(recording), gravity=G0)["accelerometer"]["bias"].values())[axis]
+    assert abs(one["median"] - truth.bias[axis]) < 3.0 * one["sd"]
 
 
 def test_hysteresis_is_named() -> None:
@@ -343,6 +374,15 @@ def test_a_clipped_axis_is_left_out_and_named() -> None:
     assert len(clipped) == 6 and len(document["rests"]) == 18
 
 
+def test_a_rest_without_an_axis_is_left_out_and_named(twelve: tuple[Recording, Truth]) -> None:
+    begin, end = twelve[1].rests[4]
+    gone = (twelve[0].time_s > begin - 0.3) & (twelve[0].time_s < end + 0.3)
+    lost = with_columns(twelve[0], lambda name, values: np.where(gone & (name == "ay"), math.nan, values))
+    document = selfcal.tumble(lost, gravity=G0)
+    assert sum("more than half of its samples of ay are missing" in one for one in document["notes"]) >= 1
+    assert len(document["rests"]) == 11 and all(of(document, "accelerometer", "bias").values())
+
+
 def test_a_turn_that_clips_is_left_out_and_named() -> None:
     random = np.random.default_rng(25)
     part = draw_part(random, gyro_limit=math.radians(88.0))
@@ -361,6 +401,84 @@ def test_a_turn_that_clips_is_left_out_and_named() -> None:
     assert 2 <= len(fast) <= 9
     z, known = errors(accel, gyro, truth)
     assert np.abs(z[known]).max() < 4.5
+
+
+def with_columns(recording: Recording, change: Any) -> Recording:
+    """With the values of each column by `change(name, values)`; None leaves it out."""
+    columns = {name: (one, change(name, one.values.copy())) for name, one in recording.columns.items()}
+    return replace(recording, columns={k: replace(a, values=b) for k, (a, b) in columns.items() if b is not None})
+
+
+def test_lost_samples_cost_little(twelve: tuple[Recording, Truth]) -> None:
+    """One row in 61 without accelerometers, and one in 43 without a gyro: every turn counts. Intervals are some percent
+    wider, and hold the truth. Half of a turn's rates lost leave it out, with the reason."""
+    recording, truth = twelve
+
+    def lose(name: str, values: Array) -> Array:
+        values[7::61] = values[7::61] if name[0] == "g" else math.nan
+        values[5::43] = math.nan if name == "gy" else values[5::43]
+        return values
+
+    whole, lost = (calibrated(one, truth.part) for one in (recording, with_columns(recording, lose)))
+    assert whole[1] is not None and lost[1] is not None
+    assert len(lost[1].turns) == 11
+    for a, b in zip(whole, lost, strict=True):
+        assert a is not None and b is not None
+        ratio = np.sqrt(np.diag(b.fit.covariance) / np.diag(a.fit.covariance))[: len(OF_ACCEL) + len(OF_GYRO)]
+        assert (ratio > 0.9).all() and (ratio < 1.15).all()
+    z, known = errors(*lost, truth)
+    assert known.all() and np.abs(z).max() < 4.5
+    middle = 0.5 * (truth.rests[3][1] + truth.rests[4][0])
+    gone = (np.abs(recording.time_s - middle) < 2.6) & (np.arange(recording.samples) % 5 > 0)
+    document = selfcal.tumble(
+        with_columns(recording, lambda name, values: np.where(gone & (name == "gx"), math.nan, values)), gravity=G0
+    )
+    assert [one for one in document["notes"] if "more than half of its samples of gx are missing" in one]
+    assert sum(one["left_out"] is None for one in document["turns"]) == 10
+
+
+@pytest.mark.parametrize(
+    ("matrix", "said"),
+    [
+        (np.diag([1.0, 1.0, -1.0]), "gz is of the other sign"),
+        (-np.eye(3), "each of gx, gy, gz is of the other sign"),
+        (np.diag([1.0, math.radians(1.0), 1.0]), "gy reads as if its unit were rad/s"),
+        (np.eye(3) * math.degrees(1.0), "each of gx, gy, gz reads as if its unit were deg/s"),
+        (np.diag([2.0, 1.0, 1.0]), "gx reads 2 times the rate"),
+        (np.eye(3)[[0, 2, 1]], "gz has the turns about y; gy has the turns about z"),
+        (
+            np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]),
+            "gz has the turns about y; gy has the turns about z and is",
+        ),
+        (np.diag([0.0, 1.0, 1.0]), "gx does not show its turns"),
+    ],
+)
+def test_a_gyro_at_fault_is_named(matrix: Array, said: str, tmp_path: Path) -> None:
+    """What the gyros are read as is `matrix` times what they show. The accelerometers keep their numbers."""
+    random = np.random.default_rng(27)
+    recording, _ = tumbled(draw_part(random), random, TWELVE, rate_hz=50.0, finer=4)
+    y = np.column_stack([recording.columns[name].values for name in ("gx", "gy", "gz")])
+    y = y @ matrix.T + (1e-5 * random.standard_normal(y.shape))
+    wrong = with_columns(recording, lambda name, values: y[:, "xyz".index(name[1])] if name[0] == "g" else values)
+    document = selfcal.tumble(wrong, gravity=G0, output=tmp_path / "calibration.yaml")
+    assert said in document["gyroscope"]["error"]
+    right = selfcal.tumble(without_gyros(recording), gravity=G0)
+    assert document["accelerometer"]["bias"]["ax"]["median"] == pytest.approx(
+        right["accelerometer"]["bias"]["ax"]["median"], abs=3.0 * right["accelerometer"]["bias"]["ax"]["sd"]
+    )
+    assert "gyroscope" not in yaml.safe_load((tmp_path / "calibration.yaml").read_text())
+
+
+def test_two_gyros_have_bias_and_sensitivity(twelve: tuple[Recording, Truth], tmp_path: Path) -> None:
+    recording, truth = twelve
+    document = selfcal.tumble(with_columns(recording, lambda name, v: None if name == "gy" else v), latitude=LATITUDE)
+    assert of(document, "gyroscope", "bias") == {"gx": True, "gy": False, "gz": True}
+    assert document["gyroscope"]["would_mend"] == ["a log with gy as well"]
+    assert any("gy is not recorded" in one for one in document["notes"])
+    assert "bias gy" in exported("yaml", with_columns(recording, lambda name, v: None if name == "gy" else v), tmp_path)
+    for k, name in ((0, "gx"), (2, "gz")):
+        one = document["gyroscope"]["bias"][name]
+        assert abs(one["median"] - math.degrees(truth.gyro_bias[k])) < 4.0 * one["sd"] < 0.02
 
 
 def test_a_wrong_gravity_goes_into_the_scales_alone(twelve: tuple[Recording, Truth]) -> None:
@@ -541,6 +659,21 @@ def test_the_command(twelve: tuple[Recording, Truth], tmp_path: Path) -> None:
     assert one["q05"] < one["median"] < one["q95"] and one["unit"] == "rad"
 
 
+def test_exit_codes_are_those_of_the_other_verbs(twelve: tuple[Recording, Truth], tmp_path: Path) -> None:
+    """0 without --fail-on; with it 0 adequate, 1 not adequate, 2 not judged."""
+    recording, truth = twelve
+    begin, end = truth.rests[7]
+    reversed_x = with_columns(recording, lambda name, values: -values if name == "gx" else values)
+    moved = without_gyros(shaken(recording, begin, end, np.array([0.02, 0.02, 0.0])))
+    given = {"latitude": LATITUDE, "model": None}
+    for one, code in ((recording, 0), (moved, 1), (reversed_x, 2)):
+        document = selfcal.tumble(one, **given, fail_on="inadequate")
+        assert verb.show(document, {"fail_on": "inadequate"}) == code
+        assert verb.show(document, {}) == 0
+    with pytest.raises(UserError, match="--fail-on: takes inadequate"):
+        selfcal.tumble(recording, fail_on="square")
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
@@ -603,7 +736,8 @@ def test_beside_other_methods() -> None:
             accel, _ = calibrated(without_gyros(recording), part, gyros=False)
             a = np.array([one.accel for one in accel.tumble.rests])
             raw, _ = raw_of(part, truth, f, np.zeros_like(f))
-            methods = {"selfcal": (accel.matrix, accel.fit.theta[:3]), "ArduPilot": ardupilot(a, G0)}
+            own_theta = accel.refitted(np.zeros(accel.fit.theta.size, bool)).theta  # what a file has
+            methods = {"selfcal": (accelerometer.matrix_of(own_theta), own_theta[:3]), "ArduPilot": ardupilot(a, G0)}
             methods["PX4, six flats"] = px4(a, np.array(POSITIONS[positions]), G0)
             if positions > 6:  # nine numbers of six rests are any
                 methods["IMU-TK"] = imu_tk(a, G0)
@@ -718,16 +852,27 @@ def test_a_plan_reaches_what_it_says(capsys: pytest.CaptureFixture[str]) -> None
     """Parts of the model, rested as planned: their intervals are as wide as the plan has them."""
     random = np.random.default_rng(70)
     part = draw_part(random, law="random_walk")
-    document = plan_of(model_of(part), ["scale within 30 ppm", "angle within 0.1 mrad"])
-    row = next(one for one in document["rows"] if one["rests"] == 12)
-    assert row["rest_s"] is not None and row["reached"]["scale"] <= 3e-5 and row["reached"]["angle"] <= 1e-4
-    recording, _ = tumbled(part, random, TWELVE, rest_s=row["rest_s"] + 4.0, turn_s=4.0, latitude_deg=LATITUDE)
-    accel, _ = calibrated(recording, part, gyros=False)
-    half = 1.6449 * np.sqrt(np.diag(accel.fit.covariance))
-    # The rests come out a second shorter or longer than planned: pieces of 1 s, and what is cut beside a turn.
-    assert half[3:6].max() == pytest.approx(row["reached"]["scale"], rel=0.3)
-    assert half[6:9].max() == pytest.approx(row["reached"]["angle"], rel=0.3)
-    tighter = plan_of(model_of(part), ["scale within 30 ppm", "angle within 0.07 mrad"])
+    document = plan_of(model_of(part), ["scale within 45 ppm", "angle within 0.13 mrad"])
+    rows = {one["rests"]: one for one in document["rows"]}
+    # Six flats, as a hand places them, leave the angles and so the scales: the answer says so.
+    assert rows[6]["rest_s"] is None and rows[6]["missed"] == document["wishes"]
+    assert set(rows[6]["not_identified"]) == {"scale", "angle"} and rows[6]["reached"]["scale"] is None
+    row = rows[12]
+    assert row["rest_s"] is not None and row["reached"]["scale"] <= 4.5e-5 and row["reached"]["angle"] <= 1.3e-4
+    assert not row["missed"] and not row["not_identified"]
+    halves = []
+    for _ in range(8):
+        own = replace(draw_part(random, law="random_walk"), N=part.N)
+        more = {"rest_s": row["rest_s"], "turn_s": 4.0, "tilt": math.radians(3.0), "rate_hz": 50.0, "finer": 2}
+        accel, _ = calibrated(without_gyros(tumbled(own, random, TWELVE, **more)[0]), own, gyros=False)
+        assert accel.fit.identified[:9].all()
+        halves.append(1.6449 * np.sqrt(np.diag(accel.fit.covariance)))
+    # 90 % of placements reach it; of 8, fewer than 5 once in 200. Rests come out a second shorter or longer: 5 %.
+    for name, own_slice in (("scale", accelerometer.SCALE), ("angle", accelerometer.ANGLE)):
+        assert sum(half[own_slice].max() <= 1.05 * row["reached"][name] for half in halves) >= 5
+        # And it is no idle bound.
+        assert np.median([half[own_slice].max() for half in halves]) > 0.6 * row["reached"][name]
+    tighter = plan_of(model_of(part), ["scale within 45 ppm", "angle within 0.07 mrad"])
     assert tighter["rows"][1]["rest_s"] is None or tighter["rows"][1]["rest_s"] > row["rest_s"]
     with pytest.raises(UserError, match="a scale is in ppm or %"):
         plan_of(model_of(part), ["scale within 3 mg"])

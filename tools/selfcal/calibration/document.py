@@ -40,21 +40,20 @@ SAME_SIDE, TURNED = math.radians(15.0), math.radians(30.0)
 MOST_NAMED = 4
 
 
-def document_of(
-    recordings: Sequence[Recording], tumble: Tumble, accel: Accelerometer, gyro: Gyroscope | None
-) -> dict[str, Any]:
-    """The whole answer, in SI units and degrees."""
-    place = accel.place
+def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyroscope | str | None) -> dict[str, Any]:
+    """The whole answer, in SI units and degrees. `gyro`: None without gyros, a line where they have no answer."""
+    place, tumble = accel.place, accel.tumble
     notes = [*tumble.notes, *(f"{one}: left out" for one in tumble.left_out), *_told_of_turns(accel)]
     return {
         "schema": SCHEMA,
         "recordings": [recording_entry(one) for one in recordings],
         "gravity": {"value": place.gravity, "sd": place.sd, "unit": "m/s^2", "source": place.words},
         "earth_rate_known": place.vertical is not None,
-        "bias_at_s": accel.reference_s,
+        "bias_at_s": accel.tumble.reference_s,
         "noise": {
             name: {"N": math.sqrt(one.white), "unit": _density(name), "drift": one.words}
             for name, one in tumble.noise.items()
+            if one.words
         },
         "rests": _rests(accel),
         "turns": [
@@ -74,11 +73,13 @@ def document_of(
         },
         "gyroscope": None
         if gyro is None
+        else {"error": gyro}
+        if isinstance(gyro, str)
         else {
             **_entries(gyro.fit, gyro.of_accel, OF_GYRO),
             **_thermal(accel, gyro.fit, gyro.of_accel + gyroscope.THERMAL.start, GYRO, "deg/s/degC", math.degrees(1.0)),
-            **_adequacy(gyro.fit, gyroscope.causes(gyro, tumble.rests)),
-            "would_mend": _turns(gyro),
+            **_adequacy(gyro.fit, gyroscope.causes(gyro, tumble)),
+            "would_mend": _turns(gyro, tumble),
         },
         "notes": notes,
     }
@@ -110,9 +111,9 @@ def _thermal(
     accel: Accelerometer, fit: Fit, start: int, names: Sequence[str], unit: str, size: float
 ) -> dict[str, Any]:
     """Temperature coefficients, where the logs have a temperature."""
-    if not accel.warmth.size:
+    if not accel.tumble.has_temp:
         return {}
-    mean = float(np.mean([one.temp for one in accel.tumble.rests]))
+    mean = float(accel.tumble.temp.mean())
     entries = {name: _entry(fit, start + k, unit, size) for k, name in enumerate(names)}
     return {"temperature": entries, "bias_at_degC": mean}
 
@@ -120,20 +121,18 @@ def _thermal(
 def _adequacy(fit: Fit, causes: Sequence[tuple[str, float]]) -> dict[str, Any]:
     """Whether the residuals are as large as their sd says; None where too few are left to say."""
     checked = math.isfinite(fit.excess)
-    fits = None if not checked else not causes and fit.excess >= FALSE_ALARM
+    fits = False if causes else fit.excess >= FALSE_ALARM if checked else None
     return {
         "adequate": fits,
         "residual_ratio": fit.ratio if checked else None,
-        "findings": [{"cause": said, "p": p} for said, p in causes if checked],
+        "findings": [{"cause": said, "p": p} for said, p in causes],
     }
 
 
 def _rests(accel: Accelerometer) -> list[dict[str, Any]]:
     """Rests with the side that is up, and the residual of |f| with its sd."""
     tumble, fit = accel.tumble, accel.fit
-    a = np.array([one.accel for one in tumble.rests])
-    warm = accel.warmth if accel.warmth.size else np.zeros(len(a))
-    f = accel.force(a, warm)
+    f = accel.force(tumble.accel, tumble.warmth)
     size = np.linalg.norm(f, axis=1)
     residual = size - accel.place.gravity * (1.0 + fit.theta[accelerometer.GRAVITY])
     sd = np.sqrt(np.diag(fit.root @ fit.root.T))
@@ -173,12 +172,8 @@ def _positions(accel: Accelerometer) -> list[str]:
         weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
         for c in candidates:
             up = (c - 1.0) / np.linalg.norm(c - 1.0)
-            x = inverse @ (up * place.gravity)
-            v = x * fit.theta[accelerometer.SCALE]
-            row = np.zeros(fit.theta.size)
-            row[accelerometer.BIAS] = -(up @ accel.matrix)
-            row[accelerometer.SCALE] = up @ (accel.matrix / fit.theta[accelerometer.SCALE]) * x
-            row[accelerometer.ANGLE] = [up[i] * v[j] for i, j in accelerometer.PLACES]
+            reading = inverse @ (up * place.gravity) + fit.theta[accelerometer.BIAS]
+            row = up @ accelerometer.forces(fit.theta, reading[None], np.zeros(1))[1][0]
             row[accelerometer.GRAVITY] = -place.gravity
             moved = covariance @ row
             less = moved**2 / (float(row @ moved) + noise)
@@ -195,9 +190,11 @@ def _positions(accel: Accelerometer) -> list[str]:
     return named
 
 
-def _turns(gyro: Gyroscope) -> list[str]:
+def _turns(gyro: Gyroscope, tumble: Tumble) -> list[str]:
     """Further rests and turns by which every parameter would be identified."""
     known = gyro.fit.identified[gyro.of_accel :]
+    if absent := [name for name, one in tumble.noise.items() if not one.words]:
+        return [f"a log with {', '.join(absent)} as well"]
     named = []
     if not known[gyroscope.G].all():
         named.append("rests with other sides up: four or more, not all in one plane")
@@ -211,8 +208,7 @@ def _turns(gyro: Gyroscope) -> list[str]:
 def _told_of_turns(accel: Accelerometer) -> list[str]:
     """Turns that are left out, and those that tell little."""
     tumble, told = accel.tumble, []
-    a = np.array([one.accel for one in tumble.rests])
-    f = accel.force(a, accel.warmth if accel.warmth.size else np.zeros(len(a)))
+    f = accel.force(tumble.accel, tumble.warmth)
     u = f / np.linalg.norm(f, axis=1)[:, None]
     for one in tumble.turns:
         where = f"turn of {tumble.rests[one.first].at_s[1]:.6g} to {tumble.rests[one.first + 1].at_s[0]:.6g} s"

@@ -71,7 +71,7 @@ def _whole(
     lost = _unknown(document, "accelerometer", ("misalignment",))
     if lost and not diagonal:
         lines.append(f"accelerometers, not identified and left at 0: {', '.join(lost)}")
-    theta = accel.refitted(held).theta if held.any() else accel.fit.theta
+    theta = accel.refitted(held).theta
     # A common error of gravity is not theirs to correct: gravity is as stated.
     bias, matrix = theta[accelerometer.BIAS], matrix_of(theta)
     if diagonal:
@@ -87,7 +87,7 @@ def _whole(
     if gyro is None:
         return Whole(bias, matrix, None, None, None, tuple(lines))
     known = gyro.fit.identified[gyro.of_accel :]
-    lost = _unknown(document, "gyroscope", ("scale", "misalignment", "g_sensitivity"))
+    lost = _unknown(document, "gyroscope", ("bias", "scale", "misalignment", "g_sensitivity"))
     if diagonal:
         largest = math.degrees(np.abs(gyro.theta[gyroscope.G]).max()) if known[gyroscope.G].all() else math.nan
         lines.append(f"gyros: their bias alone; the largest g-sensitivity left out is {largest:.2g} deg/s/g")

@@ -27,9 +27,6 @@ NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not
 IDENTIFIED, WIDER = 0.2, 8.0
 #: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
 FALSE_ALARM = 0.005
-#: Shares of a drift's mean square under a wide prior that are weighed: three decades of its deviation.
-#: A fit that is only weighed settles earlier.
-SHARES, ROUGHLY = 10.0 ** -np.arange(0.0, 6.5, 0.75), 0.1
 #: Residuals beyond the parameters that a check takes at least.
 FREE_LEAST = 0.5
 
@@ -38,7 +35,8 @@ FREE_LEAST = 0.5
 class Fit:
     """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
     `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
-    makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares."""
+    makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step` [n]:
+    to the least sum of squares by these derivatives, which takes `gain` off it."""
 
     theta: Array
     covariance: Array
@@ -47,39 +45,35 @@ class Fit:
     columns: Array
     root: Array
     pulled: float
+    step: Array
+    gain: float
 
     @property
     def squares(self) -> float:
         """Sum of squares of the residuals and the prior."""
         return float(self.white @ self.white) + self.pulled
 
+    def _informed(self, least: float) -> tuple[Array, Array]:
+        """The prior's factor [n, n], and the information in its units, with `least` of the prior's own."""
+        factor = np.asarray(np.linalg.cholesky(self.prior), float)
+        seen = self.columns @ factor
+        return factor, seen.T @ seen + least * np.eye(len(factor))
+
     @property
     def evidence(self) -> float:
-        """ln of the likelihood under the prior, but for a constant (Laplace)."""
-        factor = np.linalg.cholesky(self.prior)
-        seen = self.columns @ factor
-        size = float(np.linalg.slogdet(np.eye(factor.shape[0]) + seen.T @ seen)[1])
-        noise = 2.0 * float(np.log(np.diag(self.root)).sum())
-        return -0.5 * (self.squares + noise + size)
+        """ln of the likelihood under the prior, but for a constant (Laplace), at the end of the step."""
+        size = float(np.linalg.slogdet(self._informed(1.0)[1])[1])
+        return -0.5 * (self.squares - self.gain + 2.0 * float(np.log(np.diag(self.root)).sum()) + size)
 
     def widened(self) -> Array:
         """The covariance [n, n] were every prior WIDER times as wide: no parameter is known by another's prior."""
-        factor = np.linalg.cholesky(self.prior)
-        seen = self.columns @ factor
-        found: Array = factor @ np.linalg.inv(seen.T @ seen + np.eye(factor.shape[0]) / WIDER**2) @ factor.T
-        return found
-
-    @property
-    def left(self) -> Array:
-        """Share of each prior variance that the data alone leave [n]."""
-        left: Array = np.diag(self.widened()) / np.diag(self.prior)
-        return left
+        factor, information = self._informed(WIDER**-2)
+        return np.asarray(factor @ np.linalg.inv(information) @ factor.T)
 
     @property
     def identified(self) -> Mask:
-        """[n]."""
-        found: Mask = self.left <= IDENTIFIED
-        return found
+        """Whether the data alone leave a small share of each prior variance [n]."""
+        return np.asarray(np.diag(self.widened()) <= IDENTIFIED * np.diag(self.prior))
 
     @property
     def free(self) -> float:
@@ -99,75 +93,61 @@ class Fit:
     def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
         """Of causes, each in words and by its columns [m, k] of the residuals, those that explain more than chance, the
         surest first; with their probability by chance, corrected for the number of causes."""
+        if not math.isfinite(self.excess):
+            return []
         more = solve_triangular(self.root, np.hstack([columns for _, columns in tried]), lower=True)
         apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
         found, first = [], 0
         for said, columns in tried:
             own = slice(first, first + columns.shape[1])
             first = own.stop
-            explained, count = _explained(more[:, own].T @ apart[:, own], apart[:, own].T @ self.white)
+            normal, pull = more[:, own].T @ apart[:, own], apart[:, own].T @ self.white
+            explained = float(pull @ np.linalg.pinv(normal, 1e-9, hermitian=True) @ pull)
+            count = max(int(np.linalg.matrix_rank(normal, hermitian=True)), 1)
             found.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
         return [(said, min(1.0, p)) for p, _, said in sorted(found) if p < FALSE_ALARM]
 
 
-def _explained(normal: Array, pull: Array) -> tuple[float, int]:
-    """The sum of squares that columns with normal equations [k, k] and right sides [k] take, and how many count."""
-    values, vectors = np.linalg.eigh(normal)
-    kept = values > 1e-9 * max(float(values.max()), 1e-300)
-    along = vectors[:, kept].T @ pull
-    return float((along**2 / values[kept]).sum()), max(int(kept.sum()), 1)
-
-
-def fit(
-    problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None, settled: float = SETTLED
-) -> Fit:
-    """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
-    stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
-    `settled`: the last step, in posterior sd. Raises UserError where none settles."""
-    free = np.ones(start.size, bool) if held is None else ~held
-    theta = np.where(free, start, mean)
+def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
+    """The problem at parameters, as `fit` has it. Raises UserError."""
+    free = np.ones(theta.size, bool) if held is None else ~held
     block = np.ix_(free, free)
     unit = np.sqrt(np.diag(prior))[free]
-    inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
+    r, J, R = problem(theta)
+    if not all(np.isfinite(one).all() for one in (r, J, R)):
+        raise UserError(UNSETTLED)
+    apart = (theta - mean)[free] / unit
+    try:
+        inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
+        root = np.asarray(np.linalg.cholesky(R))
+        white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
+        own = columns[:, free] * unit
+        covariance = np.linalg.inv(own.T @ own + inverse)
+    except np.linalg.LinAlgError:
+        raise UserError(NO_NOISE) from None
+    whole, step = np.zeros(prior.shape), np.zeros(theta.size)
+    whole[block] = covariance * np.outer(unit, unit)
+    pull = own.T @ white + inverse @ apart
+    moved = -covariance @ pull
+    step[free] = moved * unit
+    return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart), step, float(-moved @ pull))
 
-    def at(theta: Array) -> Fit:
-        r, J, R = problem(theta)
-        if not all(np.isfinite(one).all() for one in (r, J, R)):
-            raise UserError(UNSETTLED)
-        apart = (theta - mean)[free] / unit
-        try:
-            root = np.asarray(np.linalg.cholesky(R))
-            white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
-            own = columns[:, free] * unit
-            covariance = np.linalg.inv(own.T @ own + inverse)
-        except np.linalg.LinAlgError:
-            raise UserError(NO_NOISE) from None
-        whole = np.zeros(prior.shape)
-        whole[block] = covariance * np.outer(unit, unit)
-        return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart))
 
-    found = at(theta)
+def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
+    """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
+    stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
+    Raises UserError where none settles."""
+    found = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
     for _ in range(ITERATIONS):
-        apart = (found.theta - mean)[free] / unit
-        pull = found.columns[:, free].T @ found.white + inverse @ apart / unit
-        step = np.zeros(theta.size)
-        step[free] = -found.covariance[block] @ pull
-        far = float(np.max(np.abs(step[free]) / np.sqrt(np.diag(found.covariance)[free])))
-        following = at(found.theta + step)
+        step, sd = found.step, np.sqrt(np.diag(found.covariance))
+        far = float(np.max(np.abs(step[sd > 0.0]) / sd[sd > 0.0]))
+        following = linearized(problem, found.theta + step, mean, prior, held)
         for _ in range(HALVINGS if far > NEAR else 0):
             if following.squares < found.squares:
                 break
-            step *= 0.5
-            following = at(found.theta + step)
+            step = 0.5 * step
+            following = linearized(problem, found.theta + step, mean, prior, held)
         found = following
-        if far < settled:
+        if far < SETTLED:
             return found
     raise UserError(UNSETTLED)
-
-
-def drift_share(fit_at: Callable[[float], Fit]) -> float:
-    """Posterior mean of the share of a drift's prior variance that residuals support, log-uniform before. `fit_at`: the
-    fit at a share."""
-    evidence = np.array([fit_at(float(one)).evidence for one in SHARES])
-    weight = np.exp(evidence - evidence.max())
-    return float(weight @ SHARES / weight.sum())

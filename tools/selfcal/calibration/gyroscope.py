@@ -13,42 +13,36 @@ two level parts of the Earth's rate in its first rest. Residuals: three of each 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.spatial.transform import Rotation
 
+from selfcal.base.errors import UserError
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
-from selfcal.calibration.accelerometer import Accelerometer, matrix_of
-from selfcal.calibration.fit import ROUGHLY, SETTLED, Fit, Mask, drift_share, fit
+from selfcal.calibration.accelerometer import NONE, Accelerometer, forces, means_covariance, shaped
+from selfcal.calibration.fit import Fit, Mask, Problem
 from selfcal.calibration.noise import drift
-from selfcal.calibration.rests import ACCEL, GYRO, Rest, Turn
+from selfcal.calibration.rests import GYRO, Tumble, Turn
 
 Array = NDArray[np.float64]
 
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); scale; angle, rad; temperature
 #: coefficient, rad/s/degC (0.05 deg/s/degC).
-BIAS_SD, G_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = (
-    math.radians(10.0),
-    math.radians(0.1),
-    0.02,
-    0.02,
-    math.radians(0.05),
-)
-#: sd of a parameter that the logs do not have.
-NONE = 1e-12
+BIAS_SD, G_SD, THERMAL_SD = math.radians(10.0), math.radians(0.1), math.radians(0.05)
+SCALE_SD, ANGLE_SD = 0.02, 0.02
+#: The accelerometers' parameters.
+OF_ACCEL = accelerometer.THERMAL.stop
+#: Windows of a turn that show signs and units, s. A gyro's factor may be off by WRONG. Share of the most turned axis,
+#: or of a turn, from which on it is judged. Information below which there is none. Units taken for each other.
+WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
+TAKEN = (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
 #: Where the parameters are, behind the accelerometers'.
-BIAS, G, SCALE, ANGLE, VERTICAL, THERMAL, LEVEL = (
-    slice(0, 3),
-    slice(3, 12),
-    slice(12, 15),
-    slice(15, 21),
-    21,
-    slice(22, 25),
-    25,
-)
+BIAS, G, SCALE, ANGLE, THERMAL = (slice(a, b) for a, b in ((0, 3), (3, 12), (12, 15), (15, 21), (22, 25)))
+VERTICAL, LEVEL = 21, 25
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 
@@ -69,27 +63,12 @@ class Gyroscope:
 
 def gyro_matrix(theta: Array) -> Array:
     """T K [3, 3] of the gyros' own parameters."""
-    T = np.eye(3)
-    for (row, column), value in zip(PLACES, theta[ANGLE], strict=True):
-        T[row, column] = value
-    return T * theta[SCALE]
+    return shaped(theta[SCALE], theta[ANGLE], PLACES)
 
 
 def cross(v: Array) -> Array:
     """The matrices [..., 3, 3] of v x of vectors [..., 3]."""
-    x, y, z = v[..., 0], v[..., 1], v[..., 2]
-    o = np.zeros_like(x)
-    return np.stack([np.stack(r, axis=-1) for r in ((o, -z, y), (z, o, -x), (-y, x, o))], axis=-2)
-
-
-def rotations(v: Array) -> Array:
-    """The rotations [n, 3, 3] by vectors [n, 3], rad (Rodrigues)."""
-    angle = np.linalg.norm(v, axis=-1)[..., None, None]
-    S = cross(v)
-    small = np.maximum(angle, 1e-12)
-    half = np.sin(0.5 * small) / small
-    found: Array = np.eye(3) + np.sin(small) / small * S + 2.0 * half**2 * (S @ S)
-    return found
+    return np.asarray(np.cross(np.eye(3), v[..., None, :]))
 
 
 def products_to_end(R: Array) -> Array:
@@ -105,42 +84,69 @@ def turned(rate: Array, dt: float) -> tuple[Array, Array]:
     """The rotation Q [3, 3] of rates [n, 3] from the first sample to the last, by the trapezoid rule and the
     first term of coning (Miller 1983); and the rotation from the end back to each sample [n, 3, 3]."""
     step = 0.5 * dt * (rate[:-1] + rate[1:]) + dt**2 / 12.0 * np.cross(rate[:-1], rate[1:])
-    to_end = np.concatenate([products_to_end(rotations(step)), np.eye(3)[None]])
+    to_end = np.concatenate([products_to_end(Rotation.from_rotvec(step).as_matrix()), np.eye(3)[None]])
     return to_end[0], np.swapaxes(to_end, 1, 2)
 
 
+def fault_of(accel: Accelerometer) -> str:
+    """What the turns say is wrong with signs, axes or units of the gyros; "" for nothing. Gravity's direction u moves
+    by u x w, which is linear in the rates: M [3, 3] of w = M y needs no start. An axis of few turns is not judged."""
+    rests, moves, angles, middles = accel.tumble.rests, [], [], []
+    for turn in (one for one in accel.tumble.turns if not one.reason):
+        size = max(2, round(WINDOW_S / turn.dt))
+        first = np.arange(0, len(turn.accel) - size, size)
+        f = accel.force(turn.accel, np.zeros(len(turn.accel)))
+        u = f / np.linalg.norm(f, axis=1)[:, None]
+        rate = turn.gyro - 0.5 * (rests[turn.first].gyro + rests[turn.first + 1].gyro)
+        way = np.cumsum(rate, axis=0) * turn.dt
+        moves.append(u[first + size] - u[first])
+        angles.append(way[first + size] - way[first])
+        middles.append(u[first + size // 2])
+    if not moves:
+        return ""
+    moved, angle, u = (np.concatenate(one) for one in (moves, angles, middles))
+    turned, seen = np.linalg.norm(np.cross(u, moved), axis=0), np.linalg.norm(angle, axis=0)
+    columns = (cross(u)[:, :, :, None] * (angle / np.maximum(seen, 1e-12))[:, None, None, :]).reshape(-1, 9)
+    inverse = np.linalg.inv(columns.T @ columns + FAINT * np.eye(9))
+    found = inverse @ columns.T @ moved.ravel()
+    sd = np.sqrt(np.mean((moved.ravel() - columns @ found) ** 2) * np.diag(inverse)).reshape(3, 3)
+    said = dict[str, list[str]]()
+    for k in np.flatnonzero(turned > SHOWN * turned.max()).tolist():
+        at = int(np.abs(found.reshape(3, 3)[k]).argmax())
+        share, value = (float(found[3 * k + at] / max(one, 1e-12)) for one in (turned[k], seen[at]))
+        if at == k and abs(value - 1.0) < WRONG + 4.0 * float(sd[k, at] / max(seen[at], 1e-12)):
+            continue
+        words = [f"has the turns about {'xyz'[k]}"] * (at != k) + ["is of the other sign"] * (value < 0.0)
+        if not 1.0 - WRONG < abs(value) < 1.0 + WRONG:
+            units = [one for one, size in TAKEN if abs(math.log(abs(value) / size)) < WRONG]
+            words.append(
+                f"reads as if its unit were {units[0]}" if units else f"reads {1 / abs(value):.2g} times the rate"
+            )
+        if abs(share) < SHOWN:
+            at, words = k, ["does not show its turns"]
+        said.setdefault(" and ".join(words), []).append(GYRO[at])
+    return "; ".join(f"{'each of ' * (len(who) > 1)}{', '.join(who)} {words}" for words, who in said.items())
+
+
 def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
-    """The gyros by the rests, and by the turns that are not left out. `held`: own parameters that stay at 0 error."""
-    if any(accel.tumble.noise[name].wide for name in GYRO):
-        near: list[Array] = []
-
-        def fit_at(share: float) -> Fit:
-            found = _calibrate(replace(accel, tumble=accel.tumble.with_drift(GYRO, share)), held, near, ROUGHLY).fit
-            near[:] = [found.theta]
-            return found
-
-        accel = replace(accel, tumble=accel.tumble.with_drift(GYRO, drift_share(fit_at)))
-        return _calibrate(accel, held, near)
-    return _calibrate(accel, held, [])
-
-
-def _calibrate(accel: Accelerometer, held: Mask | None, near: list[Array], settled: float = SETTLED) -> Gyroscope:
-    """The same with the drift as it is; from the parameters `near`, if there are any."""
-    problem = _Problem(accel)
-    of_accel, thermal = problem.of_accel, THERMAL_SD if accel.warmth.size else 0.0
+    """The gyros by the rests, and by the turns that are not left out. `held`: own parameters that stay at 0 error.
+    Raises UserError where the turns are not of these gyros."""
+    if fault := fault_of(accel):
+        raise UserError(f"no numbers: by the turns, {fault}; mend it by --unit or --column, or in the log")
+    problem, place = _Problem(accel), accel.place
+    thermal = THERMAL_SD if accel.tumble.has_temp else 0.0
     sd = np.repeat(
-        [BIAS_SD, G_SD, SCALE_SD, ANGLE_SD, accel.place.vertical_sd, thermal, accel.place.level_sd],
+        [BIAS_SD, G_SD, SCALE_SD, ANGLE_SD, place.vertical_sd, thermal, place.level_sd],
         [3, 9, 3, 6, 1, 3, 2 * (int(problem.chain[-1]) + 1)],
     )
-    prior = np.diag(np.concatenate([np.zeros(of_accel), np.maximum(sd, NONE) ** 2]))
-    prior[:of_accel, :of_accel] = accel.fit.covariance
+    prior = block_diag(accel.fit.covariance, np.diag(np.maximum(sd, NONE) ** 2))
     mean = np.concatenate([accel.fit.theta, np.zeros(sd.size)])
-    mean[of_accel:][SCALE] = 1.0
+    mean[OF_ACCEL:][SCALE] = 1.0
     start = mean.copy()
-    start[of_accel:][BIAS] = problem.y.mean(axis=0)
-    keep = None if held is None else np.concatenate([np.zeros(of_accel, bool), held])
-    found = fit(problem, near[0] if near else start, mean, prior, keep, settled)
-    return Gyroscope(found, of_accel, problem.turns)
+    start[OF_ACCEL:][BIAS] = problem.y.mean(axis=0)
+    keep = None if held is None else np.concatenate([np.zeros(OF_ACCEL, bool), held])
+    found, _ = accel.tumble.fitted(GYRO, problem.under, start, mean, prior, keep)
+    return Gyroscope(found, OF_ACCEL, problem.turns)
 
 
 @dataclass(frozen=True)
@@ -154,32 +160,50 @@ class _Directions:
     to_reading: Array
     matrix: Array
 
+    @staticmethod
+    def of(theta: Array, tumble: Tumble) -> _Directions:
+        """At parameters."""
+        force, to, M = forces(theta, tumble.accel, tumble.warmth)
+        size = np.linalg.norm(force, axis=1)[:, None]
+        u = force / size
+        flat = (np.eye(3) - u[:, :, None] * u[:, None, :]) / size[:, None]
+        return _Directions(u, force / STANDARD_GRAVITY, flat @ to, flat @ M, M)
+
 
 class _Problem:
     """Residuals of rests and turns, their derivatives and their covariance, at parameters."""
 
     def __init__(self, accel: Accelerometer) -> None:
-        tumble = accel.tumble
-        rests = tumble.rests
-        self.accel, self.count, self.of_accel = accel, len(rests), accel.fit.theta.size
-        self.turns = tuple(one for one in tumble.turns if not one.reason)
+        self.accel, self.tumble = accel, accel.tumble
+        rests = self.tumble.rests
+        self.count, self.temp = len(rests), float(self.tumble.temp.mean())
+        self.turns = tuple(one for one in self.tumble.turns if not one.reason)
         self.behind = {one.first + 1: k for k, one in enumerate(self.turns)}  # turn that leads to a rest
         self.chain = np.cumsum([k not in self.behind for k in range(self.count)]) - 1
-        self.a, self.y = (np.array([getattr(one, name) for one in rests]) for name in ("accel", "gyro"))
-        self.warm = accel.warmth if accel.warmth.size else np.zeros(self.count)
-        self.temp = float(np.mean([one.temp for one in rests])) if accel.warmth.size else math.nan
-        begin = np.concatenate([tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
-        end = np.concatenate([tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])
-        self.slow = [drift(tumble.noise[name], begin, end, accel.reference_s) for name in GYRO]
-        self.white = np.array([tumble.noise[name].white for name in GYRO])
+        self.y = np.nan_to_num([one.gyro for one in rests])  # one that is not recorded weighs nothing
+        self.white = np.array([self.tumble.noise[name].white for name in GYRO])
         self.of_rests = [self.white / one.seconds + one.rounded[3:] for one in rests]
-        self.of_accel_means = [
-            accelerometer.means_covariance(tumble, k, name, accel.reference_s) for k, name in enumerate(ACCEL)
-        ]
+        self.of_accel_means = [means_covariance(self.tumble, k, float(accel.fit.theta[k])) for k in range(3)]
+        self.begin_s = np.concatenate([self.tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
+        self.end_s = np.concatenate([self.tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])
+        self.last: tuple[Array, tuple[Array, ...]] | None = None
 
-    def __call__(self, theta: Array) -> tuple[Array, Array, Array]:
-        count, own = self.count, theta[self.of_accel :]
-        at = self._directions(theta)
+    def under(self, tumble: Tumble) -> Problem:
+        """The problem under the noise of a tumble. The integrals of the last parameters are kept."""
+        slow = [drift(tumble.noise[name], self.begin_s, self.end_s, tumble.reference_s) for name in GYRO]
+
+        def problem(theta: Array) -> tuple[Array, Array, Array]:
+            if self.last is None or not np.array_equal(theta, self.last[0]):
+                self.last = theta.copy(), self._laid(theta)
+            r, J, R, by_gyro = self.last[1]
+            return r, J, R + sum(by_gyro[:, :, j] @ slow[j] @ by_gyro[:, :, j].T for j in range(3))
+
+        return problem
+
+    def _laid(self, theta: Array) -> tuple[Array, Array, Array, Array]:
+        """Residuals, their derivatives, their covariance without the gyros' drift, and how that drift enters them."""
+        count, own, warm = self.count, theta[OF_ACCEL:], self.tumble.warmth
+        at = _Directions.of(theta, self.tumble)
         size = 3 * count + 2 * len(self.turns)
         r, J = np.zeros(size), np.zeros((size, theta.size))
         # Noise enters by the means of the gyros over rests and turns, by those of the accelerometers, and within turns.
@@ -188,15 +212,15 @@ class _Problem:
         level = np.zeros((3, 2))  # the level directions of the chain's first rest, in the frame of this one
         earth = (self.accel.place.vertical or 0.0) + own[VERTICAL]
         for k in range(count):
-            of_level = self.of_accel + LEVEL + 2 * int(self.chain[k]) + np.arange(2)
+            of_level = OF_ACCEL + LEVEL + 2 * int(self.chain[k]) + np.arange(2)
             if k in self.behind:
                 n = self.behind[k]
                 rows = slice(3 * count + 2 * n, 3 * count + 2 * n + 2)
                 way = _Way(self.turns[n], own, theta, at, self.temp)
                 level = way.Q.T @ level
                 r[rows] = way.residual - way.slope @ level @ theta[of_level] * way.seconds
-                J[rows, : self.of_accel] = way.basis @ (way.Q.T @ at.to_accel[k - 1] - at.to_accel[k])
-                J[rows, self.of_accel : self.of_accel + LEVEL] = way.derivatives
+                J[rows, :OF_ACCEL] = way.basis @ (way.Q.T @ at.to_accel[k - 1] - at.to_accel[k])
+                J[rows, OF_ACCEL : OF_ACCEL + LEVEL] = way.derivatives
                 J[rows, of_level] = -way.slope @ level * way.seconds
                 by_gyro[rows, count + n] = way.to_bias
                 by_accel[rows, k - 1] = way.basis @ way.Q.T @ at.to_reading[k - 1]
@@ -205,35 +229,17 @@ class _Problem:
             else:
                 level = _across(at.u[k]).T
             rows = slice(3 * k, 3 * k + 3)
-            drawn = own[BIAS] + own[THERMAL] * self.warm[k] + own[G].reshape(3, 3) @ at.f[k]
+            drawn = own[BIAS] + own[THERMAL] * warm[k] + own[G].reshape(3, 3) @ at.f[k]
             r[rows] = self.y[k] - drawn - earth * at.u[k] - level @ theta[of_level]
-            of = J[rows, self.of_accel :]
-            of[:, BIAS], of[:, THERMAL] = -np.eye(3), -np.eye(3) * self.warm[k]
+            of = J[rows, OF_ACCEL:]
+            of[:, BIAS], of[:, THERMAL] = -np.eye(3), -np.eye(3) * warm[k]
             of[:, G], of[:, VERTICAL] = -np.kron(np.eye(3), at.f[k]), -at.u[k]
             J[rows, of_level] = -level
             by_gyro[rows, k] = np.eye(3)
             R[rows, rows] = np.diag(self.of_rests[k])
         for j in range(3):
-            R += by_gyro[:, :, j] @ self.slow[j] @ by_gyro[:, :, j].T
             R += by_accel[:, :, j] @ self.of_accel_means[j] @ by_accel[:, :, j].T
-        return r, J, R
-
-    def _directions(self, theta: Array) -> _Directions:
-        A, scale = matrix_of(theta), theta[accelerometer.SCALE]
-        x = self.a - theta[accelerometer.BIAS] - self.warm[:, None] * accelerometer.thermal_of(theta)
-        force = x @ A.T
-        size = np.linalg.norm(force, axis=1)
-        u = force / size[:, None]
-        flat = (np.eye(3) - u[:, :, None] * u[:, None, :]) / size[:, None, None]
-        to_reading = flat @ A
-        to = np.zeros((self.count, 3, self.of_accel))
-        to[:, :, accelerometer.BIAS] = -to_reading
-        to[:, :, accelerometer.SCALE] = flat @ (A / scale * x[:, None, :])
-        for k, (row, column) in enumerate(accelerometer.PLACES):
-            to[:, :, accelerometer.ANGLE.start + k] = flat[:, :, row] * (x * scale)[:, [column]]
-        if self.accel.warmth.size:
-            to[:, :, accelerometer.THERMAL] = -to_reading * self.warm[:, None, None]
-        return _Directions(u, force / STANDARD_GRAVITY, to, to_reading, A)
+        return r, J, R, by_gyro
 
 
 class _Way:
@@ -241,11 +247,11 @@ class _Way:
     the `slope` [2, 3] of the residual to a rotation of the end, and its derivatives to the gyros' own parameters."""
 
     def __init__(self, turn: Turn, own: Array, theta: Array, at: _Directions, temp: float) -> None:
-        warm = 0.0 if math.isnan(temp) else turn.temp - temp
-        offset = theta[accelerometer.BIAS] + warm * accelerometer.thermal_of(theta)
+        warm = float(np.nan_to_num(turn.temp - temp))
+        offset = theta[accelerometer.BIAS] + warm * theta[accelerometer.THERMAL]
         force = (turn.accel - offset) @ at.matrix.T / STANDARD_GRAVITY
         clean = turn.gyro - own[BIAS] - own[THERMAL] * warm - force @ own[G].reshape(3, 3).T
-        self.matrix, self.dt = gyro_matrix(own), turn.dt
+        self.matrix, self.dt, self.unsure = gyro_matrix(own), turn.dt, turn.unsure
         self.Q, back = turned(clean @ self.matrix.T, turn.dt)
         weight = np.full(len(clean), turn.dt)
         weight[[0, -1]] *= 0.5
@@ -270,7 +276,7 @@ class _Way:
     def white(self, density: Array) -> Array:
         """Covariance [2, 2] of the residual by white noise within the turn, N^2 of each gyro [3]."""
         noisy = self.slope @ self.P @ self.matrix
-        found: Array = np.einsum("kij,j,klj->il", noisy, density / self.dt, noisy)
+        found: Array = np.einsum("kij,kj,klj->il", noisy, density / self.dt + self.unsure, noisy)
         return found
 
 
@@ -280,9 +286,9 @@ def _across(u: Array) -> Array:
     return found
 
 
-def causes(gyro: Gyroscope, rests: Sequence[Rest]) -> list[tuple[str, float]]:
+def causes(gyro: Gyroscope, tumble: Tumble) -> list[tuple[str, float]]:
     """Causes of residuals beyond their sd, as `Fit.surest` has them: each rest and each turn by itself."""
-    one = np.eye(gyro.fit.white.size)
+    one, rests = np.eye(gyro.fit.white.size), tumble.rests
     tried = [
         (f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", one[:, 3 * k : 3 * k + 3])
         for k, rest in enumerate(rests)

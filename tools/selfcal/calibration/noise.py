@@ -49,10 +49,12 @@ class Noise:
     words: str
     wide: bool = False
 
-    def scaled(self, share: float) -> Noise:
-        """With this share of the drift's variance, if its prior is wide."""
-        terms = tuple(Term(share * one.square, one.alpha) for one in self.terms)
-        return replace(self, terms=terms) if self.wide else self
+    def scaled(self, shares: Array) -> Noise:
+        """With these shares [terms] of the terms' variances, if their prior is wide."""
+        if not self.wide:
+            return self
+        terms = zip(shares.tolist(), self.terms, strict=True)
+        return replace(self, terms=tuple(Term(share * one.square, one.alpha) for share, one in terms))
 
 
 def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Array:
@@ -115,7 +117,7 @@ def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
     size = factor(group.unit, unit)
     priors, words = group.priors, f"{model.name}"
     if not known(group):
-        words = f"not known: the prior of {model.name}, weighed by the residuals"
+        words = f"not known: the prior of {model.name}, weighed by this log"
         priors = laid(priors, N / size) if N is not None else priors
     middle = {key: (mean_square(one), one.median) for key, one in priors.items() if key != "bias"}
     terms = of_laws(model.laws, model.hypotheses, dict.fromkeys(model.laws, middle))

@@ -1,7 +1,7 @@
 """How many rests of which length a calibration takes: the intervals of a part that is as its model file says.
 
-Nothing is drawn. Intervals follow from the positions, the covariance of the means and the priors: the fit of readings
-without noise has them.
+Positions are drawn, as a hand places them. Intervals follow from them, the covariance of the means and the priors: the
+fit of readings without noise has them.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from selfcal.base.output import console_of
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.earth import Place
-from selfcal.calibration.noise import of_model
-from selfcal.calibration.rests import ACCEL, GYRO, UNITS, Rest, Tumble
+from selfcal.calibration.noise import Noise, of_model
+from selfcal.calibration.rests import ACCEL, CUT_S, GYRO, PIECES, REST_S, UNITS, Rest, Tumble
 from selfcal.model.file import Model
 
 Array = NDArray[np.float64]
@@ -31,12 +31,16 @@ Array = NDArray[np.float64]
 SCHEMA = "selfcal.plan_tumble/1"
 #: Sides that are up, by rests: six flats; an edge pair in each plane as well; and the edges opposite and six corners.
 FLATS = ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0))
-EDGES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, -1, 1))
+#: Each pair of edges shows the square of the scale of the axis that both have up alike: x, z, y.
+EDGES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, 1, -1))
 OPPOSITE = tuple((-x, -y, -z) for x, y, z in EDGES)
 CORNERS = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1))
 POSITIONS = {6: FLATS, 12: FLATS + EDGES, 24: FLATS + EDGES + OPPOSITE + CORNERS}
 #: Lengths of a rest that are looked at, s, and the time of a turn between two, s.
-LENGTHS_S, TURN_S = (5.0, 10.0, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
+LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
+#: A hand places the part off by so much, rad, sd of each of two angles. Placements that are drawn, and the share of
+#: them that have what is planned.
+PLACED, DRAWN, SHARE = math.radians(3.0), 10, 0.9
 #: Share of the mean square of a drift that is not known: from the top of three decades to their middle.
 MIDDLE = 0.014
 #: What may be wished: the sensor, the unit here, and where the sensor's parameters are.
@@ -82,22 +86,38 @@ class Wish:
 
 
 def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
-    """Half of the widest 90 % interval of each group in WISHES, SI units; infinite where one is not identified."""
+    """Half of the widest 90 % interval of each group in WISHES, SI units, that SHARE of the placements have at most;
+    infinite where one is not identified."""
     noise = {}
     for name in ACCEL + GYRO:
         group = model.group_of(name)
         N = group.priors["N"].median * units.factor(group.unit, UNITS[name])
-        noise[name] = replace(of_model(model, name, UNITS[name], N).scaled(MIDDLE), wide=False)
-    up = np.array(POSITIONS[count], float)
-    up *= STANDARD_GRAVITY / np.linalg.norm(up, axis=1)[:, None]
-    begin = (length_s + TURN_S) * np.arange(count)
-    none = np.zeros(6)
+        own = of_model(model, name, UNITS[name], N)
+        noise[name] = replace(own.scaled(np.full(len(own.terms), MIDDLE)), wide=False)
+    random = np.random.default_rng(count)
+    found = [_of_placement(noise, _placed(random, POSITIONS[count]), length_s) for _ in range(DRAWN)]
+    return {name: sorted(one[name] for one in found)[math.ceil(SHARE * DRAWN) - 1] for name in WISHES}
+
+
+def _placed(random: np.random.Generator, positions: Sequence[tuple[int, int, int]]) -> Array:
+    """Readings [n, 3], m/s^2, of a part in positions, as a hand places it; its scales and angles are of the priors."""
+    up = np.array(positions, float)
+    up /= np.linalg.norm(up, axis=1)[:, None]
+    up += PLACED * random.standard_normal(up.shape)
+    scale = 1.0 + accelerometer.SCALE_SD * random.standard_normal(3)
+    part = accelerometer.shaped(scale, accelerometer.ANGLE_SD * random.standard_normal(3), accelerometer.PLACES)
+    return np.asarray(STANDARD_GRAVITY * up / np.linalg.norm(up, axis=1)[:, None] @ np.linalg.inv(part).T)
+
+
+def _of_placement(noise: dict[str, Noise], readings: Array, length_s: float) -> dict[str, float]:
+    """The same for one placement with readings [n, 3]."""
+    begin = (length_s + TURN_S) * np.arange(len(readings)) + 0.5 * CUT_S
+    none, seconds = np.zeros(6), length_s - CUT_S
     rests = tuple(
-        Rest(0, (a, a + length_s), a, a + length_s, length_s, f, none[:3], math.nan, none, none[:3])
-        for a, f in zip(begin, up, strict=True)
+        Rest(0, (a, a + seconds), a, a + seconds, seconds, f, none[:3], math.nan, none, np.zeros((PIECES, 6)))
+        for a, f in zip(begin, readings, strict=True)
     )
-    tumble = Tumble(rests, (), noise)
-    accel = accelerometer.calibrate(tumble, Place(STANDARD_GRAVITY, 0.0, 0.0, 0.0, 0.0, ""))
+    accel = accelerometer.calibrate(Tumble(rests, (), noise), Place(STANDARD_GRAVITY, 0.0, 0.0, 0.0, 0.0, ""))
     gyro = gyroscope.calibrate(accel)
     found = {}
     for name, (sensor, _, where) in WISHES.items():
@@ -113,15 +133,29 @@ def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
     wishes = [Wish.of(text) for text in texts]
     rows = []
     for count in POSITIONS:
-        entry: dict[str, Any] = {"rests": count, "rest_s": None, "total_s": None, "reached": None}
         for length_s in LENGTHS_S:
             found = reached(model, count, length_s)
-            if all(found[one.name] <= one.most for one in wishes):
-                total = count * length_s + (count - 1) * TURN_S
-                entry = {"rests": count, "rest_s": length_s, "total_s": total, "reached": found}
+            missed = [one.text for one in wishes if found[one.name] > one.most]
+            if not missed:
                 break
-        rows.append(entry)
-    return {"schema": SCHEMA, "model": str(model.path), "wishes": [one.text for one in wishes], "rows": rows}
+        total = count * length_s + (count - 1) * TURN_S
+        rows.append(
+            {
+                "rests": count,
+                "rest_s": None if missed else length_s,
+                "total_s": None if missed else total,
+                "reached": {name: value if math.isfinite(value) else None for name, value in found.items()},
+                "missed": missed,
+                "not_identified": [name for name, value in found.items() if not math.isfinite(value)],
+            }
+        )
+    return {
+        "schema": SCHEMA,
+        "model": str(model.path),
+        "placed_deg": math.degrees(PLACED),
+        "wishes": [one.text for one in wishes],
+        "rows": rows,
+    }
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
@@ -132,12 +166,14 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
 
     line("; ".join(document["wishes"]))
+    line(f"{SHARE:.0%} of placements by hand, off by {document['placed_deg']:g} deg (sd), reach it with:")
     met = [one for one in document["rows"] if one["rest_s"] is not None]
     for one in document["rows"]:
+        lost = f"; not identified: {', '.join(one['not_identified'])}" if one["not_identified"] else ""
         if one["rest_s"] is None:
-            line(f"  {one['rests']} rests: no length up to {LENGTHS_S[-1]:g} s suffices")
+            line(f"  {one['rests']} rests: no length up to {LENGTHS_S[-1]:g} s has {', '.join(one['missed'])}{lost}")
             continue
-        line(f"  {one['rests']} rests of {one['rest_s']:g} s: {one['total_s'] / 60.0:.1f} minutes")
+        line(f"  {one['rests']} rests of {one['rest_s']:g} s: {one['total_s'] / 60.0:.1f} minutes{lost}")
     if met:
         best = min(met, key=lambda one: float(one["total_s"]))
         line(f"rest it {best['rest_s']:g} s in each of {best['rests']} positions")

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, runs
 from selfcal.base.units import factor
-from selfcal.calibration.noise import LONG_S, Noise, measured, of_model, of_rest, rounding
+from selfcal.calibration.fit import Fit, Mask, Problem, fit, linearized
+from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
@@ -24,8 +27,17 @@ ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
 #: Seconds that are cut off a rest beside a motion: its first and last movement is below the noise of a piece.
 SETTLE_S = PIECE_S
-#: Shortest rest, s, and rests at most: the fit is dense.
+#: Shortest rest that is advised, s, and what the search for motion takes off both ends of one at most, s.
+REST_S, CUT_S = 10.0, 6.0 * PIECE_S
+#: Shortest rest that counts, s of readings, and rests at most: the fit is dense.
 LEAST_S, MOST = 2.0, 200
+#: Pieces of a rest: their differences show its drift.
+PIECES = 8
+#: Shares of a drift's mean square under a wide prior that are weighed: three decades of its deviation.
+#: Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
+SHARES, RESTLESS = 10.0 ** -np.arange(0.0, 6.5, 0.75), 10.0
+#: N^2 of a gyro that is not recorded beside others: it weighs nothing.
+UNRECORDED = 1e6
 #: Readings at the extreme in a row that a turn clips at, and steps of the lattice to the readings beside them at least.
 FLAT, STEEP = 3, 3.0
 #: Assumed time between two logs without stamps of one clock, s.
@@ -36,7 +48,7 @@ BETWEEN_S = 60.0
 class Rest:
     """A rest: `log` and its time in it, s, its `begin_s` and `end_s` on the clock of all logs, `seconds` of readings
     in it; means `accel` [3], m/s^2, and `gyro` [3], rad/s, NaN without gyros; `temp`, degC, or NaN; `rounded` [6]:
-    variance of the means by a lattice that the noise does not dither; `moved` [3]: difference of its halves, m/s^2."""
+    variance of the means by a lattice that the noise does not dither; `pieces` [PIECES, 6]: means of equal parts."""
 
     log: int
     at_s: tuple[float, float]
@@ -47,18 +59,20 @@ class Rest:
     gyro: Array
     temp: float
     rounded: Array
-    moved: Array
+    pieces: Array
 
 
 @dataclass(frozen=True)
 class Turn:
     """Samples between the rests `first` and the one behind it: `accel` [n, 3], m/s^2, and `gyro` [n, 3], rad/s, each
-    `dt` s. `reason`: why the turn is left out, or ""."""
+    `dt` s; lost ones are bridged. `unsure` [n, 3]: variance of `gyro` by that. `reason`: why the turn is left out, or
+    ""."""
 
     first: int
     dt: float
     accel: Array
     gyro: Array
+    unsure: Array
     temp: float
     reason: str = ""
 
@@ -75,12 +89,88 @@ class Tumble:
 
     @property
     def has_gyro(self) -> bool:
-        """The logs have three gyros."""
+        """The logs have gyros; one that is not recorded weighs nothing."""
         return GYRO[0] in self.noise
 
-    def with_drift(self, names: Sequence[str], share: float) -> Tumble:
-        """With this share of the wide drift of axes."""
-        return replace(self, noise={**self.noise, **{name: self.noise[name].scaled(share) for name in names}})
+    def wide(self, names: Sequence[str]) -> int:
+        """Terms of the drift of axes whose prior spans decades; 0: there are none."""
+        return max((len(self.noise[name].terms) for name in names if self.noise[name].wide), default=0)
+
+    def with_drift(self, names: Sequence[str], shares: Array) -> Tumble:
+        """With these shares [terms] of the wide drift of axes."""
+        return replace(self, noise={**self.noise, **{name: self.noise[name].scaled(shares) for name in names}})
+
+    def fitted(
+        self, names: Sequence[str], problem_of: Callable[[Tumble], Problem], start: Array, mean: Array, prior: Array,
+        held: Mask | None = None,
+    ) -> tuple[Fit, Tumble]:  # fmt: skip
+        """The fit, and the tumble with the wide drift of axes as this log has it: posterior means of the variances of
+        its terms. Before, each term by itself is as likely, and its deviation uniform. A prior of its logarithm would
+        be decided by the least of SHARES, which no log contradicts (Gelman 2006). A rest in which the mount moved is
+        no drift's: none counts for more than RESTLESS."""
+        known, count = self, self.wide(names)
+        if count:
+            middle = self.with_drift(names, np.full(count, SHARES[SHARES.size // 2]))
+            start = fit(problem_of(middle), start, mean, prior, held).theta
+            tried = [[self.with_drift(names, share * one) for share in SHARES] for one in np.eye(count)]
+            within = np.array([[one.within(names) for one in row] for row in tried])
+            likely = np.maximum(within - within.max(axis=(0, 1)), -RESTLESS).sum(axis=2)
+            likely += [[linearized(problem_of(one), start, mean, prior, held).evidence for one in row] for row in tried]
+            weight = np.sqrt(SHARES) * np.exp(likely - likely.max())
+            known = self.with_drift(names, weight @ SHARES / weight.sum())
+        return fit(problem_of(known), start, mean, prior, held), known
+
+    def _pieces(self, names: Sequence[str]) -> Iterator[tuple[int, Array, Array]]:
+        """Of each rest and axis the number of the rest, its pieces [PIECES], and their covariance but for what they
+        share."""
+        for k, name in enumerate(ACCEL + GYRO):
+            for n, one in enumerate(self.rests if name in names else ()):
+                edges = np.linspace(one.begin_s, one.end_s, PIECES + 1)
+                C = drift(self.noise[name], edges[:-1], edges[1:], one.end_s)
+                white = self.noise[name].white * PIECES / one.seconds + one.rounded[k]
+                if np.isfinite(one.pieces[:, k]).all():
+                    yield n, one.pieces[:, k], C + white * np.eye(PIECES)
+
+    def within(self, names: Sequence[str]) -> Array:
+        """ln of the likelihood of the differences between neighbouring pieces of each rest [n], but for a constant."""
+        found, step = np.zeros(len(self.rests)), np.diff(np.eye(PIECES), axis=0)
+        for n, x, C in self._pieces(names):
+            d, R = step @ x, step @ C @ step.T
+            found[n] -= 0.5 * float(d @ np.linalg.solve(R, d) + np.linalg.slogdet(R)[1])
+        return found
+
+    def moved(self, names: Sequence[str]) -> Array:
+        """Probability [n] that the halves of each rest are so far apart by chance, times the number of rests."""
+        square, halves = np.zeros(len(self.rests)), np.repeat([-1.0, 1.0], PIECES // 2)
+        for n, x, C in self._pieces(names):
+            square[n] += float((halves @ x) ** 2 / (halves @ C @ halves))
+        return np.asarray(len(self.rests) * chi2.sf(square, len(names)))
+
+    @property
+    def accel(self) -> Array:
+        """Means [n, 3] of the accelerometers, m/s^2."""
+        return np.array([one.accel for one in self.rests])
+
+    @property
+    def temp(self) -> Array:
+        """[n], degC; 0 where not all rests have one."""
+        temp = np.array([one.temp for one in self.rests])
+        return temp if np.isfinite(temp).all() else np.zeros(temp.size)
+
+    @property
+    def has_temp(self) -> bool:
+        """All rests have a temperature."""
+        return all(math.isfinite(one.temp) for one in self.rests)
+
+    @property
+    def warmth(self) -> Array:
+        """Temperatures [n] about their mean, degC."""
+        return np.asarray(self.temp - self.temp.mean())
+
+    @property
+    def reference_s(self) -> float:
+        """When the bias is to be known: the end of the last rest, s."""
+        return float(self.end_s.max())
 
     @property
     def begin_s(self) -> Array:
@@ -95,33 +185,35 @@ class Tumble:
 
 @dataclass(frozen=True)
 class _Log:
-    """A log on the clock of its fastest axes: its columns in the units used here, the step of the lattice of each (0:
-    none), its temperature, degC, NaN without one, and the rows of its rests."""
+    """A log on the clock of its fastest axes: its columns in the units used here, the same with straight lines over
+    lost readings, the step of the lattice of each (0: none), its temperature, degC, NaN without one, and the rows of
+    its rests."""
 
     recording: Recording
     begin_s: float
     own: dict[str, Array]
+    bridged: dict[str, Array]
     steps: dict[str, float]
     temp: Array
     rests: tuple[slice, ...]
 
     def seconds(self, rows: slice) -> float:
-        """Seconds of readings in rows."""
-        return float(rows.stop - rows.start) / self.recording.rate_hz
+        """Seconds of readings in rows, of the axis that lost most."""
+        return min(int(np.isfinite(values[rows]).sum()) for values in self.own.values()) / self.recording.rate_hz
 
 
 def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: bool) -> Tumble:
     """Rests and turns of logs in order of time. `part_stated`: the model is the part's own, and so is its range.
     Raises UserError where accelerometers are missing, or too many rests are there."""
-    gyros = all(name in one.columns for one in recordings for name in GYRO)
-    axes = ACCEL + GYRO if gyros else ACCEL
+    gyros = tuple(name for name in GYRO if all(name in one.columns for one in recordings))
+    axes = ACCEL + gyros
     begins, notes = _begins(recordings)
     logs = [_log(one, begin_s, axes) for one, begin_s in zip(recordings, begins, strict=True)]
     if sum(len(one.rests) for one in logs) > MOST:
         raise UserError(f"more than {MOST} rests: choose a stretch with --start and --end")
     ranges = {name: _range(model, name) if part_stated else math.inf for name in axes}
     typical = {
-        name: _median([float(np.nanstd(log.own[name][rows])) for log in logs for rows in log.rests]) for name in axes
+        name: _median([float(np.std(log.bridged[name][rows])) for log in logs for rows in log.rests]) for name in axes
     }
     rests: list[Rest] = []
     turns: list[Turn] = []
@@ -130,17 +222,20 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
         end = -1  # the row behind the rest before, if that one counts
         for rows in log.rests:
             rest = _rest(k, log, rows)
-            if reason := _clipped_at_rest(log, rows, ranges, typical):
+            if reason := _unfit(log, rows, ranges, typical):
                 where = f"{recordings[k].path}, " if len(logs) > 1 else ""
                 left_out.append(f"rest of {where}{rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s: {reason}")
                 end = -1
                 continue
             if gyros and end >= 0:
-                turns.append(_turn(log, end, rows.start, len(rests) - 1, ranges))
+                turns.append(_turn(log, end, rows.start, (rests[-1], rest), len(rests) - 1, ranges))
             rests.append(rest)
             end = rows.stop
     long_rest = None if part_stated else _long_rest(logs)
     noise = {name: _noise(logs, name, model, long_rest) for name in axes}
+    for name in (one for one in GYRO if gyros and one not in axes):
+        notes.append(f"{name} is not recorded: it has no number, and turns take three gyros")
+        noise[name] = Noise(UNRECORDED, (), "")
     return Tumble(tuple(rests), tuple(turns), noise, tuple(left_out), tuple(notes))
 
 
@@ -150,23 +245,25 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         if name not in whole.columns:
             there = ", ".join(whole.columns)
             raise UserError(f"{whole.path}: there is no column '{name}' (there are {there}): tumble takes ax, ay, az")
-    kinds = [names for names in (ACCEL, GYRO) if names[0] in axes]
-    recording = whole.along(*max(kinds, key=lambda names: whole.clock_of(names[0]).rate_hz))
+    clock = whole.columns[max(axes, key=lambda name: whole.clock_of(name).rate_hz)].clock
+    recording = whole.along(*(name for name in axes if whole.columns[name].clock is clock))
     own = {name: recording.in_unit(name, UNITS[name]) for name in axes}
     steps = {name: step_of(values[np.isfinite(values)])[0] for name, values in own.items()}
     has_temp = "temp" in recording.columns
     temp = recording.in_unit("temp", "degC") if has_temp else np.full(recording.samples, math.nan)
-    found = rest_of(recording, axes)
     time = recording.time_s + recording.start_s
+    bridged = {name: _over_lost(time, values) for name, values in own.items()}
+    columns = {name: replace(recording.columns[name], values=values) for name, values in bridged.items()}
+    found = rest_of(replace(recording, columns=columns), axes)
     still = found.still or ((float(time[0]), float(time[-1])),)
     rests = []
     for begin_rest, end_rest in still:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
         end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in found.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
-        if end - begin >= LEAST_S and behind - first > 2:
+        if end - begin >= LEAST_S and behind - first >= PIECES:
             rests.append(slice(first, behind))
-    return _Log(recording, begin_s, own, steps, temp, tuple(rests))
+    return _Log(recording, begin_s, own, bridged, steps, temp, tuple(rests))
 
 
 def _long_rest(logs: Sequence[_Log]) -> Recording | None:
@@ -188,7 +285,7 @@ def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording |
     pieces = []
     for log in logs:
         size = max(1, round(PIECE_S * log.recording.rate_hz))
-        pieces += [block_means(log.own[name][rows], size) for rows in log.rests]
+        pieces += [block_means(log.bridged[name][rows], size) for rows in log.rests]
     white = measured(pieces, PIECE_S)
     return of_model(model, name, UNITS[name], None if white is None else math.sqrt(white))
 
@@ -222,15 +319,16 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     """The means of rows of a log."""
     recording, own = log.recording, log.own
     time = recording.time_s
-    half = (rows.start + rows.stop) // 2
+    cut = np.linspace(rows.start, rows.stop, PIECES + 1).astype(int).tolist()
 
     def means(names: tuple[str, ...], part: slice) -> Array:
-        return np.array([np.nanmean(own[name][part]) if name in own else math.nan for name in names])
+        known = [own[name][part][np.isfinite(own[name][part])] if name in own else np.zeros(0) for name in names]
+        return np.array([one.mean() if one.size else math.nan for one in known])
 
     rounded = []
     for name in ACCEL + GYRO:
         step = log.steps.get(name, 0.0)
-        scatter = float(np.nanvar(own[name][rows])) if name in own else 0.0
+        scatter = float(np.var(log.bridged[name][rows])) if name in own else 0.0
         rounded.append(rounding(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
     begin, end = float(time[rows.start]), float(time[rows.stop - 1]) + 1.0 / recording.rate_hz
     return Rest(
@@ -243,12 +341,15 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
         means(GYRO, rows),
         float(np.mean(log.temp[rows])),
         np.array(rounded),
-        means(ACCEL, slice(half, rows.stop)) - means(ACCEL, slice(rows.start, half)),
+        np.array([means(ACCEL + GYRO, slice(a, b)) for a, b in itertools.pairwise(cut)]),
     )
 
 
-def _clipped_at_rest(log: _Log, rows: slice, ranges: dict[str, float], typical: dict[str, float]) -> str:
-    """Why a rest does not count: an axis at its range, or without the scatter that it has in the other rests."""
+def _unfit(log: _Log, rows: slice, ranges: dict[str, float], typical: dict[str, float]) -> str:
+    """Why a rest does not count: an axis that is lost, at its range, or without its scatter of the other rests."""
+    for name, values in log.own.items():
+        if 2 * np.isfinite(values[rows]).sum() < rows.stop - rows.start:
+            return f"more than half of its samples of {name} are missing"
     for name in ACCEL:
         part = log.own[name][rows]
         stuck = typical[name] > 0.5 * log.steps[name] and not np.nanstd(part) > 0.0
@@ -257,19 +358,54 @@ def _clipped_at_rest(log: _Log, rows: slice, ranges: dict[str, float], typical: 
     return ""
 
 
-def _turn(log: _Log, begin: int, end: int, rest: int, ranges: dict[str, float]) -> Turn:
-    """Samples from the last one of a rest to the first one of the next."""
-    recording, own = log.recording, log.own
+def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, ranges: dict[str, float]) -> Turn:
+    """Samples from the last one of a rest to the first one of the next; `ends`: the two rests."""
     rows = slice(begin - 1, end + 1)
-    reason = "samples are missing in it" if recording.missing_before[begin : end + 1].any() else ""
-    for name in ACCEL + GYRO:
-        part = own[name][rows]
-        if not np.isfinite(part).all():
-            reason = reason or f"samples of {name} are missing in it"
-        elif np.abs(part).max() >= ranges[name] or _flat(part, own[name], log.steps[name]):
-            reason = reason or f"{name} clips in it"
-    accel, gyro = (np.column_stack([own[name][rows] for name in names]) for names in (ACCEL, GYRO))
-    return Turn(rest, 1.0 / recording.rate_hz, accel, gyro, float(np.mean(log.temp[rows])), reason)
+    place = log.recording.clock.place[rows]
+    place = place - place[0]
+    columns, unsure, reasons = [], [], []
+    for k, name in enumerate(ACCEL + GYRO):
+        if name not in log.own:
+            reasons.append(f"{name} is not recorded")
+            continue
+        part = log.own[name][rows]
+        if np.nanmax(np.abs(part), initial=0.0) >= ranges[name] or _flat(part, log.own[name], log.steps[name]):
+            reasons.append(f"{name} clips in it")
+        whole = np.full(place[-1] + 1, math.nan)
+        whole[place] = part
+        if 2 * np.isfinite(whole).sum() < whole.size:
+            reasons.append(f"more than half of its samples of {name} are missing")
+        for at, rest in zip((0, -1), ends, strict=True):
+            if math.isnan(whole[at]):
+                whole[at] = (*rest.accel, *rest.gyro)[k]
+        values, variance = _bridged(whole)
+        columns.append(values)
+        unsure.append(variance)
+    none = np.zeros((1, 3))
+    accel, gyro = (none, none) if len(columns) < 6 else (np.column_stack(columns[a : a + 3]) for a in (0, 3))
+    temp = float(np.mean(log.temp[rows]))
+    reason = reasons[0] if reasons else ""
+    return Turn(first, 1.0 / log.recording.rate_hz, accel, gyro, np.column_stack(unsure[-3:]), temp, reason)
+
+
+def _over_lost(time: Array, values: Array) -> Array:
+    """Values [n] with straight lines over those that are NaN; as they are where all are."""
+    known = np.isfinite(values)
+    return np.interp(time, time[known], values[known]) if known.any() else values
+
+
+def _bridged(values: Array) -> tuple[Array, Array]:
+    """Readings of an axis [n] with straight lines over the lost ones, and the variance of the rate that this leaves
+    [n], as if it were that of one sample of each gap. A line over a span misses a parabola by 2/3 of its sagitta; the
+    mean square of the sagittas is that of all such spans of the turn, its noise included."""
+    lost, variance = ~np.isfinite(values), np.zeros(values.size)
+    values = _over_lost(np.arange(float(values.size)), values)
+    for first, behind in runs(lost):
+        span = behind - first + 1
+        half = min((span + 1) // 2, (values.size - 1) // 2)
+        sagitta = values[half:-half] - 0.5 * (values[: -2 * half] + values[2 * half :])
+        variance[(first + behind) // 2] = (2.0 / 3.0 * span) ** 2 * float(np.mean(sagitta**2))
+    return values, variance
 
 
 def _flat(part: Array, values: Array, step: float) -> bool:

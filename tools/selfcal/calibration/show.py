@@ -39,12 +39,16 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 
     turns = [one for one in document["turns"] if one["left_out"] is None]
     line(f"{len(document['rests'])} rests, {len(turns)} turns")
+    line(f"up, rest by rest: {', '.join(side_of(np.array(one['up'])) for one in document['rests'])}")
     gravity = document["gravity"]
     line(f"gravity {gravity['value']:.6g} m/s^2 ({gravity['source']}); scales take its error, which no rest shows")
     for sensor in ("accelerometer", "gyroscope"):
         found = document[sensor]
         if found is None:
             line("gyroscope: the logs have no gx, gy, gz")
+            continue
+        if "error" in found:
+            line(f"gyroscope: {found['error']}")
             continue
         drift = dict.fromkeys(one["drift"] for name, one in document["noise"].items() if name[0] == sensor[0])
         line("")
@@ -72,7 +76,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             line("residuals: no rest is left over to check the model with")
         else:
             said = "as the noise has it" if found["adequate"] else "NOT adequate"
-            line(f"residuals: {found['residual_ratio']:.2f} of their sd, {said}")
+            size = found["residual_ratio"]
+            line("residuals: " + (f"{size:.2f} of their sd, " if size is not None else "") + said)
         if found["adequate"] is False and not found["findings"]:
             line("  no single rest or turn, no square and no hysteresis explains it")
         for one in found["findings"][:3]:

@@ -38,6 +38,10 @@ def tumble(
         option("Write it for yaml, c, kalibr, px4 or ardupilot", metavar="FORMAT FILE", kind=tuple[str, Path]),
     ] = None,
     plot: Annotated[Path | str | None, option("Save the residuals (.png .pdf .svg)", metavar="FILE")] = None,
+    fail_on: Annotated[
+        str | None,
+        option("Exit code 1 when a sensor is not adequate, 2 when one cannot be judged", metavar="inadequate"),
+    ] = None,
     json: Json = None,
     start_s: Start = None,
     end_s: End = None,
@@ -49,11 +53,13 @@ def tumble(
     law, noise and range; without one the law is of a rest of 20 min in the log, else the default model's prior.
     `latitude`, `height`, `gravity`: see `calibration/earth.py`. `output`: the YAML file; `export`: a format of
     `calibration/export.py` and its file; `plot`: a picture of the residuals. `start_s`, `end_s`: the stretch to look
-    at, s.
-    Returns the document `selfcal.tumble/1` and writes it to `json`. Raises UserError for what the user can put right:
-    fewer than three rests, a place that is none, logs that are not of accelerometers.
+    at, s. `fail_on`: `inadequate`; it is only checked here.
+    Returns the document `selfcal.tumble/1` and writes it to `json`; gyros without an answer have an `error` there.
+    Raises UserError for what the user can put right: fewer than three rests, a place that is none, logs that are not of
+    accelerometers.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.batch.fail_on import INADEQUATE
     from selfcal.calibration import accelerometer, gyroscope
     from selfcal.calibration.document import document_of
     from selfcal.calibration.earth import place
@@ -72,13 +78,20 @@ def tumble(
         check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
+    if fail_on not in (None, INADEQUATE):
+        raise UserError(f"--fail-on: takes {INADEQUATE}")
     where = place(latitude, height, gravity)
     loaded = Model.load(model)
     recordings = [load(log, sensors=loaded.sensors, **reading).between(start_s, end_s) for log in each]
     found = tumble_of(recordings, loaded, part_stated=model is not None)
     accel = accelerometer.calibrate(found, where)
-    gyro = gyroscope.calibrate(accel) if found.has_gyro else None
-    document = document_of(recordings, found, accel, gyro)
+    gyro, failed = None, None
+    if found.has_gyro:
+        try:
+            gyro = gyroscope.calibrate(accel)
+        except UserError as error:
+            failed = str(error)
+    document = document_of(recordings, accel, gyro or failed)
     for form, file in ((("yaml", output),) if output is not None else ()) + ((export,) if export is not None else ()):
         write(form, file, accel, gyro, document)
     if plot is not None:
@@ -90,7 +103,9 @@ def tumble(
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     """Print the calibration."""
+    from selfcal.batch.fail_on import exit_code
     from selfcal.calibration.show import show as tables
 
     tables(document, to_stderr=to_stderr(given))
-    return 0
+    sensors = {name: document[name] for name in ("accelerometer", "gyroscope") if document[name] is not None}
+    return exit_code({"axes": sensors}, given.get("fail_on"))
