@@ -174,7 +174,7 @@ def test_after_a_look_that_harms_the_next_one_is_taken(monkeypatch: pytest.Monke
     monkeypatch.setattr(score, "gain", lambda look, *_: SimpleNamespace(harms=known[look.cause]))
     one = Diagnosed(state, state, record)
     monkeypatch.setattr(loop, "LOOKS", causes)
-    loop._rounds(record, one, lambda _: None)
+    loop._rounds(record, one, lambda _: None, loop.LOOKS)
     assert [finding.look.cause for finding in one.findings] == ["ramp"]
     assert [look.cause for look in one.harmful] == ["step", "pulse"]
     assert looked == [*known, *known]  # a round that takes one, and one that finds no more

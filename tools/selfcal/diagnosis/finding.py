@@ -40,8 +40,9 @@ class Finding:
 @dataclass
 class Diagnosed:
     """One axis after the loop: what it began as, what it is, and what was found in which record. `harmful`: looks that
-    predict held-out time clearly worse, which are no findings. `stated`: what the model file has already, which is none
-    either. `unfinished`: why it is not done, "" if it is. `hidden`: what moves several axes, this one among them."""
+    predict held-out time clearly worse, which are no findings; `dropped`: those that other axes explain. `stated`: what
+    the model file has already, which is none either. `unfinished`: why it is not done, "" if it is. `hidden`: what moves
+    several axes, this one among them."""
 
     first: State
     state: State
@@ -50,6 +51,7 @@ class Diagnosed:
     before: list[Statistic] = field(default_factory=list)
     after: list[Statistic] = field(default_factory=list)
     harmful: list[Look] = field(default_factory=list)
+    dropped: list[Look] = field(default_factory=list)
     stated: list[Finding] = field(default_factory=list)
     unfinished: str = ""
     hidden: Hidden | None = None

@@ -29,6 +29,8 @@ from selfcal.readings.motion import Moved
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)
 #: Those of a round at every sample, after one at means.
 QUICK: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and not cause.of_means)
+#: Those of causes that are of one axis: all axes together have nothing to say of them.
+OWN = {cause.looks for cause in CAUSES.values() if cause.looks and cause.grouping.settle is None}
 #: What the readings of an axis show by themselves.
 READ = (integrity.misread, integrity.held_samples, integrity.stuck, integrity.recurring)
 #: Why an axis is not done.
@@ -79,13 +81,13 @@ def diagnose_record(
     record = _of_means(record, found, means) if means else _together(record, found, advance)
     record = _fast(record, found)
 
-    def walk(name: str) -> None:
+    def walk(name: str, causes: Sequence[Looks] = ()) -> None:
         one, spent = found[name], ""
         one.record = record
         with suppress(Stopped):
             try:
                 with work.within(works[name]):
-                    _rounds(record, one, advance, name in means)
+                    _rounds(record, one, advance, causes or (QUICK if name in means else LOOKS))
             except work.Spent:
                 spent = SPENT
             _end(one, advance)
@@ -94,12 +96,20 @@ def diagnose_record(
     work.each(walk, found)
     if any(one.unfinished == INTERRUPTED for one in found.values()):
         raise Stopped
+    named = {name: [finding.look for finding in one.findings] for name, one in found.items()}
     settled = [
         _weed(found),
         *(cause.grouping.settle(record, found) for cause in CAUSES.values() if cause.grouping.settle is not None),
     ]
-    changed = list(dict.fromkeys(name for names in settled for name in names))
-    work.each(lambda name: _end(found[name], advance), changed)
+    for name, one in found.items():
+        one.dropped = [look for look in named[name] if not any(look.repeats(kept.look) for kept in one.findings)]
+
+    def again(name: str) -> None:
+        """What a finding that was dropped stood before may be one now."""
+        causes = tuple(looks for looks in (QUICK if name in means else LOOKS) if looks in OWN)
+        walk(name, causes) if found[name].dropped else _end(found[name], advance)
+
+    work.each(again, dict.fromkeys(name for names in settled for name in names))
     return found
 
 
@@ -318,9 +328,8 @@ def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], stat
     return replace(finding, look=replace(finding.look, estimate=estimate))
 
 
-def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], quick: bool = False) -> None:
-    """Name what is worth it until nothing is. `quick`: what means show is known."""
-    causes = QUICK if quick else LOOKS
+def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], causes: Sequence[Looks]) -> None:
+    """Name what is worth it of some causes until nothing is."""
     number = 1 + max((finding.round for finding in one.findings), default=0)
     idle: set[Looks] = set()
     while number <= ROUNDS and not one.state.below_lattice:
@@ -372,7 +381,7 @@ def _looked(one: Diagnosed, record: Record, causes: Sequence[Looks]) -> tuple[li
             look
             for look in cause(one.state, record)
             if named[look.cause] < (CAUSES[look.cause].grouping.most or ROUNDS)
-            and not any(map(look.repeats, one.harmful))
+            and not any(map(look.repeats, (*one.harmful, *one.dropped)))
         ]
         found += looks
         if all(look.net < NET_LEAST for look in looks):

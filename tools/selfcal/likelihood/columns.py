@@ -149,14 +149,15 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
 
 
 def _between(state: State, best: Tried) -> Tried:
-    """The best numbers between those of the grid."""
+    """The best numbers between those of the grid. Where the price is that of the grid alone, they gain nothing."""
+    paid, grid = best.shape.free > len(best.shape.columns), best.gain
     for reach in REACHES if best.shape.numbers and best.net > NEARLY else ():
         moves = np.exp2(reach * np.linspace(-1.0, 1.0, 2 * FINER + 1))
         shapes = best.shape.near([[*np.multiply(best.shape.theta, by)] for by in product(moves, repeat=_count(best))])
         gains = state.scores([one.columns for one in shapes], best.fit)
         moved = fitted(state, shapes[int(gains.argmax())]) if gains.max() > best.gain else best
         best = moved if moved.gain > best.gain else best
-    return best
+    return best if paid else replace(best, gain=grid)
 
 
 def _count(one: Tried) -> int:
