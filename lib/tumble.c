@@ -409,6 +409,44 @@ selfcal_tumble_status_t selfcal_tumble(selfcal_tumble_t *found, const selfcal_tu
     return status;
 }
 
+uint8_t selfcal_tumble_next(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
+                            selfcal_tumble_work_t *work, uint16_t *known) {
+    static const int8_t up[SELFCAL_TUMBLE_POSITIONS][3] = {{0, 0, 1},  {0, 1, 0},  {1, 0, 0}, {0, 0, -1},
+                                                           {0, -1, 0}, {-1, 0, 0}, {1, 1, 0}, {1, -1, 0},
+                                                           {1, 0, 1},  {-1, 0, 1}, {0, 1, 1}, {0, -1, 1}};
+    wide_t normal[ACCEL * (ACCEL + 1) / 2], theta[ACCEL] = {0.0}, most = 0.0;
+    uint8_t next = 0;
+    if (count > 0U) {
+        lay_accel(part, rests, count, theta, work);
+    }
+    *known = 0U;
+    if (take_step(work, ACCEL, count, theta, normal) < 0.0) { /* `normal`: the covariance, without rests the prior's */
+        return 0U;
+    }
+    *known = identified(work, ACCEL, count);
+    for (uint8_t p = 0; p < SELFCAL_TUMBLE_POSITIONS; p++) {
+        const wide_t g = (wide_t)part->gravity, size = up[p][0] * up[p][0] + up[p][1] * up[p][1] + up[p][2] * up[p][2];
+        wide_t h[ACCEL], variance = 0.0;
+        for (size_t i = 0; i < 3U; i++) { /* the residual's derivatives at error 0 */
+            h[i] = -up[p][i] / sqrt(size) * BIAS_SD;
+            h[3U + i] = g * up[p][i] * up[p][i] / size * SCALE_SD;
+        }
+        h[6] = g * up[p][0] * up[p][1] / size * ANGLE_SD;
+        h[7] = g * up[p][0] * up[p][2] / size * ANGLE_SD;
+        h[8] = g * up[p][1] * up[p][2] / size * ANGLE_SD;
+        for (size_t i = 0; i < ACCEL; i++) {
+            for (size_t j = 0; j < ACCEL; j++) {
+                variance += h[i] * h[j] * normal[i >= j ? packed(i, j) : packed(j, i)];
+            }
+        }
+        if (variance > (1.0 + 1e-6) * most) { /* of equal ones the first */
+            most = variance;
+            next = p;
+        }
+    }
+    return next;
+}
+
 float selfcal_tumble_accel_sd(const selfcal_tumble_t *found, uint8_t k) {
     const bool known = k < ACCEL && (found->accel_identified >> k & 1U) != 0U;
     return known ? sqrtf(found->accel_covariance[packed(k, k)]) : NAN;

@@ -26,6 +26,7 @@
  * against the noise lose float's digits. Results are right to 1e-4 of their standard deviation.
  * Cortex-M4F: 5.8 KB of flash beside the software doubles, 1.4 KB of stack; 6 million instructions of 12 rests, 20 of
  * 24, 70 with a Gauss-Markov drift. It fits a Cortex-M0 too.
+ * On a module selfcal_imu_tumble_start() and _stop() do all of it, see below.
  * The gyros' scale and misalignment take the turns between the rests: `selfcal tumble` on the host. */
 #ifndef SELFCAL_TUMBLE_H
 #define SELFCAL_TUMBLE_H
@@ -103,6 +104,84 @@ float selfcal_tumble_gyro_sd(const selfcal_tumble_t *found, uint8_t axis, uint8_
 
 /* Correct one reading of six axes. */
 void selfcal_tumble_apply(const selfcal_tumble_t *found, const float reading[6], float corrected[6]);
+
+/* Positions by the side that is up: +z +y +x -z -y -x, then edges: +x+y +x-y +x+z -x+z +y+z -y+z. */
+enum { SELFCAL_TUMBLE_POSITIONS = 12 };
+
+/* The position that tells most after `count` rests: whose residual is least known by their information matrix.
+ * `identified`: a bit for each accelerometer parameter that they identify. `rests` are sound, see above. A round of the
+ * fit: 1 million instructions of 12 rests on a Cortex-M4F. */
+uint8_t selfcal_tumble_next(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
+                            selfcal_tumble_work_t *work, uint16_t *identified);
+
+/* --- on a module ---
+ * A pipe that names selfcal_tumbling_code (`-DSELFCAL_MODEL_TUMBLED=1`) calibrates while it runs. Between start and
+ * stop the gate tells rests, and the bank takes no sample. A rest counts from SELFCAL_TUMBLE_REST_S of whole windows
+ * on. The result corrects samples (selfcal_imu_corrected()), and goes with the saved state (selfcal_imu_save()). */
+#ifndef SELFCAL_TUMBLE_REST_S
+#define SELFCAL_TUMBLE_REST_S 10
+#endif
+
+struct selfcal_tumbling {
+    selfcal_tumble_part_t part;
+    uint8_t axis[6];             /* of the model: ax ay az gx gy gz */
+    float accel_unit, gyro_unit; /* the model's, in m/s^2 and rad/s */
+};
+
+typedef enum {
+    SELFCAL_TUMBLE_OFF = 0,
+    SELFCAL_TUMBLE_PLACE = 1, /* no rest: place the part as `next` says */
+    SELFCAL_TUMBLE_HOLD = 2,  /* a rest that does not count yet: leave the part alone */
+    SELFCAL_TUMBLE_TURN = 3   /* a rest that counts: turn the part as `next` says */
+} selfcal_tumble_phase_t;
+
+typedef struct {
+    selfcal_tumble_phase_t phase;
+    selfcal_tumble_status_t status; /* of the last stop since power-on, or OK */
+    uint8_t rests, wanted;          /* `wanted` goes beyond 12 while parameters are not identified */
+    uint8_t next;                   /* position; SELFCAL_TUMBLE_POSITIONS: none, stop */
+    bool applied;                   /* a calibration corrects samples */
+} selfcal_tumble_progress_t;
+
+/* The calibration in use, as it is saved. Units as above; it holds for readings without the sensor's own offsets
+ * (selfcal_shifted()). `covariance` as selfcal_tumble_t's. */
+typedef struct {
+    float bias[3], matrix[3][3], G[3][3], covariance[45], ratio;
+    uint16_t accel_identified, gyro_identified;
+} selfcal_tumbled_t;
+
+/* Begin: earlier rests are forgotten, an earlier result stays. False: the pipe names no calibration, the gate is off,
+ * or an axis is retired. */
+bool selfcal_imu_tumble_start(selfcal_imu_t *imu);
+
+/* End, and calibrate by the rests. Any other status than OK leaves the result before. It takes as long as
+ * selfcal_tumble(). */
+selfcal_tumble_status_t selfcal_imu_tumble_stop(selfcal_imu_t *imu);
+
+/* How far it is; after a rest that counts it takes as long as selfcal_tumble_next(). The pipe names a calibration. */
+selfcal_tumble_progress_t selfcal_imu_tumble_progress(selfcal_imu_t *imu);
+
+/* Values of message TUMBLE for selfcal_telemetry_words(): the progress, and of the calibration in use the parameters
+ * that are identified, with their sd. Returns which are there, a bit each. */
+enum { SELFCAL_TUMBLE_WORDS = 29 };
+uint32_t selfcal_imu_tumble_words(selfcal_imu_t *imu, uint32_t word[SELFCAL_TUMBLE_WORDS]);
+
+/* The calibration in use; NULL: none. */
+const selfcal_tumbled_t *selfcal_imu_tumbled(const selfcal_imu_t *imu);
+
+/* Private; declared here so that the caller can place it. */
+struct selfcal_imu_tumble {
+    selfcal_tumbled_t used;
+    selfcal_tumble_progress_t progress;
+    bool resting, counted, spoilt, due; /* of the rest under way; of its window; `next` is to be worked out */
+    uint32_t passed, begun;             /* samples since the start, and up to the rest under way */
+    uint32_t window, kept;              /* samples of the window and of the rest under way */
+    float origin[6], window_sum[6];     /* of its first sample; of the window, about it */
+    selfcal_wide_t sum[6];
+    selfcal_tumble_rest_t rest[SELFCAL_TUMBLE_MAX];
+    selfcal_tumble_t found;
+    selfcal_tumble_work_t work;
+};
 
 #ifdef __cplusplus
 }

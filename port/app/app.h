@@ -77,7 +77,10 @@ typedef struct {
     answer_t answer[ANSWERS];
 #endif
     selfcal_module_t told; /* filled in by `module` */
-    uint32_t begun_ms;     /* start of the axis report under way */
+#if SELFCAL_MODEL_TUMBLED
+    uint32_t tumble_ms, tumble[SELFCAL_TUMBLE_WORDS]; /* when its message was sent last, and its words then */
+#endif
+    uint32_t begun_ms; /* start of the axis report under way */
 #if APP_CORRECTED_MS
     uint32_t corrected_ms; /* when a corrected sample was sent last */
     uint32_t reading_ms;   /* of the newest sample */

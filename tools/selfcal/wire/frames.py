@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 VERSION = 4
 #: Axis messages are named after the axis, in capitals.
 AXES = tuple(AXIS_UNITS)
-STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
+STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "ANSWER", "TUMBLE"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
@@ -327,7 +327,7 @@ def _kinds() -> dict[int, _Kind]:
         axis, _, rest = message.name.lower().partition("_")
         hypothesis = int(rest[1:]) if rest.startswith("h") else None
         part = {"": 0, "coefficients": _COEFFICIENTS, "adequacy": _ADEQUACY}.get(rest)
-        if message.name in (STATUS, CORRECTED, ANSWER):
+        if message.name in (STATUS, CORRECTED, ANSWER, TUMBLE):
             kinds[message.frame_id - BASE] = _Kind(message, "", "", 0)
         elif hypothesis is not None:
             kinds[message.frame_id - BASE] = _Kind(message, axis, f"h{hypothesis}_", 1 + hypothesis)
@@ -359,6 +359,8 @@ class Decoder:
         self._corrects = False  # what comes belongs to that sample
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
+        #: The same of the calibration by rests in several positions, since the last that came of one.
+        self.tumble: dict[str, float] = {}
         #: Latest module time of a frame, unwrapped, ms. It goes back only if the module starts anew.
         self.time_ms = 0
         #: The module has said that no sample will follow, and this was its last status.
@@ -464,6 +466,9 @@ class Decoder:
                 self._corrects = True
             if self._corrects:
                 self.corrected.update(values)
+            return self.flush()
+        if name == TUMBLE:
+            self.tumble = values if "time_ms" in values else self.tumble | values
             return self.flush()
         if name == ANSWER:
             self.answer.update(values)
