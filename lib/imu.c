@@ -97,8 +97,8 @@ selfcal_status_t selfcal_imu_init_as(uint32_t layout, selfcal_imu_t *imu, const 
     }
     imu->memory = room.next;
     selfcal_status_t status = selfcal_init(&imu->bank, pipe->model, imu->memory, room.left);
-    if (status == SELFCAL_OK && imu->tumble != NULL && !pipe->tumbling_code->begin(imu)) {
-        status = SELFCAL_BAD_MODEL;
+    if (imu->tumble != NULL) {
+        pipe->tumbling_code->begin(imu);
     }
     status = status == SELFCAL_OK ? begin_all(imu) : status;
     if (status == SELFCAL_OK && imu->gate != NULL && !selfcal_imu_watch(imu, true)) {
@@ -159,10 +159,10 @@ uint32_t selfcal_imu_sample(selfcal_imu_t *imu, const float reading[], const flo
     uint32_t found = 0;
     const bool rests = !imu->watching || pipe->gate_code->rests(imu, reading);
     const bool taken = imu->tumble != NULL && pipe->tumbling_code->take(imu, reading);
-    if (taken || !rests) {
-        (void)selfcal_push_moving(&imu->bank, reading);
-    } else {
+    if (!taken && rests) {
         (void)selfcal_push_with(&imu->bank, reading, values); /* what it rejects it counts */
+    } else if (!taken) {
+        (void)selfcal_push_moving(&imu->bank, reading);
     }
     if (imu->judge != NULL) {
         pipe->judging->sample(imu, side, values);
@@ -337,7 +337,7 @@ selfcal_status_t selfcal_imu_forget(selfcal_imu_t *imu) {
     }
     (void)begin_all(imu);
     if (imu->tumble != NULL) {
-        imu->pipe->tumbling_code->forget(imu);
+        imu->pipe->tumbling_code->begin(imu);
     }
     if (imu->watching) { /* its windows go on: the bank must start with one of them */
         (void)selfcal_imu_watch(imu, true);

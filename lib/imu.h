@@ -53,28 +53,17 @@ struct selfcal_holding_code {
 /* imu_tumble.c: rests in several positions give scale and misalignment of the accelerometers. */
 struct selfcal_tumbling_code {
     size_t bytes; /* of selfcal_imu_tumble_t */
-    bool (*begin)(selfcal_imu_t *imu);
+    /* Nothing is known. */
+    void (*begin)(selfcal_imu_t *imu);
     void (*skip)(selfcal_imu_t *imu, uint64_t count);
-    /* Behind the gate. Whether it takes the sample, in the place of the bank. */
+    /* Behind the gate. Whether it has taken the sample, which is motion to the bank. */
     bool (*take)(selfcal_imu_t *imu, const float reading[]);
     void (*correct)(const selfcal_imu_t *imu, selfcal_corrected_t *corrected);
-    void (*forget)(selfcal_imu_t *imu);
     /* Behind a snapshot. */
     bool (*save)(const selfcal_imu_t *imu, selfcal_write_t write, void *context);
     /* Takes its bytes off the end. */
     selfcal_status_t (*restore)(selfcal_imu_t *imu, const void *bytes, size_t *length);
 };
-
-static inline bool is_stuck(const selfcal_t *bank, uint8_t axis) {
-    const uint32_t limit = bank->model->axis[axis].stuck_limit;
-    return limit > 0U && bank->equal[axis] >= limit;
-}
-
-/* Whether an axis's reading is no number or beyond its range. */
-static inline bool is_wrong(const selfcal_t *bank, uint8_t axis, float reading) {
-    const float range = bank->model->axis[axis].range;
-    return !isfinite(reading) || (range > 0.0F && fabsf(reading) >= range);
-}
 
 /* Whether an axis has a report that is not of the past. */
 static inline bool has_report(const selfcal_imu_t *imu, uint8_t axis) {

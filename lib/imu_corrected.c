@@ -4,11 +4,18 @@
 /* True if the bank keeps this sample out for a fault of the sensor's. */
 static bool faulty(const selfcal_t *bank, const float reading[]) {
     for (uint8_t axis = 0; axis < bank->model->axes; axis++) {
-        if (is_wrong(bank, axis, reading[axis]) && !selfcal_retired(bank, axis)) {
+        const float range = bank->model->axis[axis].range;
+        const bool bad = !isfinite(reading[axis]) || (range > 0.0F && fabsf(reading[axis]) >= range);
+        if (bad && !selfcal_retired(bank, axis)) {
             return true;
         }
     }
     return false;
+}
+
+static bool stuck(const selfcal_t *bank, uint8_t axis) {
+    const uint32_t limit = bank->model->axis[axis].stuck_limit;
+    return limit > 0U && bank->equal[axis] >= limit;
 }
 
 /* Why there is no corrected sample of an axis, or why it is not to be relied on. */
@@ -17,7 +24,7 @@ static selfcal_reason_t reason_of(const selfcal_imu_t *imu, uint8_t axis, bool i
     if (known == SELFCAL_REASON_RETIRED) {
         return known;
     }
-    return is_faulty ? SELFCAL_REASON_BAD_SAMPLE : is_stuck(&imu->bank, axis) ? SELFCAL_REASON_STUCK : known;
+    return is_faulty ? SELFCAL_REASON_BAD_SAMPLE : stuck(&imu->bank, axis) ? SELFCAL_REASON_STUCK : known;
 }
 
 bool selfcal_imu_corrected(selfcal_imu_t *imu, selfcal_corrected_t *corrected) {

@@ -1,14 +1,13 @@
 /* The calibration by rests in several positions, in the pipe (tumble.h).
  *
- * A rest is the mean of the whole windows in which the gate sees rest from begin to end: the window in which motion
- * begins is dropped, and one with a reading that is no number or beyond its range. Sums are taken about a rest's first
- * sample. Gyros may rest at another level in each position, by their g-sensitivity: the gate forgets the last one.
+ * A rest is the mean of the gate's windows that are at rest from begin to end: the window in which motion begins is
+ * dropped, and one with a reading that the bank's intake finds wrong. Gyros may rest at another level in each position, by their g-sensitivity: the gate forgets the last one.
  *
  * The result corrects accelerometers by f = T K (a - b), whose variance is J C J' of its covariance C. Residuals beyond
  * their sd widen it. A gyro's bias is the bank's. It holds where the gate saw rest last, at the specific force f0, so
  * G (f - f0) is taken off as well.
  *
- * Saved: magic, format and bytes, selfcal_tumbled_t as it lies in memory, CRC-32 of all before. */
+ * Saved: magic with its format, selfcal_tumbled_t as it lies in memory, CRC-32 of all before. */
 #include "tumble.h"
 
 #include "imu.h"
@@ -16,109 +15,61 @@
 
 /* rad/s per m/s^2 */
 #define DEG_PER_S_PER_G (57.29577951F * 9.80665F)
-#define SAVED_FORMAT 1U
+#define MAGIC 0x31425446U /* "FTB1" */
 
 typedef struct {
-    uint8_t magic[4];
-    uint32_t format; /* and the size */
+    uint32_t magic; /* and format */
     selfcal_tumbled_t used;
     uint32_t crc;
 } saved_t;
 
-static const uint8_t magic[4] = {'S', 'F', 'T', 'B'};
-enum { FORMAT = (int)(SAVED_FORMAT << 16) + (int)sizeof(saved_t) };
-
-static bool begin(selfcal_imu_t *imu) {
-    const selfcal_tumbling_t *table = imu->pipe->tumbling;
+static void begin_tumble(selfcal_imu_t *imu) {
     memset(imu->tumble, 0, sizeof *imu->tumble);
     imu->tumble->progress.next = SELFCAL_TUMBLE_POSITIONS;
-    bool sound = table->accel_unit > 0.0F && table->gyro_unit > 0.0F;
-    for (unsigned i = 0; i < 6U; i++) {
-        sound = sound && table->axis[i] < imu->bank.model->axes;
-    }
-    return sound;
 }
 
 /* --- rests --- */
 
 static void end_rest(selfcal_imu_tumble_t *self) {
-    self->resting = self->counted = self->spoilt = false;
+    self->ended = self->progress.rests;
+    self->resting = self->counted = false;
     self->window = self->kept = 0U;
 }
 
+/* Whether rest has ended the next sample tells. */
 static void skip(selfcal_imu_t *imu, uint64_t count) {
-    selfcal_imu_tumble_t *self = imu->tumble;
-    self->passed += (uint32_t)count;
-    if (imu->gate->gate.state != SELFCAL_RESTING) {
-        end_rest(self);
-    }
+    imu->tumble->passed += (uint32_t)count;
 }
 
-static float unit_of(const selfcal_tumbling_t *table, size_t i) {
-    return i < 3U ? table->accel_unit : table->gyro_unit;
-}
-
-/* Means of the rest under way. It counts once it is long enough. */
-static void count_rest(selfcal_imu_t *imu) {
+/* A window of rest has ended: the gate's sums still have it. */
+static void keep_window(selfcal_imu_t *imu) {
     selfcal_imu_tumble_t *self = imu->tumble;
     const selfcal_tumbling_t *table = imu->pipe->tumbling;
-    const float rate = imu->pipe->rate_hz;
-    if ((float)self->kept < (float)SELFCAL_TUMBLE_REST_S * rate ||
-        (!self->counted && self->progress.rests == SELFCAL_TUMBLE_MAX)) {
-        return;
+    const selfcal_gate_t *gate = &imu->gate->gate;
+    const float n = (float)self->window, rate = imu->pipe->rate_hz;
+    self->kept += self->window;
+    selfcal_tumble_rest_t *rest = &self->rest[self->ended];
+    rest->begin_s = (float)(self->passed - self->kept) / rate;
+    rest->end_s = (float)self->passed / rate;
+    for (size_t i = 0; i < 6U; i++) {
+        const uint8_t axis = table->axis[i];
+        const float mean = gate->origin[axis] + gate->first[axis] + (float)gate->sum[axis] / n;
+        const float own = (mean - imu->bank.shifted[axis]) * (i < 3U ? table->accel_unit : table->gyro_unit);
+        rest->mean[i] += (own - rest->mean[i]) * (n / (float)self->kept);
     }
-    if (!self->counted) {
+    if (!self->counted && (float)self->kept >= SELFCAL_TUMBLE_REST_S * rate) {
         self->counted = self->due = true;
         self->progress.rests++;
     }
-    selfcal_tumble_rest_t *rest = &self->rest[self->progress.rests - 1U];
-    rest->begin_s = (float)self->begun / rate;
-    rest->end_s = (float)self->passed / rate;
-    for (size_t i = 0; i < 6U; i++) {
-        const selfcal_wide_t mean = (selfcal_wide_t)self->origin[i] + self->sum[i] / (selfcal_wide_t)self->kept;
-        rest->mean[i] = (float)((mean - (selfcal_wide_t)selfcal_shifted(&imu->bank, table->axis[i])) *
-                                (selfcal_wide_t)unit_of(table, i));
-    }
 }
 
-/* A window of rest has ended. */
-static void close_window(selfcal_imu_t *imu) {
-    selfcal_imu_tumble_t *self = imu->tumble;
-    if (self->window > 0U && !self->spoilt) {
-        if (self->kept == 0U) {
-            self->begun = self->passed - self->window;
-            memset(self->sum, 0, sizeof self->sum);
-        }
-        for (size_t i = 0; i < 6U; i++) {
-            self->sum[i] += (selfcal_wide_t)self->window_sum[i];
-        }
-        self->kept += self->window;
-        count_rest(imu);
-    }
-    self->window = 0U;
-    self->spoilt = false;
-}
-
-static void add(selfcal_imu_t *imu, const float reading[]) {
-    selfcal_imu_tumble_t *self = imu->tumble;
-    for (size_t i = 0; i < 6U; i++) {
-        const uint8_t axis = imu->pipe->tumbling->axis[i];
-        self->spoilt = self->spoilt || is_wrong(&imu->bank, axis, reading[axis]) || is_stuck(&imu->bank, axis);
-        if (self->window == 0U) {
-            self->origin[i] = self->kept == 0U ? reading[axis] : self->origin[i];
-            self->window_sum[i] = 0.0F;
-        }
-        self->window_sum[i] += reading[axis] - self->origin[i];
-    }
-    self->window++;
-}
-
-static bool take(selfcal_imu_t *imu, const float reading[]) {
+static bool take_sample(selfcal_imu_t *imu, const float reading[]) {
     selfcal_imu_tumble_t *self = imu->tumble;
     selfcal_gate_t *gate = &imu->gate->gate;
     if (self->progress.phase == SELFCAL_TUMBLE_OFF) {
         return false;
     }
+    (void)selfcal_push_moving(&imu->bank, reading);
     self->passed++;
     if (gate->state != SELFCAL_RESTING) {
         gate->rested = false;
@@ -126,12 +77,16 @@ static bool take(selfcal_imu_t *imu, const float reading[]) {
         self->progress.phase = SELFCAL_TUMBLE_PLACE;
         return true;
     }
-    if (self->resting) { /* else this sample belongs to the window that told so */
-        add(imu, reading);
-    }
+    self->window += self->resting ? 1U : 0U; /* else the window that told of rest, which is not taken */
     self->resting = true;
     if (gate->position == 0U) {
-        close_window(imu);
+        /* what passes is missing to the bank, but for wrong readings */
+        const uint32_t faults = self->passed - (uint32_t)imu->bank.counters.missing;
+        if (self->window > 0U && faults == self->faults && self->ended < SELFCAL_TUMBLE_MAX) {
+            keep_window(imu);
+        }
+        self->window = 0U;
+        self->faults = faults;
     }
     self->progress.phase = self->counted ? SELFCAL_TUMBLE_TURN : SELFCAL_TUMBLE_HOLD;
     return true;
@@ -141,14 +96,11 @@ static bool take(selfcal_imu_t *imu, const float reading[]) {
 
 bool selfcal_imu_tumble_start(selfcal_imu_t *imu) {
     selfcal_imu_tumble_t *self = imu->tumble;
-    bool able = self != NULL && imu->watching;
-    for (size_t i = 0; able && i < 6U; i++) {
-        able = !selfcal_retired(&imu->bank, imu->pipe->tumbling->axis[i]);
-    }
+    const bool able = self != NULL && imu->watching && imu->bank.retired == 0U;
     if (able) {
-        end_rest(self);
         self->passed = 0U;
         self->progress.rests = 0U;
+        end_rest(self);
         self->progress.status = SELFCAL_TUMBLE_OK;
         self->progress.phase = SELFCAL_TUMBLE_PLACE;
         self->due = true;
@@ -156,15 +108,16 @@ bool selfcal_imu_tumble_start(selfcal_imu_t *imu) {
     return able;
 }
 
-/* The result in use from here on. */
+/* The result in use from here on. A parameter that is not identified has error 0. */
 static void use(selfcal_imu_tumble_t *self) {
     const selfcal_tumble_t *found = &self->found;
     selfcal_tumbled_t *used = &self->used;
-    memcpy(used->bias, found->bias, sizeof used->bias);
-    memcpy(used->matrix, found->matrix, sizeof used->matrix);
-    memcpy(used->G, found->G, sizeof used->G);
+    for (size_t i = 0; i < SELFCAL_TUMBLE_ACCEL; i++) {
+        used->accel[i] = (found->accel_identified >> i & 1U) != 0U ? (float)found->accel[i] : 0.0F;
+    }
     memcpy(used->covariance, found->accel_covariance, sizeof used->covariance);
-    used->ratio = isfinite(found->ratio) ? found->ratio : 0.0F;
+    memcpy(used->G, found->G, sizeof used->G);
+    used->ratio = found->ratio > 0.0F ? found->ratio : 0.0F; /* NAN: 0 */
     used->accel_identified = found->accel_identified;
     used->gyro_identified = found->gyro_identified;
     self->progress.applied = true;
@@ -177,7 +130,7 @@ selfcal_tumble_status_t selfcal_imu_tumble_stop(selfcal_imu_t *imu) {
     }
     selfcal_tumble_progress_t *progress = &self->progress;
     progress->status =
-        selfcal_tumble(&self->found, &imu->pipe->tumbling->part, self->rest, progress->rests, &self->work);
+        selfcal_tumble(&self->found, &imu->pipe->tumbling->part, self->rest, progress->rests, &self->by.work);
     if (progress->status == SELFCAL_TUMBLE_OK) {
         use(self);
     }
@@ -187,50 +140,103 @@ selfcal_tumble_status_t selfcal_imu_tumble_stop(selfcal_imu_t *imu) {
     return progress->status;
 }
 
-selfcal_tumble_progress_t selfcal_imu_tumble_progress(selfcal_imu_t *imu) {
+/* By how much residuals beyond their sd widen an sd. */
+static float widening(const selfcal_tumbled_t *used) {
+    return used->ratio > 1.0F ? used->ratio : 1.0F;
+}
+
+/* Variance of `w` f by the covariance of the parameters: x is a - b, u K (a - b). */
+static float variance_of(const float accel[], const float *covariance, const float x[3], const float u[3],
+                         const float w[3]) {
+    float slope[SELFCAL_TUMBLE_ACCEL] = {0.0F}, sum = 0.0F;
+    for (size_t i = 0; i < 3U; i++) {
+        for (size_t j = i; j < 3U; j++) {
+            const float part = i == j ? w[i] : w[i] * accel[5U + i + j]; /* xy xz yz */
+            slope[j] -= part * (1.0F + accel[3U + j]);
+            slope[3U + j] += part * x[j];
+            if (i != j) {
+                slope[5U + i + j] = w[i] * u[j];
+            }
+        }
+    }
+    for (size_t a = 0; a < SELFCAL_TUMBLE_ACCEL; a++) {
+        for (size_t b = 0; b <= a; b++) {
+            sum += (a == b ? 1.0F : 2.0F) * slope[a] * slope[b] * *covariance++;
+        }
+    }
+    return sum;
+}
+
+/* The position whose |f| is least known: w is its direction. */
+static uint8_t next_of(const selfcal_imu_tumble_t *self, const float *covariance, float gravity) {
+    static const int8_t up[SELFCAL_TUMBLE_POSITIONS][3] = {{0, 0, 1},  {0, 1, 0},  {1, 0, 0}, {0, 0, -1},
+                                                           {0, -1, 0}, {-1, 0, 0}, {1, 1, 0}, {1, -1, 0},
+                                                           {1, 0, 1},  {-1, 0, 1}, {0, 1, 1}, {0, -1, 1}};
+    float most = 0.0F;
+    uint8_t next = 0;
+    for (uint8_t p = 0; p < SELFCAL_TUMBLE_POSITIONS; p++) {
+        float w[3], f[3];
+        for (size_t i = 0; i < 3U; i++) {
+            w[i] = (float)up[p][i] * (p < 6U ? 1.0F : 0.70710678F);
+            f[i] = gravity * w[i];
+        }
+        const float variance = variance_of(self->used.accel, covariance, f, f, w);
+        if (variance > 1.0001F * most) { /* of equal ones the first */
+            most = variance;
+            next = p;
+        }
+    }
+    return next;
+}
+
+const selfcal_tumble_progress_t *selfcal_imu_tumble_progress(selfcal_imu_t *imu) {
     selfcal_imu_tumble_t *self = imu->tumble;
     selfcal_tumble_progress_t *progress = &self->progress;
     if (self->due) {
-        uint16_t known = 0;
-        const uint8_t rests = progress->rests,
-                      next = selfcal_tumble_next(&imu->pipe->tumbling->part, self->rest, rests, &self->work, &known);
-        const bool all = known == (1U << SELFCAL_TUMBLE_ACCEL) - 1U, full = rests == SELFCAL_TUMBLE_MAX;
-        const bool enough = full || (all && rests >= SELFCAL_TUMBLE_POSITIONS);
-        progress->wanted = rests < SELFCAL_TUMBLE_POSITIONS ? (uint8_t)SELFCAL_TUMBLE_POSITIONS
-                                                            : (uint8_t)(rests + (enough ? 0U : 1U));
-        progress->next = enough ? (uint8_t)SELFCAL_TUMBLE_POSITIONS : next;
+        const selfcal_tumble_part_t *part = &imu->pipe->tumbling->part;
+        const uint8_t rests = progress->rests;
+        float covariance[45] = {0.0F};
+        const uint16_t known = selfcal_tumble_known(part, self->rest, rests, &self->by.work, covariance);
+        const bool all = known == (1U << SELFCAL_TUMBLE_ACCEL) - 1U, most = rests == SELFCAL_TUMBLE_MAX;
+        progress->wanted = SELFCAL_TUMBLE_POSITIONS;
+        progress->next = next_of(self, covariance, part->gravity);
+        if (rests >= SELFCAL_TUMBLE_POSITIONS) {
+            progress->wanted = all || most ? rests : (uint8_t)(rests + 1U);
+            progress->next = all || most ? (uint8_t)SELFCAL_TUMBLE_POSITIONS : progress->next;
+        }
         self->due = false;
     }
-    return *progress;
+    return progress;
 }
 
-uint32_t selfcal_imu_tumble_words(selfcal_imu_t *imu, uint32_t word[SELFCAL_TUMBLE_WORDS]) {
-    const selfcal_tumble_progress_t p = selfcal_imu_tumble_progress(imu);
+const uint32_t *selfcal_imu_tumble_words(selfcal_imu_t *imu, uint32_t *there) {
+    const selfcal_tumble_progress_t *p = selfcal_imu_tumble_progress(imu);
     const selfcal_tumbled_t *used = &imu->tumble->used;
-    word[0] = (uint32_t)p.phase << SELFCAL_TUMBLE_PHASE_SHIFT | (uint32_t)p.applied << SELFCAL_TUMBLE_APPLIED_SHIFT |
-              (uint32_t)p.status << SELFCAL_TUMBLE_RESULT_SHIFT | (uint32_t)p.rests << SELFCAL_TUMBLE_RESTS_SHIFT |
-              (uint32_t)p.wanted << SELFCAL_TUMBLE_WANTED_SHIFT | (uint32_t)p.next << SELFCAL_TUMBLE_NEXT_SHIFT;
-    if (!p.applied) {
-        return 1U;
+    uint32_t *const word = imu->tumble->by.word;
+    *there = 1U;
+    word[0] = (uint32_t)p->phase << SELFCAL_TUMBLE_PHASE_SHIFT | (uint32_t)p->applied << SELFCAL_TUMBLE_APPLIED_SHIFT |
+              (uint32_t)p->status << SELFCAL_TUMBLE_RESULT_SHIFT | (uint32_t)p->rests << SELFCAL_TUMBLE_RESTS_SHIFT |
+              (uint32_t)p->wanted << SELFCAL_TUMBLE_WANTED_SHIFT | (uint32_t)p->next << SELFCAL_TUMBLE_NEXT_SHIFT;
+    if (!p->applied) {
+        return word;
     }
-    uint32_t there = 1U;
+    const float wider = widening(used);
+    memcpy(&word[SELFCAL_TUMBLE_BIAS_X - 1], used->accel, sizeof used->accel);
     for (size_t i = 0; i < SELFCAL_TUMBLE_ACCEL; i++) {
-        const size_t row = i == 8U ? 1U : 0U, column = i == 6U ? 1U : 2U; /* of the angles xy xz yz */
-        const size_t at = SELFCAL_TUMBLE_BIAS_X - 1U + i, at_sd = SELFCAL_TUMBLE_BIAS_X_SD - 1U + i;
-        const float scale = used->matrix[i % 3U][i % 3U];
-        const float angle = used->matrix[row][column] / used->matrix[column][column];
-        word[at] = float_bits(i < 3U ? used->bias[i] : i < 6U ? scale - 1.0F : angle);
-        word[at_sd] = float_bits(sqrtf(used->covariance[i * (i + 3U) / 2U]) * fmaxf(used->ratio, 1.0F));
-        const uint32_t known = used->accel_identified >> i & 1U;
-        there |= known << at | known << at_sd;
+        word[SELFCAL_TUMBLE_BIAS_X_SD - 1U + i] = float_bits(sqrtf(used->covariance[i * (i + 3U) / 2U]) * wider);
     }
+    const uint32_t known = used->accel_identified;
+    *there |= known << (SELFCAL_TUMBLE_BIAS_X - 1) | known << (SELFCAL_TUMBLE_BIAS_X_SD - 1);
     for (size_t i = 0; i < 9U; i++) {
-        const size_t axis = i / 3U, along = i % 3U, at = SELFCAL_TUMBLE_G_XX - 1U + i;
-        word[at] = float_bits(used->G[axis][along] * DEG_PER_S_PER_G);
-        there |= (uint32_t)(used->gyro_identified >> (SELFCAL_TUMBLE_GYRO * axis + 1U + along) & 1U) << at;
+        word[SELFCAL_TUMBLE_G_XX - 1U + i] = float_bits(used->G[i] * DEG_PER_S_PER_G);
+    }
+    for (unsigned axis = 0; axis < 3U; axis++) {
+        *there |= (used->gyro_identified >> (SELFCAL_TUMBLE_GYRO * axis + 1U) & 7U)
+                  << (SELFCAL_TUMBLE_G_XX - 1U + 3U * axis);
     }
     word[SELFCAL_TUMBLE_RESIDUALS - 1] = float_bits(used->ratio);
-    return there | 1UL << (SELFCAL_TUMBLE_RESIDUALS - 1);
+    *there |= 1UL << (SELFCAL_TUMBLE_RESIDUALS - 1);
+    return word;
 }
 
 const selfcal_tumbled_t *selfcal_imu_tumbled(const selfcal_imu_t *imu) {
@@ -239,85 +245,58 @@ const selfcal_tumbled_t *selfcal_imu_tumbled(const selfcal_imu_t *imu) {
 
 /* --- correction --- */
 
-/* f = T K (a - b) of the accelerometers among `reading`; `x` gets a - b. */
-static void force_of(const selfcal_imu_t *imu, const float reading[], float x[3], float f[3]) {
-    const selfcal_tumbling_t *table = imu->pipe->tumbling;
-    const selfcal_tumbled_t *used = &imu->tumble->used;
+/* f = T K x, u = K x. */
+static void turn(const float accel[], const float x[3], float u[3], float f[3]) {
     for (size_t i = 0; i < 3U; i++) {
-        const uint8_t axis = table->axis[i];
-        x[i] = (reading[axis] - selfcal_shifted(&imu->bank, axis)) * table->accel_unit - used->bias[i];
+        f[i] = u[i] = (1.0F + accel[3U + i]) * x[i];
     }
-    for (size_t i = 0; i < 3U; i++) {
-        f[i] = used->matrix[i][0] * x[0] + used->matrix[i][1] * x[1] + used->matrix[i][2] * x[2];
-    }
-}
-
-/* sd of f[i] by the parameters' covariance. */
-static float force_sd(const selfcal_tumbled_t *used, const float x[3], size_t i) {
-    float slope[SELFCAL_TUMBLE_ACCEL] = {0.0F}, sum = 0.0F;
-    for (size_t j = i; j < 3U; j++) {
-        const float scale = used->matrix[j][j];
-        slope[j] = -used->matrix[i][j];
-        slope[3U + j] = used->matrix[i][j] / scale * x[j];
-        if (j > i) { /* angles xy xz yz */
-            slope[5U + i + j] = scale * x[j];
-        }
-    }
-    const float *covariance = used->covariance;
-    for (size_t a = 0; a < SELFCAL_TUMBLE_ACCEL; a++) {
-        for (size_t b = 0; b <= a; b++) {
-            sum += (a == b ? 1.0F : 2.0F) * slope[a] * slope[b] * *covariance++;
-        }
-    }
-    return sqrtf(fmaxf(sum, 0.0F)) * fmaxf(used->ratio, 1.0F);
+    f[0] += accel[6] * u[1] + accel[7] * u[2];
+    f[1] += accel[8] * u[2];
 }
 
 static void correct(const selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
     const selfcal_tumbling_t *table = imu->pipe->tumbling;
     const selfcal_tumbled_t *used = &imu->tumble->used;
     const selfcal_gate_t *gate = &imu->gate->gate;
+    const uint32_t spoils = 1U << SELFCAL_REASON_RETIRED | 1U << SELFCAL_REASON_STUCK | 1U << SELFCAL_REASON_BAD_SAMPLE;
+    float x[3], u[3], f[3], moved[3], turned[3];
+    uint32_t why = 0;
     if (!imu->tumble->progress.applied) {
         return;
     }
-    bool sound = true;
-    for (size_t i = 0; i < 3U; i++) { /* each force has a part of every reading */
-        const selfcal_reason_t why = corrected->reason[table->axis[i]];
-        sound =
-            sound && why != SELFCAL_REASON_RETIRED && why != SELFCAL_REASON_STUCK && why != SELFCAL_REASON_BAD_SAMPLE;
-    }
-    float x[3], f[3], x0[3], f0[3], level[SELFCAL_AXES_MAX] = {0.0F};
-    for (uint8_t axis = 0; axis < imu->bank.model->axes; axis++) {
-        level[axis] = gate->origin[axis] + gate->rest.mean[axis];
-    }
-    force_of(imu, imu->kept->reading, x, f);
-    force_of(imu, level, x0, f0);
     for (size_t i = 0; i < 3U; i++) {
-        const uint8_t axis = table->axis[i], gyro = table->axis[3U + i];
-        corrected->value[axis] = f[i] / table->accel_unit;
-        corrected->sd[axis] = sound ? force_sd(used, x, i) / table->accel_unit : NAN;
-        if (sound) {
+        const uint8_t axis = table->axis[i];
+        const float reading = imu->kept->reading[axis];
+        x[i] = (reading - imu->bank.shifted[axis]) * table->accel_unit - used->accel[i];
+        moved[i] = (reading - gate->origin[axis] - gate->rest.mean[axis]) * table->accel_unit;
+        why |= 1U << corrected->reason[axis]; /* each force has a part of every reading */
+    }
+    const float unit = (why & spoils) != 0U ? NAN : 1.0F / table->accel_unit, wide = unit * widening(used);
+    turn(used->accel, moved, u, turned);
+    turn(used->accel, x, u, f);
+    for (size_t i = 0; i < 3U; i++) {
+        const uint8_t axis = table->axis[i];
+        float w[3] = {0.0F};
+        w[i] = wide;
+        corrected->value[axis] = f[i] * unit;
+        corrected->sd[axis] = sqrtf(variance_of(used->accel, used->covariance, x, u, w));
+        if ((why & spoils) == 0U) {
             corrected->reason[axis] = SELFCAL_REASON_NONE;
         }
-        for (size_t j = 0; sound && gate->rested && j < 3U; j++) {
-            corrected->value[gyro] -= used->G[i][j] * (f[j] - f0[j]) / table->gyro_unit;
+        for (size_t j = 0; gate->rested && j < 3U; j++) {
+            corrected->value[table->axis[3U + i]] -= used->G[3U * i + j] * turned[j] / table->gyro_unit;
         }
     }
 }
 
 /* --- saved state --- */
 
-static void forget(selfcal_imu_t *imu) {
-    (void)begin(imu);
-}
-
 static bool save(const selfcal_imu_t *imu, selfcal_write_t write, void *context) {
     saved_t saved;
     if (!imu->tumble->progress.applied) {
         return true;
     }
-    memset(&saved, 0, sizeof saved);
-    memcpy(saved.magic, magic, sizeof magic);
-    saved.format = FORMAT;
+    saved.magic = MAGIC;
     saved.used = imu->tumble->used;
     saved.crc = selfcal_crc32(0, (const uint8_t *)&saved, offsetof(saved_t, crc));
     return write(context, &saved, sizeof saved);
@@ -330,16 +309,13 @@ static selfcal_status_t restore(selfcal_imu_t *imu, const void *bytes, size_t *l
         return SELFCAL_OK;
     }
     memcpy(&saved, (const uint8_t *)bytes + (*length - sizeof saved), sizeof saved);
-    if (memcmp(saved.magic, magic, sizeof magic) != 0) {
+    if (saved.magic != MAGIC) {
         return SELFCAL_OK;
     }
     if (saved.crc != selfcal_crc32(0, (const uint8_t *)&saved, offsetof(saved_t, crc))) {
         return SELFCAL_SNAPSHOT_DAMAGED;
     }
     *length -= sizeof saved;
-    if (saved.format != FORMAT) {
-        return SELFCAL_SNAPSHOT_VERSION;
-    }
     if (!imu->tumble->progress.applied) {
         imu->tumble->used = saved.used;
         imu->tumble->progress.applied = true;
@@ -348,4 +324,4 @@ static selfcal_status_t restore(selfcal_imu_t *imu, const void *bytes, size_t *l
 }
 
 const selfcal_tumbling_code_t selfcal_tumbling_code = {
-    sizeof(selfcal_imu_tumble_t), begin, skip, take, correct, forget, save, restore};
+    sizeof(selfcal_imu_tumble_t), begin_tumble, skip, take_sample, correct, save, restore};

@@ -165,9 +165,9 @@ static wide_t take_step(selfcal_tumble_work_t *work, size_t parameters, size_t c
     return isfinite(far) ? far : -1.0;
 }
 
-/* A bit for each parameter that the whitened columns in `work` identify. */
-static uint16_t identified(const selfcal_tumble_work_t *work, size_t parameters, size_t count) {
-    wide_t normal[ACCEL * (ACCEL + 1) / 2];
+/* A bit for each parameter that the whitened columns in `work` identify. The covariance there is lost. */
+static uint16_t identified(selfcal_tumble_work_t *work, size_t parameters, size_t count) {
+    wide_t *const normal = work->factor;
     uint16_t bits = 0;
     normal_of(work, parameters, count, 1.0 / (WIDER * WIDER), normal);
     if (factorize(normal, parameters)) {
@@ -182,6 +182,15 @@ static uint16_t identified(const selfcal_tumble_work_t *work, size_t parameters,
 static const wide_t accel_sd[ACCEL] = {BIAS_SD,  BIAS_SD,  BIAS_SD,  SCALE_SD, SCALE_SD,
                                        SCALE_SD, ANGLE_SD, ANGLE_SD, ANGLE_SD};
 static const wide_t gyro_sd[GYRO] = {GYRO_BIAS_SD, G_SD, G_SD, G_SD};
+
+/* The accelerometers' covariance in their units. */
+static void scale(const wide_t normal[], float found[45]) {
+    for (size_t i = 0; i < ACCEL; i++) {
+        for (size_t j = 0; j <= i; j++) {
+            found[packed(i, j)] = (float)(normal[packed(i, j)] * accel_sd[i] * accel_sd[j]);
+        }
+    }
+}
 
 /* T K of parameters in units of the prior's sd. */
 static void matrix_of(const wide_t theta[ACCEL], wide_t M[3][3]) {
@@ -346,10 +355,8 @@ static selfcal_tumble_status_t fit_accel(selfcal_tumble_t *found, const selfcal_
     for (size_t i = 0; i < ACCEL; i++) {
         const bool known = (found->accel_identified >> i & 1U) != 0U;
         found->accel[i] = known ? theta[i] * accel_sd[i] : (wide_t)NAN;
-        for (size_t j = 0; j <= i; j++) {
-            found->accel_covariance[packed(i, j)] = (float)(normal[packed(i, j)] * accel_sd[i] * accel_sd[j]);
-        }
     }
+    scale(normal, found->accel_covariance);
     for (size_t i = 0; i < 3U; i++) {
         found->bias[i] = (float)(theta[i] * BIAS_SD);
         for (size_t j = 0; j < 3U; j++) {
@@ -409,42 +416,17 @@ selfcal_tumble_status_t selfcal_tumble(selfcal_tumble_t *found, const selfcal_tu
     return status;
 }
 
-uint8_t selfcal_tumble_next(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
-                            selfcal_tumble_work_t *work, uint16_t *known) {
-    static const int8_t up[SELFCAL_TUMBLE_POSITIONS][3] = {{0, 0, 1},  {0, 1, 0},  {1, 0, 0}, {0, 0, -1},
-                                                           {0, -1, 0}, {-1, 0, 0}, {1, 1, 0}, {1, -1, 0},
-                                                           {1, 0, 1},  {-1, 0, 1}, {0, 1, 1}, {0, -1, 1}};
-    wide_t normal[ACCEL * (ACCEL + 1) / 2], theta[ACCEL] = {0.0}, most = 0.0;
-    uint8_t next = 0;
+uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
+                              selfcal_tumble_work_t *work, float found[45]) {
+    wide_t normal[ACCEL * (ACCEL + 1) / 2], theta[ACCEL] = {0.0};
     if (count > 0U) {
         lay_accel(part, rests, count, theta, work);
     }
-    *known = 0U;
-    if (take_step(work, ACCEL, count, theta, normal) < 0.0) { /* `normal`: the covariance, without rests the prior's */
+    if (take_step(work, ACCEL, count, theta, normal) < 0.0) {
         return 0U;
     }
-    *known = identified(work, ACCEL, count);
-    for (uint8_t p = 0; p < SELFCAL_TUMBLE_POSITIONS; p++) {
-        const wide_t g = (wide_t)part->gravity, size = up[p][0] * up[p][0] + up[p][1] * up[p][1] + up[p][2] * up[p][2];
-        wide_t h[ACCEL], variance = 0.0;
-        for (size_t i = 0; i < 3U; i++) { /* the residual's derivatives at error 0 */
-            h[i] = -up[p][i] / sqrt(size) * BIAS_SD;
-            h[3U + i] = g * up[p][i] * up[p][i] / size * SCALE_SD;
-        }
-        h[6] = g * up[p][0] * up[p][1] / size * ANGLE_SD;
-        h[7] = g * up[p][0] * up[p][2] / size * ANGLE_SD;
-        h[8] = g * up[p][1] * up[p][2] / size * ANGLE_SD;
-        for (size_t i = 0; i < ACCEL; i++) {
-            for (size_t j = 0; j < ACCEL; j++) {
-                variance += h[i] * h[j] * normal[i >= j ? packed(i, j) : packed(j, i)];
-            }
-        }
-        if (variance > (1.0 + 1e-6) * most) { /* of equal ones the first */
-            most = variance;
-            next = p;
-        }
-    }
-    return next;
+    scale(normal, found);
+    return identified(work, ACCEL, count);
 }
 
 float selfcal_tumble_accel_sd(const selfcal_tumble_t *found, uint8_t k) {

@@ -105,14 +105,11 @@ float selfcal_tumble_gyro_sd(const selfcal_tumble_t *found, uint8_t axis, uint8_
 /* Correct one reading of six axes. */
 void selfcal_tumble_apply(const selfcal_tumble_t *found, const float reading[6], float corrected[6]);
 
-/* Positions by the side that is up: +z +y +x -z -y -x, then edges: +x+y +x-y +x+z -x+z +y+z -y+z. */
-enum { SELFCAL_TUMBLE_POSITIONS = 12 };
-
-/* The position that tells most after `count` rests: whose residual is least known by their information matrix.
- * `identified`: a bit for each accelerometer parameter that they identify. `rests` are sound, see above. A round of the
- * fit: 1 million instructions of 12 rests on a Cortex-M4F. */
-uint8_t selfcal_tumble_next(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
-                            selfcal_tumble_work_t *work, uint16_t *identified);
+/* What `count` sound rests, 0 to SELFCAL_TUMBLE_MAX, tell of the accelerometers: the covariance of the nine, as
+ * accel_covariance, at error 0. Returns a bit for each parameter that they identify; 0, and no covariance, where there
+ * is none. A round of the fit: 1 million instructions of 12 rests on a Cortex-M4F. */
+uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
+                              selfcal_tumble_work_t *work, float found[45]);
 
 /* --- on a module ---
  * A pipe that names selfcal_tumbling_code (`-DSELFCAL_MODEL_TUMBLED=1`) calibrates while it runs. Between start and
@@ -127,6 +124,9 @@ struct selfcal_tumbling {
     uint8_t axis[6];             /* of the model: ax ay az gx gy gz */
     float accel_unit, gyro_unit; /* the model's, in m/s^2 and rad/s */
 };
+
+/* Positions by the side that is up: +z +y +x -z -y -x, then edges: +x+y +x-y +x+z -x+z +y+z -y+z. */
+enum { SELFCAL_TUMBLE_POSITIONS = 12 };
 
 typedef enum {
     SELFCAL_TUMBLE_OFF = 0,
@@ -144,9 +144,10 @@ typedef struct {
 } selfcal_tumble_progress_t;
 
 /* The calibration in use, as it is saved. Units as above; it holds for readings without the sensor's own offsets
- * (selfcal_shifted()). `covariance` as selfcal_tumble_t's. */
+ * (selfcal_shifted()). Members as selfcal_tumble_t's, 0 for NAN: what is not identified has error 0. A
+ * `ratio` above 1 widens the sd. */
 typedef struct {
-    float bias[3], matrix[3][3], G[3][3], covariance[45], ratio;
+    float accel[SELFCAL_TUMBLE_ACCEL], covariance[45], G[9], ratio;
     uint16_t accel_identified, gyro_identified;
 } selfcal_tumbled_t;
 
@@ -158,13 +159,14 @@ bool selfcal_imu_tumble_start(selfcal_imu_t *imu);
  * selfcal_tumble(). */
 selfcal_tumble_status_t selfcal_imu_tumble_stop(selfcal_imu_t *imu);
 
-/* How far it is; after a rest that counts it takes as long as selfcal_tumble_next(). The pipe names a calibration. */
-selfcal_tumble_progress_t selfcal_imu_tumble_progress(selfcal_imu_t *imu);
+/* How far it is. `next` is the position whose residual is least known after the rests so far, by their information.
+ * After a rest that counts it takes as long as selfcal_tumble_known(). The pipe names a calibration. */
+const selfcal_tumble_progress_t *selfcal_imu_tumble_progress(selfcal_imu_t *imu);
 
 /* Values of message TUMBLE for selfcal_telemetry_words(): the progress, and of the calibration in use the parameters
- * that are identified, with their sd. Returns which are there, a bit each. */
+ * that are identified, with their sd. `there`: which, a bit each. They stay until the next call of these functions. */
 enum { SELFCAL_TUMBLE_WORDS = 29 };
-uint32_t selfcal_imu_tumble_words(selfcal_imu_t *imu, uint32_t word[SELFCAL_TUMBLE_WORDS]);
+const uint32_t *selfcal_imu_tumble_words(selfcal_imu_t *imu, uint32_t *there);
 
 /* The calibration in use; NULL: none. */
 const selfcal_tumbled_t *selfcal_imu_tumbled(const selfcal_imu_t *imu);
@@ -173,14 +175,16 @@ const selfcal_tumbled_t *selfcal_imu_tumbled(const selfcal_imu_t *imu);
 struct selfcal_imu_tumble {
     selfcal_tumbled_t used;
     selfcal_tumble_progress_t progress;
-    bool resting, counted, spoilt, due; /* of the rest under way; of its window; `next` is to be worked out */
-    uint32_t passed, begun;             /* samples since the start, and up to the rest under way */
-    uint32_t window, kept;              /* samples of the window and of the rest under way */
-    float origin[6], window_sum[6];     /* of its first sample; of the window, about it */
-    selfcal_wide_t sum[6];
+    bool resting, counted, due;    /* a rest is under way; it counts; `next` is to be worked out */
+    uint8_t ended;                 /* rests that count and have ended */
+    uint32_t passed, window, kept; /* samples since the start, of the window and of the rest under way */
+    uint32_t faults;               /* readings that the bank found wrong, when the window began */
     selfcal_tumble_rest_t rest[SELFCAL_TUMBLE_MAX];
     selfcal_tumble_t found;
-    selfcal_tumble_work_t work;
+    union {
+        selfcal_tumble_work_t work;
+        uint32_t word[SELFCAL_TUMBLE_WORDS];
+    } by;
 };
 
 #ifdef __cplusplus

@@ -47,33 +47,24 @@ void app_tell_status(app_t *app, uint32_t now) {
     app->told_ms = now;
 }
 
-#if SELFCAL_MODEL_TUMBLED
 bool app_tumbles(app_t *app) {
-    return selfcal_imu_tumble_progress(&app->imu).phase != SELFCAL_TUMBLE_OFF;
+    return SELFCAL_MODEL_TUMBLED && app->imu.tumble->progress.phase != SELFCAL_TUMBLE_OFF;
 }
 
 bool app_begin_tumble(app_t *app, uint32_t now) {
-    const uint32_t before = app->tumble[0];
-    const uint32_t there = selfcal_imu_tumble_words(&app->imu, app->tumble);
-    if (before == app->tumble[0] && now - app->tumble_ms < STATUS_MS) {
+    if (!SELFCAL_MODEL_TUMBLED) {
         return false;
     }
+    uint32_t there = 0;
+    const uint32_t *word = selfcal_imu_tumble_words(&app->imu, &there);
+    if (word[0] == app->tumble && now - app->tumble_ms < STATUS_MS) {
+        return false;
+    }
+    app->tumble = word[0];
     app->tumble_ms = now;
-    return selfcal_telemetry_words(&app->telemetry, SELFCAL_FRAME_TUMBLE_ID, app->tumble, SELFCAL_TUMBLE_WORDS, there,
-                                   now) == SELFCAL_OK;
+    return selfcal_telemetry_words(&app->telemetry, SELFCAL_FRAME_TUMBLE_ID, word, SELFCAL_TUMBLE_WORDS, there, now) ==
+           SELFCAL_OK;
 }
-#else
-bool app_tumbles(app_t *app) {
-    (void)app;
-    return false;
-}
-
-bool app_begin_tumble(app_t *app, uint32_t now) {
-    (void)app;
-    (void)now;
-    return false;
-}
-#endif
 
 bool app_status_due(const app_t *app, uint32_t now) {
     return app->module != NULL && now - app->told_ms >= STATUS_MS;
