@@ -4,8 +4,8 @@
  * dropped, and one with a reading that the bank's intake finds wrong. Gyros may rest at another level in each position, by their g-sensitivity: the gate forgets the last one.
  *
  * The result corrects accelerometers by f = T K (a - b), whose variance is J C J' of its covariance C. Residuals beyond
- * their sd widen it. A gyro's bias is the bank's. It holds where the gate saw rest last, at the specific force f0, so
- * G (f - f0) is taken off as well.
+ * their sd widen it. A gyro's bias is the bank's, learned at rest under a specific force f0: the accelerometers' biases
+ * of the last reports. So G (f - f0) is taken off as well. After a new attitude at rest both follow in their own time.
  *
  * Saved: magic with its format, selfcal_tumbled_t as it lies in memory, CRC-32 of all before. */
 #include "tumble.h"
@@ -195,7 +195,7 @@ const selfcal_tumble_progress_t *selfcal_imu_tumble_progress(selfcal_imu_t *imu)
     if (self->due) {
         const selfcal_tumble_part_t *part = &imu->pipe->tumbling->part;
         const uint8_t rests = progress->rests;
-        float covariance[45] = {0.0F};
+        float *const covariance = self->found.accel_covariance; /* free until the end */
         const uint16_t known = selfcal_tumble_known(part, self->rest, rests, &self->by.work, covariance);
         const bool all = known == (1U << SELFCAL_TUMBLE_ACCEL) - 1U, most = rests == SELFCAL_TUMBLE_MAX;
         progress->wanted = SELFCAL_TUMBLE_POSITIONS;
@@ -257,7 +257,6 @@ static void turn(const float accel[], const float x[3], float u[3], float f[3]) 
 static void correct(const selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
     const selfcal_tumbling_t *table = imu->pipe->tumbling;
     const selfcal_tumbled_t *used = &imu->tumble->used;
-    const selfcal_gate_t *gate = &imu->gate->gate;
     const uint32_t spoils = 1U << SELFCAL_REASON_RETIRED | 1U << SELFCAL_REASON_STUCK | 1U << SELFCAL_REASON_BAD_SAMPLE;
     float x[3], u[3], f[3], moved[3], turned[3];
     uint32_t why = 0;
@@ -268,7 +267,7 @@ static void correct(const selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
         const uint8_t axis = table->axis[i];
         const float reading = imu->kept->reading[axis];
         x[i] = (reading - imu->bank.shifted[axis]) * table->accel_unit - used->accel[i];
-        moved[i] = (reading - gate->origin[axis] - gate->rest.mean[axis]) * table->accel_unit;
+        moved[i] = (reading - imu->bias[axis]) * table->accel_unit;
         why |= 1U << corrected->reason[axis]; /* each force has a part of every reading */
     }
     const float unit = (why & spoils) != 0U ? NAN : 1.0F / table->accel_unit, wide = unit * widening(used);
@@ -283,7 +282,7 @@ static void correct(const selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
         if ((why & spoils) == 0U) {
             corrected->reason[axis] = SELFCAL_REASON_NONE;
         }
-        for (size_t j = 0; gate->rested && j < 3U; j++) {
+        for (size_t j = 0; isfinite(turned[0]) && j < 3U; j++) { /* it has a part of all three */
             corrected->value[table->axis[3U + i]] -= used->G[3U * i + j] * turned[j] / table->gyro_unit;
         }
     }

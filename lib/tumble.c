@@ -333,7 +333,8 @@ static float ratio_of(const selfcal_tumble_work_t *work, size_t count, const wid
 static selfcal_tumble_status_t fit_accel(selfcal_tumble_t *found, const selfcal_tumble_part_t *part,
                                          const selfcal_tumble_rest_t rests[], size_t count, wide_t theta[ACCEL],
                                          selfcal_tumble_work_t *work) {
-    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, M[3][3], far = 1.0;
+    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, far = 1.0;
+    wide_t(*const M)[3] = (wide_t(*)[3])work->factor; /* at the end: less stack */
     for (int round = 0; round < ROUNDS && far >= SETTLED; round++) {
         lay_accel(part, rests, count, theta, work);
         far = take_step(work, ACCEL, count, theta, normal);

@@ -10,6 +10,7 @@ import errno
 import logging
 import math
 import os
+import re
 import shlex
 import time
 from collections.abc import Callable, Mapping
@@ -115,6 +116,16 @@ def reasons(*messages: Mapping[str, float]) -> dict[str, str]:
             words = {axis: choices(STATUS, f"reason_{axis}").get(int(code), f"{code:g}") for axis, code in said.items()}
             known = {axis: word for axis, word in words.items() if word != "none"}
     return known
+
+
+def tumble_text(values: Mapping[str, float]) -> str:
+    """What to do in a calibration by rests in several positions, or why it came to nothing; "" if neither applies."""
+    word = {name: choices(TUMBLE, name).get(int(values.get(name, 0)), "?") for name in ("phase", "result", "next")}
+    if word["phase"] == "off":
+        return "" if word["result"] == "none" else f"no calibration, {word['result'].replace('_', ' ')}: send tumble start"
+    sides = re.sub("(minus_)?([xyz])_", lambda found: f"{'-' if found[1] else '+'}{found[2]} ", word["next"])
+    todo = "hold still" if word["phase"] == "hold" else "send tumble stop" if sides == "none" else f"now {sides}"
+    return f"{values.get('rests', 0):.0f} of {values.get('wanted', 0):.0f}: {todo}"
 
 
 def status_text(signal: str, value: float) -> str:
