@@ -1,7 +1,8 @@
 /* The calibration by rests in several positions, in the pipe (tumble.h).
  *
  * A rest is the mean of the gate's windows that are at rest from begin to end: the window in which motion begins is
- * dropped, and one with a reading that the bank's intake finds wrong. Gyros may rest at another level in each position, by their g-sensitivity: the gate forgets the last one.
+ * dropped, and one with a reading that the bank's intake finds wrong. Gyros may rest at another level in each position,
+ * by their g-sensitivity: the gate forgets the last one.
  *
  * The result corrects accelerometers by f = T K (a - b), whose variance is J C J' of its covariance C. Residuals beyond
  * their sd widen it. A gyro's bias is the bank's, learned at rest under a specific force f0: the accelerometers' biases

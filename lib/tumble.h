@@ -24,7 +24,7 @@
  *
  * Units: m/s^2, rad/s, s, rad, rad/s per m/s^2. The arithmetic is in selfcal_wide_t: weights of a drift that is large
  * against the noise lose float's digits. Results are right to 1e-4 of their standard deviation.
- * Cortex-M4F: 5.8 KB of flash beside the software doubles, 1.4 KB of stack; 6 million instructions of 12 rests, 20 of
+ * Cortex-M4F: 5.8 KB of flash beside the software doubles, 1.1 KB of stack; 6 million instructions of 12 rests, 20 of
  * 24, 70 with a Gauss-Markov drift. It fits a Cortex-M0 too.
  * On a module selfcal_imu_tumble_start() and _stop() do all of it, see below.
  * The gyros' scale and misalignment take the turns between the rests: `selfcal tumble` on the host. */
@@ -114,7 +114,8 @@ uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_t
 /* --- on a module ---
  * A pipe that names selfcal_tumbling_code (`-DSELFCAL_MODEL_TUMBLED=1`) calibrates while it runs. Between start and
  * stop the gate tells rests, and the bank takes no sample. A rest counts from SELFCAL_TUMBLE_REST_S of whole windows
- * on. The result corrects samples (selfcal_imu_corrected()), and goes with the saved state (selfcal_imu_save()). */
+ * on. The result corrects samples (selfcal_imu_corrected()), and goes with the saved state (selfcal_imu_save()), which
+ * SELFCAL_TUMBLE_SAVED bytes are added to. */
 #ifndef SELFCAL_TUMBLE_REST_S
 #define SELFCAL_TUMBLE_REST_S 10
 #endif
@@ -150,6 +151,8 @@ typedef struct {
     float accel[SELFCAL_TUMBLE_ACCEL], covariance[45], G[9], ratio;
     uint16_t accel_identified, gyro_identified;
 } selfcal_tumbled_t;
+
+#define SELFCAL_TUMBLE_SAVED (sizeof(selfcal_tumbled_t) + 8U)
 
 /* Begin: earlier rests are forgotten, an earlier result stays. False: the pipe names no calibration, the gate is off,
  * or an axis is retired. */

@@ -255,7 +255,7 @@ static void test_saved_state(void) {
     TEST_ASSERT_EQUAL(SELFCAL_TUMBLE_OK, selfcal_imu_tumble_stop(&imu));
     const selfcal_tumbled_t found = *selfcal_imu_tumbled(&imu);
     save();
-    TEST_ASSERT_EQUAL(plain + sizeof found + 8U, length);
+    TEST_ASSERT_EQUAL(plain + SELFCAL_TUMBLE_SAVED, length);
     for (size_t at = plain; at < length; at++) {
         begin();
         saved[at] ^= 0x10U;

@@ -9,12 +9,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from firmware import AXES, Board, image, messages, parts
+from firmware import AXES, Board, image, messages
 from parts.icm42688 import Icm42688
 from parts.turned import Turned
 from test_firmware_commands import KEY, RESULT, challenge, new_answers
 
-from selfcal.model.file import PARTS, Model
 from selfcal.wire import command as verb
 from selfcal.wire.frames import Decoder, tumble_text
 
@@ -111,9 +110,9 @@ def compare(user: User) -> None:
     """Corrected accelerations are the true ones, and gyros show no force, in attitudes that were not among the rests.
 
     Tolerance: five standard deviations of the mean of the compared readings and of what the module itself tells of its
-    calibration. The readings' step, g/8192, is dithered by noise of twice its size. Of a gyro the module tells the sd of
-    its bias; G (f - f0), of forces up to 2 g apart, adds 2 g times the sd of its row: twice N / sqrt(10 s) over the
-    root of 6 rests along an axis. An uncorrected reading is off by 0.2 m/s^2 and 0.02 deg/s.
+    calibration. The readings' step, g/8192, is dithered by noise of twice its size. A gyro's told sd is of its bias;
+    G (f - f0), of forces up to 2 g apart, adds 2 g times the sd of its row: twice N / sqrt(10 s) over the root of
+    6 rests along an axis. An uncorrected reading is off by 0.2 m/s^2 and 0.02 deg/s.
     """
     for up in ATTITUDES:
         mean, sd, count = user.rest_at(up)
@@ -132,7 +131,6 @@ def test_a_part_is_calibrated_in_the_hand() -> None:
     """Twelve positions by telemetry; the result is saved, corrects, and outlives a power cut. A damaged one is refused
     with its state, and corrects nothing."""
     user = User(turned(5))
-    assert Model.load(next(PARTS.glob("icm42688*.yaml"))).groups  # the model of the image
     user.wait(1.0)
     assert user.order("tumble", 1) == RESULT["done"]
     assert user.told == "0 of 12: now +z up"
@@ -142,7 +140,8 @@ def test_a_part_is_calibrated_in_the_hand() -> None:
         assert count == f"{len(sides)} of 12"
         sides.append(side)
         user.place(side)
-        assert user.order("write_offsets", 0) == RESULT["not_now"] or len(sides) != 2
+        if len(sides) == 2:
+            assert user.order("write_offsets", 0) == RESULT["not_now"]
     assert user.told == "12 of 12: send tumble stop"
     assert {side.count(" ") for side in sides[:6]} == {1} and len(set(sides[:6])) == 6  # the six faces first
     assert user.order("tumble", 0, 4.0) == RESULT["done"]

@@ -120,11 +120,12 @@ def reasons(*messages: Mapping[str, float]) -> dict[str, str]:
 
 def tumble_text(values: Mapping[str, float]) -> str:
     """What to do in a calibration by rests in several positions, or why it came to nothing; "" if neither applies."""
-    word = {name: choices(TUMBLE, name).get(int(values.get(name, 0)), "?") for name in ("phase", "result", "next")}
-    if word["phase"] == "off":
-        return "" if word["result"] == "none" else f"no calibration, {word['result'].replace('_', ' ')}: send tumble start"
-    sides = re.sub("(minus_)?([xyz])_", lambda found: f"{'-' if found[1] else '+'}{found[2]} ", word["next"])
-    todo = "hold still" if word["phase"] == "hold" else "send tumble stop" if sides == "none" else f"now {sides}"
+    names = ("phase", "result", "next")
+    phase, result, side = (choices(TUMBLE, name).get(int(values.get(name, 0)), "?").replace("_", " ") for name in names)
+    if phase == "off":
+        return "" if result == "none" else f"no calibration, {result}: send tumble start"
+    sides = re.sub("(minus )?([xyz]) ", lambda found: f"{'-' if found[1] else '+'}{found[2]} ", side)
+    todo = "hold still" if phase == "hold" else "send tumble stop" if sides == "none" else f"now {sides}"
     return f"{values.get('rests', 0):.0f} of {values.get('wanted', 0):.0f}: {todo}"
 
 
