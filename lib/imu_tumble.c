@@ -175,7 +175,7 @@ static uint8_t next_of(const selfcal_imu_tumble_t *self, const float *covariance
                                                            {1, 0, 1},  {-1, 0, 1}, {0, 1, 1}, {0, -1, 1}};
     float most = 0.0F;
     uint8_t next = 0;
-    for (uint8_t p = 0; p < SELFCAL_TUMBLE_POSITIONS; p++) {
+    for (unsigned p = 0; p < SELFCAL_TUMBLE_POSITIONS; p++) {
         float w[3], f[3];
         for (size_t i = 0; i < 3U; i++) {
             w[i] = (float)up[p][i] * (p < 6U ? 1.0F : 0.70710678F);
@@ -184,7 +184,7 @@ static uint8_t next_of(const selfcal_imu_tumble_t *self, const float *covariance
         const float variance = variance_of(self->used.accel, covariance, f, f, w);
         if (variance > 1.0001F * most) { /* of equal ones the first */
             most = variance;
-            next = p;
+            next = (uint8_t)p;
         }
     }
     return next;

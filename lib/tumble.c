@@ -419,7 +419,7 @@ selfcal_tumble_status_t selfcal_tumble(selfcal_tumble_t *found, const selfcal_tu
 
 uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
                               selfcal_tumble_work_t *work, float found[45]) {
-    wide_t normal[ACCEL * (ACCEL + 1) / 2], theta[ACCEL] = {0.0};
+    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, theta[ACCEL] = {0.0};
     if (count > 0U) {
         lay_accel(part, rests, count, theta, work);
     }
