@@ -37,9 +37,11 @@ static void end_rest(selfcal_imu_tumble_t *self) {
     self->window = self->kept = 0U;
 }
 
-/* Whether rest has ended the next sample tells. */
+/* The window in progress is dropped: the gate may have begun another one. The next sample tells if rest has ended. */
 static void skip(selfcal_imu_t *imu, uint64_t count) {
     imu->tumble->passed += (uint32_t)count;
+    imu->tumble->resting = false;
+    imu->tumble->window = 0U;
 }
 
 /* A window of rest has ended: the gate's sums still have it. */
@@ -78,8 +80,7 @@ static bool take_sample(selfcal_imu_t *imu, const float reading[]) {
         self->progress.phase = SELFCAL_TUMBLE_PLACE;
         return true;
     }
-    self->window += self->resting ? 1U : 0U; /* else the window that told of rest, which is not taken */
-    self->resting = true;
+    self->window += self->resting ? 1U : 0U;
     if (gate->position == 0U) {
         /* what passes is missing to the bank, but for wrong readings */
         const uint32_t faults = self->passed - (uint32_t)imu->bank.counters.missing;
@@ -88,6 +89,7 @@ static bool take_sample(selfcal_imu_t *imu, const float reading[]) {
         }
         self->window = 0U;
         self->faults = faults;
+        self->resting = true; /* from a window's begin on */
     }
     self->progress.phase = self->counted ? SELFCAL_TUMBLE_TURN : SELFCAL_TUMBLE_HOLD;
     return true;

@@ -178,7 +178,7 @@ const selfcal_tumbled_t *selfcal_imu_tumbled(const selfcal_imu_t *imu);
 struct selfcal_imu_tumble {
     selfcal_tumbled_t used;
     selfcal_tumble_progress_t progress;
-    bool resting, counted, due;    /* a rest is under way; it counts; `next` is to be worked out */
+    bool resting, counted, due;    /* at rest since a window began; the rest counts; `next` is to be worked out */
     uint8_t ended;                 /* rests that count and have ended */
     uint32_t passed, window, kept; /* samples since the start, of the window and of the rest under way */
     uint32_t faults;               /* readings that the bank found wrong, when the window began */
