@@ -14,6 +14,9 @@
 #include "imu.h"
 #include "selfcal_frames.h"
 
+SELFCAL_STATIC_ASSERT(there_is_room_for_every_position,
+                      (unsigned)SELFCAL_TUMBLE_MAX >= (unsigned)SELFCAL_TUMBLE_POSITIONS);
+
 /* rad/s per m/s^2 */
 #define DEG_PER_S_PER_G (57.29577951F * 9.80665F)
 #define MAGIC 0x31425446U /* "FTB1" */
