@@ -90,7 +90,7 @@ typedef struct {
 
 /* Not for users. */
 typedef struct {
-    selfcal_wide_t factor[SELFCAL_TUMBLE_MAX > 9 ? SELFCAL_TUMBLE_MAX * (SELFCAL_TUMBLE_MAX + 1) / 2 : 45];
+    selfcal_wide_t factor[SELFCAL_TUMBLE_MAX > 9 ? SELFCAL_TUMBLE_MAX *(SELFCAL_TUMBLE_MAX + 1) / 2 : 45];
     selfcal_wide_t column[SELFCAL_TUMBLE_ACCEL][SELFCAL_TUMBLE_MAX], residual[SELFCAL_TUMBLE_MAX];
 } selfcal_tumble_work_t;
 
