@@ -326,6 +326,9 @@ static inline selfcal_moving_t moving_of(const selfcal_node_t *node) {
     return node->gains.moving;
 }
 
+/* snapshot.c: CRC-32 of bytes after those of `crc`, 0 at the start. */
+uint32_t selfcal_crc32(uint32_t crc, const uint8_t *bytes, size_t count);
+
 /* A level node's samples have added this to A since it became level. */
 static inline selfcal_wide_t level_a(const selfcal_node_t *node) {
     const selfcal_wide_t u = (selfcal_wide_t)node->u_inf;

@@ -38,6 +38,9 @@ static void carve_all(selfcal_imu_t *imu, room_t *room) {
     if (pipe->changes != NULL) {
         imu->changes = carve(room, SELFCAL_CHANGES_SIZE(model->nodes, model->axes));
     }
+    if (pipe->tumbling_code != NULL) {
+        imu->tumble = carve(room, SELFCAL_PART(pipe->tumbling_code->bytes));
+    }
     if (pipe->holding != NULL) {
         imu->held = carve(room, SELFCAL_HELD_SIZE(model->nodes, sum_nodes(model), regressors_of(model)));
     }
@@ -69,7 +72,9 @@ static selfcal_status_t begin_all(selfcal_imu_t *imu) {
 /* Whether the pipe has all that the tables want. */
 static bool goes_together(const selfcal_pipe_t *pipe) {
     return (pipe->columns != NULL) == (pipe->model->regressors != NULL) && pipe->rate_hz > 0.0F &&
-           (pipe->gate_code == NULL || pipe->gate != NULL) && (pipe->changes == NULL || pipe->judging != NULL);
+           (pipe->gate_code == NULL || pipe->gate != NULL) &&
+           (pipe->tumbling_code == NULL || (pipe->tumbling != NULL && pipe->gate_code != NULL)) &&
+           (pipe->changes == NULL || pipe->judging != NULL);
 }
 
 selfcal_status_t selfcal_imu_init_as(uint32_t layout, selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory,
@@ -92,6 +97,9 @@ selfcal_status_t selfcal_imu_init_as(uint32_t layout, selfcal_imu_t *imu, const 
     }
     imu->memory = room.next;
     selfcal_status_t status = selfcal_init(&imu->bank, pipe->model, imu->memory, room.left);
+    if (imu->tumble != NULL) {
+        pipe->tumbling_code->begin(imu);
+    }
     status = status == SELFCAL_OK ? begin_all(imu) : status;
     if (status == SELFCAL_OK && imu->gate != NULL && !selfcal_imu_watch(imu, true)) {
         status = SELFCAL_BAD_MODEL;
@@ -116,6 +124,9 @@ void selfcal_imu_skip(selfcal_imu_t *imu, uint64_t count) {
     }
     if (imu->watching) {
         pipe->gate_code->skip(imu, count);
+    }
+    if (imu->tumble != NULL) {
+        pipe->tumbling_code->skip(imu, count);
     }
     (void)selfcal_skip(&imu->bank, count);
     if (imu->columns != NULL) {
@@ -146,10 +157,12 @@ uint32_t selfcal_imu_sample(selfcal_imu_t *imu, const float reading[], const flo
     const selfcal_pipe_t *pipe = imu->pipe;
     const float *values = imu->columns != NULL ? pipe->columns->form(imu, reading, channels) : NULL;
     uint32_t found = 0;
-    if (imu->watching && !pipe->gate_code->rests(imu, reading)) {
-        (void)selfcal_push_moving(&imu->bank, reading);
-    } else {
+    const bool rests = !imu->watching || pipe->gate_code->rests(imu, reading);
+    const bool taken = imu->tumble != NULL && pipe->tumbling_code->take(imu, reading);
+    if (!taken && rests) {
         (void)selfcal_push_with(&imu->bank, reading, values); /* what it rejects it counts */
+    } else if (!taken) {
+        (void)selfcal_push_moving(&imu->bank, reading);
     }
     if (imu->judge != NULL) {
         pipe->judging->sample(imu, side, values);
@@ -323,6 +336,9 @@ selfcal_status_t selfcal_imu_forget(selfcal_imu_t *imu) {
         (void)selfcal_shift(&imu->bank, axis, shifted[axis]);
     }
     (void)begin_all(imu);
+    if (imu->tumble != NULL) {
+        imu->pipe->tumbling_code->begin(imu);
+    }
     if (imu->watching) { /* its windows go on: the bank must start with one of them */
         (void)selfcal_imu_watch(imu, true);
     }
@@ -330,12 +346,23 @@ selfcal_status_t selfcal_imu_forget(selfcal_imu_t *imu) {
 }
 
 selfcal_status_t selfcal_imu_save(const selfcal_imu_t *imu, selfcal_write_t write, void *context) {
-    return selfcal_save(&imu->bank, write, context);
+    const selfcal_status_t status = selfcal_save(&imu->bank, write, context);
+    if (status == SELFCAL_OK && imu->tumble != NULL && !imu->pipe->tumbling_code->save(imu, write, context)) {
+        return SELFCAL_WRITE_FAILED;
+    }
+    return status;
 }
 
 selfcal_status_t selfcal_imu_restore(selfcal_imu_t *imu, const void *snapshot, size_t length, uint64_t gap) {
     selfcal_t *bank = &imu->bank;
-    const selfcal_status_t status = selfcal_restore(bank, imu->pipe->model, imu->memory, SIZE_MAX, snapshot, length);
+    selfcal_status_t status = SELFCAL_OK;
+    if (imu->tumble != NULL && snapshot != NULL) {
+        status = imu->pipe->tumbling_code->restore(imu, snapshot, &length);
+    }
+    if (status != SELFCAL_OK) {
+        return status;
+    }
+    status = selfcal_restore(bank, imu->pipe->model, imu->memory, SIZE_MAX, snapshot, length);
     if (status == SELFCAL_OK) {
         /* Up to the start of a bank interval: it holds whole windows of the gate. */
         (void)selfcal_moving(bank);

@@ -50,6 +50,21 @@ struct selfcal_holding_code {
     void (*follow)(selfcal_imu_t *imu);
 };
 
+/* imu_tumble.c: rests in several positions give scale and misalignment of the accelerometers. */
+struct selfcal_tumbling_code {
+    size_t bytes; /* of selfcal_imu_tumble_t */
+    /* Nothing is known. */
+    void (*begin)(selfcal_imu_t *imu);
+    void (*skip)(selfcal_imu_t *imu, uint64_t count);
+    /* Behind the gate. Whether it has taken the sample, which is motion to the bank. */
+    bool (*take)(selfcal_imu_t *imu, const float reading[]);
+    void (*correct)(const selfcal_imu_t *imu, selfcal_corrected_t *corrected);
+    /* Behind a snapshot. */
+    bool (*save)(const selfcal_imu_t *imu, selfcal_write_t write, void *context);
+    /* Takes its bytes off the end. */
+    selfcal_status_t (*restore)(selfcal_imu_t *imu, const void *bytes, size_t *length);
+};
+
 /* Whether an axis has a report that is not of the past. */
 static inline bool has_report(const selfcal_imu_t *imu, uint8_t axis) {
     return (imu->reported >> axis & 1U) != 0U;

@@ -1,4 +1,4 @@
-/* Corrected samples: the newest sample less the bias predicted for its time. */
+/* Corrected samples: the newest sample less the bias predicted for its time, or by a calibration. */
 #include "imu.h"
 
 /* True if the bank keeps this sample out for a fault of the sensor's. */
@@ -50,6 +50,9 @@ bool selfcal_imu_corrected(selfcal_imu_t *imu, selfcal_corrected_t *corrected) {
         corrected->value[axis] = kept->reading[axis] - bias;
         corrected->sd[axis] = sd;
         corrected->reason[axis] = reason;
+    }
+    if (imu->tumble != NULL) {
+        imu->pipe->tumbling_code->correct(imu, corrected);
     }
     corrected->motion = selfcal_imu_motion(imu);
     return true;

@@ -27,6 +27,7 @@
  *   selfcal_parts.h    bank, gate, report, adequacy, changes, telemetry, for a pipe of one's own
  *   selfcal_layout.h   structs that the caller places but does not read
  *   selfcal_frames.h   codes of the telemetry
+ *   tumble.h           calibration by rests in several positions, if the pipe names it
  *
  * THREADS AND INTERRUPTS
  *   There is no global state. One selfcal_imu_t belongs to one context at a time. The caller locks when two share it.
@@ -214,7 +215,8 @@ typedef struct {
     selfcal_change_t change;   /* ... and the last of them */
 } selfcal_judgement_t;
 
-/* A corrected sample, by axis of the model, unit; sd NAN: there is none of this axis. */
+/* A corrected sample, by axis of the model, unit; sd NAN: there is none of this axis. With a calibration (tumble.h)
+ * accelerometers have the specific force and its sd, and gyros are without their g-sensitivity. */
 typedef struct {
     float value[SELFCAL_AXES_MAX];             /* reading less bias, see selfcal_predict() */
     float sd[SELFCAL_AXES_MAX];                /* of that bias */
@@ -306,8 +308,8 @@ float selfcal_imu_bias(const selfcal_imu_t *imu, uint8_t axis);
 /* Whether the sensor rests, by the code of selfcal.dbc. */
 uint32_t selfcal_imu_motion(const selfcal_imu_t *imu);
 
-/* The newest sample less the bias predicted for its time, with its sd and reason. False: no sample has come since the
- * last call, or selfcal_imu_keep() has not been called. O(alpha nodes axes). */
+/* The newest sample less the bias predicted for its time, or by a calibration, with its sd and reason. False: no sample
+ * has come since the last call, or selfcal_imu_keep() has not been called. O(alpha nodes axes). */
 bool selfcal_imu_corrected(selfcal_imu_t *imu, selfcal_corrected_t *corrected);
 
 /* From the next sample on the sensor itself adds `amount` (unit) to the readings of an axis, say because its offset

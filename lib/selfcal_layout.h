@@ -655,13 +655,16 @@ struct selfcal_kept {
     bool newer;                      /* than what was last corrected */
 };
 
+typedef struct selfcal_imu_tumble selfcal_imu_tumble_t; /* tumble.h */
+
 struct selfcal_imu {
     /* in the caller's memory; NULL: the pipe does not name it */
     selfcal_watched_t *gate;
     selfcal_imu_columns_t *columns;
     selfcal_imu_judge_t *judge;
     selfcal_changes_t *changes; /* with what was learned before a change behind it */
-    selfcal_kept_t *kept;       /* or NULL */
+    selfcal_imu_tumble_t *tumble;
+    selfcal_kept_t *kept; /* or NULL */
     const selfcal_pipe_t *pipe;
     void *memory;                              /* of the bank */
     selfcal_t *held;                           /* of the report under way, its sums behind it; or NULL */
@@ -708,7 +711,8 @@ struct selfcal_telemetry {
     uint16_t id;
     const selfcal_report_t *report;
     const selfcal_corrected_t *corrected;
-    uint32_t answer;
+    const uint32_t *word;
+    uint32_t answer; /* or the words that are there */
     const selfcal_counters_t *counters;
     selfcal_wide_t ln_best;
     uint32_t report_number;

@@ -239,6 +239,9 @@ typedef struct selfcal_changes_code selfcal_changes_code_t;
 extern const selfcal_changes_code_t selfcal_changes_code;
 typedef struct selfcal_holding_code selfcal_holding_code_t;
 extern const selfcal_holding_code_t selfcal_holding_code;
+typedef struct selfcal_tumbling_code selfcal_tumbling_code_t;
+extern const selfcal_tumbling_code_t selfcal_tumbling_code;
+typedef struct selfcal_tumbling selfcal_tumbling_t; /* tumble.h */
 typedef struct selfcal_gate_config selfcal_gate_config_t;
 typedef struct {
     const selfcal_model_t *model;
@@ -249,6 +252,8 @@ typedef struct {
     const selfcal_judging_code_t *judging; /* judges the model */
     const selfcal_changes_code_t *changes; /* handles steps and changes of the noise; with judging */
     const selfcal_holding_code_t *holding; /* a report rests on a copy of its axis's sums: no sample overtakes it */
+    const selfcal_tumbling_t *tumbling;    /* of tumbling_code */
+    const selfcal_tumbling_code_t *tumbling_code; /* calibrates by rests in several positions; with a gate */
 } selfcal_pipe_t;
 
 #ifdef __cplusplus

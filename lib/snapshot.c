@@ -56,7 +56,7 @@ static size_t size_of(const selfcal_model_t *model) {
 /* --- bytes --- */
 
 /* Four bits a step: a table of 64 bytes. */
-static uint32_t crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
+uint32_t selfcal_crc32(uint32_t crc, const uint8_t *bytes, size_t count) {
     static const uint32_t table[16] = {
         0x00000000U, 0x1DB71064U, 0x3B6E20C8U, 0x26D930ACU, 0x76DC4190U, 0x6B6B51F4U, 0x4DB26158U, 0x5005713CU,
         0xEDB88320U, 0xF00F9344U, 0xD6D6A3E8U, 0xCB61B38CU, 0x9B64C2B0U, 0x86D3D2D4U, 0xA00AE278U, 0xBDBDF21CU,
@@ -102,7 +102,8 @@ static uint32_t facts_of_build(void) {
         SELFCAL_BATCH,
         SELFCAL_TERMS_MAX,
     };
-    return crc32(0, (const uint8_t *)facts, sizeof facts); /* of these bytes as they lie: the order of bytes is in it */
+    return selfcal_crc32(0, (const uint8_t *)facts,
+                         sizeof facts); /* of these bytes as they lie: the order of bytes is in it */
 }
 
 /* --- save --- */
@@ -117,7 +118,7 @@ typedef struct {
 } sink_t;
 
 static void flush(sink_t *sink) {
-    sink->crc = crc32(sink->crc, sink->chunk, sink->held);
+    sink->crc = selfcal_crc32(sink->crc, sink->chunk, sink->held);
     sink->good = sink->good && sink->write(sink->context, sink->chunk, sink->held);
     sink->held = 0;
 }
@@ -164,7 +165,7 @@ selfcal_status_t selfcal_save(const selfcal_t *self, selfcal_write_t write, void
     for (size_t p = 0; p < PARTS; p++) {
         put(&sink, part[p].from, part[p].bytes);
     }
-    put_number(&sink, TRAILER, crc32(sink.crc, sink.chunk, sink.held));
+    put_number(&sink, TRAILER, selfcal_crc32(sink.crc, sink.chunk, sink.held));
     if (sink.held > 0U) {
         flush(&sink);
     }
@@ -185,7 +186,7 @@ static selfcal_status_t inspect(const selfcal_model_t *model, const uint8_t *byt
     if (length != stated) {
         return length < stated ? SELFCAL_SNAPSHOT_TRUNCATED : SELFCAL_SNAPSHOT_TOO_LONG;
     }
-    if (number_at(bytes + length - TRAILER, TRAILER) != crc32(0, bytes, length - TRAILER)) {
+    if (number_at(bytes + length - TRAILER, TRAILER) != selfcal_crc32(0, bytes, length - TRAILER)) {
         return SELFCAL_SNAPSHOT_DAMAGED;
     }
     if (number_at(bytes + 8, 2) != VERSION) {

@@ -5,7 +5,7 @@
 #include <math.h>
 #include <string.h>
 
-enum { STATUS, REPORT, CORRECTED, ANSWER }; /* what the frames under way are of */
+enum { STATUS, REPORT, CORRECTED, ANSWER, WORDS }; /* what the frames under way are of */
 enum { NO_PARAMETER = SELFCAL_PARAMETERS };
 enum { REASON_BITS = 4 };
 
@@ -217,6 +217,19 @@ selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t ite
     }
     self->item = item;
     self->answer = value;
+    return SELFCAL_OK;
+}
+
+selfcal_status_t selfcal_telemetry_words(selfcal_telemetry_t *self, uint32_t id, const uint32_t word[], uint8_t count,
+                                         uint32_t there, uint32_t time_ms) {
+    if (self == NULL || word == NULL) {
+        return SELFCAL_BAD_ARGUMENT;
+    }
+    if (!begin(self, WORDS, id, count, time_ms)) {
+        return SELFCAL_BUSY;
+    }
+    self->word = word;
+    self->answer = there;
     return SELFCAL_OK;
 }
 
@@ -481,6 +494,10 @@ bool selfcal_telemetry_next(selfcal_telemetry_t *self, selfcal_frame_t *frame) {
             case STATUS: value = status_value(self, item); break;
             case REPORT: has = report_value(self, item, &value); break;
             case CORRECTED: has = corrected_value(self, item, &value); break;
+            case WORDS:
+                has = item == 0U || (self->answer >> (item - 1U) & 1U) != 0U;
+                value = item == 0U ? self->time_ms : self->word[item - 1U];
+                break;
             default: break;
             }
             if (has) {

@@ -167,9 +167,9 @@ static wide_t take_step(selfcal_tumble_work_t *work, size_t parameters, size_t c
     return isfinite(far) ? far : -1.0;
 }
 
-/* A bit for each parameter that the whitened columns in `work` identify. */
-static uint16_t identified(const selfcal_tumble_work_t *work, size_t parameters, size_t count) {
-    wide_t normal[ACCEL * (ACCEL + 1) / 2];
+/* A bit for each parameter that the whitened columns in `work` identify. The covariance there is lost. */
+static uint16_t identified(selfcal_tumble_work_t *work, size_t parameters, size_t count) {
+    wide_t *const normal = work->factor;
     uint16_t bits = 0;
     normal_of(work, parameters, count, 1.0 / (WIDER * WIDER), normal);
     if (factorize(normal, parameters)) {
@@ -184,6 +184,15 @@ static uint16_t identified(const selfcal_tumble_work_t *work, size_t parameters,
 static const wide_t accel_sd[ACCEL] = {BIAS_SD,  BIAS_SD,  BIAS_SD,  SCALE_SD, SCALE_SD,
                                        SCALE_SD, ANGLE_SD, ANGLE_SD, ANGLE_SD};
 static const wide_t gyro_sd[GYRO] = {GYRO_BIAS_SD, G_SD, G_SD, G_SD};
+
+/* Covariance of parameters, in units of the prior's `sd`, in their own. */
+static void scale(float covariance_of[], const wide_t normal[], const wide_t sd[], size_t parameters) {
+    for (size_t i = 0; i < parameters; i++) {
+        for (size_t j = 0; j <= i; j++) {
+            covariance_of[packed(i, j)] = (float)(normal[packed(i, j)] * sd[i] * sd[j]);
+        }
+    }
+}
 
 /* T K of parameters in units of the prior's sd. */
 static void matrix_of(const wide_t theta[ACCEL], wide_t M[3][3]) {
@@ -350,16 +359,15 @@ static void state(wide_t value[], float covariance_of[], const wide_t theta[], c
                   size_t parameters, uint16_t bits) {
     for (size_t i = 0; i < parameters; i++) {
         value[i] = (bits >> i & 1U) != 0U ? theta[i] * sd[i] : (wide_t)NAN;
-        for (size_t j = 0; j <= i; j++) {
-            covariance_of[packed(i, j)] = (float)(normal[packed(i, j)] * sd[i] * sd[j]);
-        }
     }
+    scale(covariance_of, normal, sd, parameters);
 }
 
 /* Parameters with intervals that have a square of the scale. `bias` and `matrix` come nearest at 1 g: without one. */
 static bool fit_accel(selfcal_tumble_t *found, const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[],
                       size_t count, wide_t theta[ACCEL], selfcal_tumble_work_t *work) {
-    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, M[3][3], straight[ACCEL];
+    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, straight[ACCEL];
+    wide_t(*const M)[3] = (wide_t(*)[3])work->factor; /* at the end: less stack */
     if (!find_accel(part, rests, count, SQUARE_SD, theta, normal, work)) {
         return false;
     }
@@ -421,6 +429,19 @@ selfcal_tumble_status_t selfcal_tumble(selfcal_tumble_t *found, const selfcal_tu
         clear(found);
     }
     return status;
+}
+
+uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
+                              selfcal_tumble_work_t *work, float found[45]) {
+    wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, theta[ACCEL] = {0.0};
+    if (count > 0U) {
+        lay(part, rests, count, ALL, theta, SQUARE_SD, work);
+    }
+    if (take_step(work, ACCEL, count, theta, normal) < 0.0) {
+        return 0U;
+    }
+    scale(found, normal, accel_sd, ACCEL);
+    return identified(work, ACCEL, count);
 }
 
 float selfcal_tumble_accel_sd(const selfcal_tumble_t *found, uint8_t k) {

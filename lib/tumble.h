@@ -26,8 +26,9 @@
  *
  * Units: m/s^2, rad/s, s, rad, rad/s per m/s^2. The arithmetic is in selfcal_wide_t: weights of a drift that is large
  * against the noise lose float's digits. Results are right to 1e-4 of their standard deviation.
- * Cortex-M4F: 5.9 KB of flash beside the software doubles, 1.4 KB of stack; 10 million instructions of 12 rests, 36 of
+ * Cortex-M4F: 5.9 KB of flash beside the software doubles, 1.2 KB of stack; 10 million instructions of 12 rests, 36 of
  * 24, 105 with a Gauss-Markov drift. It fits a Cortex-M0 too.
+ * On a module selfcal_imu_tumble_start() and _stop() do all of it, see below.
  * The gyros' scale and misalignment take the turns between the rests: `selfcal tumble` on the host. */
 #ifndef SELFCAL_TUMBLE_H
 #define SELFCAL_TUMBLE_H
@@ -91,7 +92,7 @@ typedef struct {
 
 /* Not for users. */
 typedef struct {
-    selfcal_wide_t factor[SELFCAL_TUMBLE_MAX * (SELFCAL_TUMBLE_MAX + 1) / 2];
+    selfcal_wide_t factor[SELFCAL_TUMBLE_MAX > 9 ? SELFCAL_TUMBLE_MAX *(SELFCAL_TUMBLE_MAX + 1) / 2 : 45];
     selfcal_wide_t column[SELFCAL_TUMBLE_ACCEL][SELFCAL_TUMBLE_MAX], residual[SELFCAL_TUMBLE_MAX];
 } selfcal_tumble_work_t;
 
@@ -105,6 +106,91 @@ float selfcal_tumble_gyro_sd(const selfcal_tumble_t *found, uint8_t axis, uint8_
 
 /* Correct one reading of six axes. */
 void selfcal_tumble_apply(const selfcal_tumble_t *found, const float reading[6], float corrected[6]);
+
+/* What `count` sound rests, 0 to SELFCAL_TUMBLE_MAX, tell of the accelerometers: the covariance of the nine, as
+ * accel_covariance, at error 0. Returns a bit for each parameter that they identify; 0, and no covariance, where there
+ * is none. A round of the fit: 1 million instructions of 12 rests on a Cortex-M4F. */
+uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_tumble_rest_t rests[], uint8_t count,
+                              selfcal_tumble_work_t *work, float found[45]);
+
+/* --- on a module ---
+ * A pipe that names selfcal_tumbling_code (`-DSELFCAL_MODEL_TUMBLED=1`) calibrates while it runs. Between start and
+ * stop the gate tells rests, and the bank takes no sample. A rest counts from SELFCAL_TUMBLE_REST_S of whole windows
+ * on. The result corrects samples (selfcal_imu_corrected()), and goes with the saved state (selfcal_imu_save()), which
+ * SELFCAL_TUMBLE_SAVED bytes are added to. */
+#ifndef SELFCAL_TUMBLE_REST_S
+#define SELFCAL_TUMBLE_REST_S 10
+#endif
+
+struct selfcal_tumbling {
+    selfcal_tumble_part_t part;
+    uint8_t axis[6];             /* of the model: ax ay az gx gy gz */
+    float accel_unit, gyro_unit; /* the model's, in m/s^2 and rad/s */
+};
+
+/* Positions by the side that is up: +z +y +x -z -y -x, then edges: +x+y +x-y +x+z -x+z +y+z -y+z. */
+enum { SELFCAL_TUMBLE_POSITIONS = 12 };
+
+typedef enum {
+    SELFCAL_TUMBLE_OFF = 0,
+    SELFCAL_TUMBLE_PLACE = 1, /* no rest: place the part as `next` says */
+    SELFCAL_TUMBLE_HOLD = 2,  /* a rest that does not count yet: leave the part alone */
+    SELFCAL_TUMBLE_TURN = 3   /* a rest that counts: turn the part as `next` says */
+} selfcal_tumble_phase_t;
+
+typedef struct {
+    selfcal_tumble_phase_t phase;
+    selfcal_tumble_status_t status; /* of the last stop since power-on, or OK */
+    uint8_t rests, wanted;          /* `wanted` goes beyond 12 while parameters are not identified */
+    uint8_t next;                   /* position; SELFCAL_TUMBLE_POSITIONS: none, stop */
+    bool applied;                   /* a calibration corrects samples */
+} selfcal_tumble_progress_t;
+
+/* The calibration in use, as it is saved. Units as above; it holds for readings without the sensor's own offsets
+ * (selfcal_shifted()). Members as selfcal_tumble_t's, 0 for NAN: what is not identified has error 0. A
+ * `ratio` above 1 widens the sd. */
+typedef struct {
+    float accel[SELFCAL_TUMBLE_ACCEL], covariance[45], G[9], ratio;
+    uint16_t accel_identified, gyro_identified;
+} selfcal_tumbled_t;
+
+#define SELFCAL_TUMBLE_SAVED (sizeof(selfcal_tumbled_t) + 8U)
+
+/* Begin: earlier rests are forgotten, an earlier result stays. False: the pipe names no calibration, the gate is off,
+ * or an axis is retired. */
+bool selfcal_imu_tumble_start(selfcal_imu_t *imu);
+
+/* End, and calibrate by the rests. Any other status than OK leaves the result before. It takes as long as
+ * selfcal_tumble(). */
+selfcal_tumble_status_t selfcal_imu_tumble_stop(selfcal_imu_t *imu);
+
+/* How far it is. `next` is the position whose residual is least known after the rests so far, by their information.
+ * After a rest that counts it takes as long as selfcal_tumble_known(). The pipe names a calibration. */
+const selfcal_tumble_progress_t *selfcal_imu_tumble_progress(selfcal_imu_t *imu);
+
+/* Values of message TUMBLE for selfcal_telemetry_words(): the progress, and of the calibration in use the parameters
+ * that are identified, with their sd. `there`: which, a bit each. They stay until the next call of these functions. */
+enum { SELFCAL_TUMBLE_WORDS = 29 };
+const uint32_t *selfcal_imu_tumble_words(selfcal_imu_t *imu, uint32_t *there);
+
+/* The calibration in use; NULL: none. */
+const selfcal_tumbled_t *selfcal_imu_tumbled(const selfcal_imu_t *imu);
+
+/* Private; declared here so that the caller can place it. */
+struct selfcal_imu_tumble {
+    selfcal_tumbled_t used;
+    selfcal_tumble_progress_t progress;
+    bool resting, counted, due;    /* at rest since a window began; the rest counts; `next` is to be worked out */
+    uint8_t ended;                 /* rests that count and have ended */
+    uint32_t passed, window, kept; /* samples since the start, of the window and of the rest under way */
+    uint32_t faults;               /* readings that the bank found wrong, when the window began */
+    selfcal_tumble_rest_t rest[SELFCAL_TUMBLE_MAX];
+    selfcal_tumble_t found;
+    union {
+        selfcal_tumble_work_t work;
+        uint32_t word[SELFCAL_TUMBLE_WORDS];
+    } by;
+};
 
 #ifdef __cplusplus
 }

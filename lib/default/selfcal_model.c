@@ -86,10 +86,24 @@ const selfcal_gate_config_t selfcal_model_gate = {
     {2.86216701F, 2.86216701F, 2.86216701F, 0.572433402F, 0.572433402F, 0.572433402F}, {true, true, true, false, false, false},
 };
 
+const selfcal_tumbling_t selfcal_model_tumbling = {
+    {{
+        {0.00223606798F, 9.48683298e-05F, 0.0F, 0.0F},
+        {0.00223606798F, 9.48683298e-05F, 0.0F, 0.0F},
+        {0.00223606798F, 9.48683298e-05F, 0.0F, 0.0F},
+        {0.000390267485F, 1.10384314e-05F, 0.0F, 0.0F},
+        {0.000390267485F, 1.10384314e-05F, 0.0F, 0.0F},
+        {0.000390267485F, 1.10384314e-05F, 0.0F, 0.0F},
+    }, SELFCAL_MODEL_GRAVITY, 0.0F, 4.2e-5F},
+    {3, 4, 5, 0, 1, 2}, 1.0F, 0.0174532925F,
+};
+
 const selfcal_pipe_t selfcal_model_pipe = {
     &selfcal_model, SELFCAL_MODEL_RATE_HZ, &selfcal_model_gate, &selfcal_gate_code,
     NULL,
     SELFCAL_MODEL_JUDGED ? &selfcal_judging_code : NULL,
     SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES ? &selfcal_changes_code : NULL,
     SELFCAL_MODEL_HELD ? &selfcal_holding_code : NULL,
+    SELFCAL_MODEL_TUMBLED ? &selfcal_model_tumbling : NULL,
+    SELFCAL_MODEL_TUMBLED ? &selfcal_tumbling_code : NULL,
 };

@@ -3,6 +3,7 @@
 #define SELFCAL_MODEL_H
 
 #include "selfcal.h"
+#include "tumble.h"
 
 #define SELFCAL_MODEL_ID 0xE5D59D27UL
 #define SELFCAL_MODEL_NODES 209U
@@ -43,9 +44,18 @@
          ? 1U \
          : SELFCAL_REPORT_CALLS(SELFCAL_MODEL_NODES, SELFCAL_MODEL_HYPOTHESES, SELFCAL_MODEL_REGRESSORS))
 #define SELFCAL_MODEL_KEEPS_UP(calls_a_sample) ((calls_a_sample) * 819U >= SELFCAL_MODEL_REPORT_STEPS)
+/* 1: it calibrates by rests in several positions (lib/tumble.h), for which it needs six axes and the gate. */
+#ifndef SELFCAL_MODEL_TUMBLED
+#define SELFCAL_MODEL_TUMBLED 0
+#endif
+/* Where the part rests, m/s^2. */
+#ifndef SELFCAL_MODEL_GRAVITY
+#define SELFCAL_MODEL_GRAVITY 9.80665F
+#endif
+#define SELFCAL_MODEL_TUMBLED_BYTES (SELFCAL_MODEL_TUMBLED ? SELFCAL_PART(sizeof(selfcal_imu_tumble_t)) : 0U)
 /* What selfcal_imu_init() wants. */
 #define SELFCAL_MODEL_IMU_BYTES \
-    (SELFCAL_MODEL_BYTES + SELFCAL_MODEL_HELD_BYTES + \
+    (SELFCAL_MODEL_BYTES + SELFCAL_MODEL_HELD_BYTES + SELFCAL_MODEL_TUMBLED_BYTES + \
      SELFCAL_PARTS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_GATE, SELFCAL_MODEL_REGRESSORS, \
                         SELFCAL_MODEL_JUDGED, SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES))
 /* Rate of the samples, Hz. */
@@ -63,6 +73,7 @@ extern const char *const selfcal_model_axis_name[SELFCAL_MODEL_AXES];
 #if SELFCAL_MODEL_CHANNELS > 0
 extern const char *const selfcal_model_channel_name[SELFCAL_MODEL_CHANNELS];
 #endif
+extern const selfcal_tumbling_t selfcal_model_tumbling;
 #if SELFCAL_MODEL_GATE
 extern const selfcal_gate_config_t selfcal_model_gate;
 #endif

@@ -76,8 +76,9 @@ typedef struct {
     command_t command;
     answer_t answer[ANSWERS];
 #endif
-    selfcal_module_t told; /* filled in by `module` */
-    uint32_t begun_ms;     /* start of the axis report under way */
+    selfcal_module_t told;      /* filled in by `module` */
+    uint32_t tumble_ms, tumble; /* when the message of the calibration was sent last, and its progress then */
+    uint32_t begun_ms;          /* start of the axis report under way */
 #if APP_CORRECTED_MS
     uint32_t corrected_ms; /* when a corrected sample was sent last */
     uint32_t reading_ms;   /* of the newest sample */

@@ -29,6 +29,9 @@ static uint8_t write_offsets(app_t *app, uint32_t axes) {
     float wanted[SELFCAL_MODEL_AXES], got[SELFCAL_MODEL_AXES];
     uint32_t found = 0;
     app_tell(app);
+    if (app_tumbles(app)) { /* rests of one calibration are read alike */
+        return SELFCAL_ANSWER_RESULT_NOT_NOW;
+    }
     if (axes != 0U && (app->told.motion == SELFCAL_STATUS_MOTION_MOVING ||
                        app->told.sensor_state != SELFCAL_STATUS_SENSOR_STATE_RUNNING)) {
         return SELFCAL_ANSWER_RESULT_NOT_NOW;
@@ -69,6 +72,21 @@ static uint8_t saved(app_t *app, uint32_t now) {
     return app->told.state_saves != before ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_FAILED;
 }
 
+/* Starts or stops a calibration by rests in several positions; a result is saved. */
+static uint8_t tumble(app_t *app, uint32_t now) {
+    if (!SELFCAL_MODEL_TUMBLED) {
+        return SELFCAL_ANSWER_RESULT_UNKNOWN;
+    }
+    if (app->argument == 1U) {
+        return selfcal_imu_tumble_start(&app->imu) ? SELFCAL_ANSWER_RESULT_DONE : SELFCAL_ANSWER_RESULT_NOT_NOW;
+    }
+    const selfcal_tumble_status_t status = selfcal_imu_tumble_stop(&app->imu);
+    if (status == SELFCAL_TUMBLE_BAD_ARGUMENT) { /* none was started */
+        return SELFCAL_ANSWER_RESULT_NOT_NOW;
+    }
+    return status == SELFCAL_TUMBLE_OK ? saved(app, now) : SELFCAL_ANSWER_RESULT_FAILED;
+}
+
 static void obey(app_t *app, uint32_t now) {
     const uint8_t command = app->ordered;
     uint8_t result = SELFCAL_ANSWER_RESULT_DONE;
@@ -77,6 +95,8 @@ static void obey(app_t *app, uint32_t now) {
         result = saved(app, now);
     } else if (command == SELFCAL_ANSWER_COMMAND_WRITE_OFFSETS) {
         result = write_offsets(app, app->argument);
+    } else if (command == SELFCAL_ANSWER_COMMAND_TUMBLE) {
+        result = tumble(app, now);
     } else if (app->argument == 1U) {
         result = forget(app);
         if (result == SELFCAL_ANSWER_RESULT_DONE) {
@@ -102,7 +122,8 @@ bool app_obey(app_t *app, uint32_t now) {
 static uint8_t judge(const app_t *app, uint8_t command, uint32_t argument) {
     bool in_range;
     switch (command) {
-    case SELFCAL_ANSWER_COMMAND_RESET: in_range = argument <= 1U; break;
+    case SELFCAL_ANSWER_COMMAND_RESET:
+    case SELFCAL_ANSWER_COMMAND_TUMBLE: in_range = argument <= 1U; break;
     case SELFCAL_ANSWER_COMMAND_SAVE: in_range = argument == 0U; break;
     case SELFCAL_ANSWER_COMMAND_TELEMETRY_PERIOD: in_range = argument >= TELEMETRY_PERIOD_LEAST_MS; break;
     case SELFCAL_ANSWER_COMMAND_WRITE_OFFSETS: in_range = argument <= AXIS_BITS; break;

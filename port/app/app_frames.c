@@ -47,6 +47,25 @@ void app_tell_status(app_t *app, uint32_t now) {
     app->told_ms = now;
 }
 
+bool app_tumbles(app_t *app) {
+    return SELFCAL_MODEL_TUMBLED && app->imu.tumble->progress.phase != SELFCAL_TUMBLE_OFF;
+}
+
+bool app_begin_tumble(app_t *app, uint32_t now) {
+    if (!SELFCAL_MODEL_TUMBLED) {
+        return false;
+    }
+    uint32_t there = 0;
+    const uint32_t *word = selfcal_imu_tumble_words(&app->imu, &there);
+    if (word[0] == app->tumble && now - app->tumble_ms < STATUS_MS) {
+        return false;
+    }
+    app->tumble = word[0];
+    app->tumble_ms = now;
+    return selfcal_telemetry_words(&app->telemetry, SELFCAL_FRAME_TUMBLE_ID, word, SELFCAL_TUMBLE_WORDS, there, now) ==
+           SELFCAL_OK;
+}
+
 bool app_status_due(const app_t *app, uint32_t now) {
     return app->module != NULL && now - app->told_ms >= STATUS_MS;
 }

@@ -24,6 +24,12 @@ void app_tell_status(app_t *app, uint32_t now);
 /* A status does not wait, neither for a report that is far off nor for the end of one. */
 bool app_status_due(const app_t *app, uint32_t now);
 
+/* Whether a calibration by rests in several positions is under way. */
+bool app_tumbles(app_t *app);
+
+/* Begins its message if there is news, or with each status; false: no. Only with all frames out. */
+bool app_begin_tumble(app_t *app, uint32_t now);
+
 /* app_state.c: saved state */
 
 void app_restore(app_t *app);

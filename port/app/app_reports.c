@@ -22,6 +22,9 @@ bool app_begin_frames(app_t *app) {
     if (app_begin_answer(app, now)) {
         return true;
     }
+    if (app_begin_tumble(app, now)) {
+        return true;
+    }
     if (app->stage != STAGE_NONE && app_status_due(app, now)) { /* between reports app_advance() looks */
         app_tell_status(app, now);
         return true;

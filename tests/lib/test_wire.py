@@ -77,7 +77,7 @@ def test_names_of_a_model_are_symbols_of_a_dbc() -> None:
         assert len(set(symbols)) == len(symbols)
         assert all(re.fullmatch(r"[A-Za-z_]\w{0,31}", one, re.ASCII) for one in symbols)
         assert 0x200 + 11 * 128 <= entry.frame_id < 0x800
-    assert len({entry.name for entry in database.messages}) == len(database.messages) == 1 + 2 + 3 + 2 * (2 + 3)
+    assert len({entry.name for entry in database.messages}) == len(database.messages) == 1 + 2 + 4 + 2 * (2 + 3)
     coefficient = database.get_message_by_name("M11_AZ_COEFFICIENTS").get_signal_by_name("temperature_sin_mean")
     assert coefficient.unit == "m/s^2/degC"
 

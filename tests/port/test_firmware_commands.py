@@ -118,6 +118,8 @@ def test_key_files(tmp_path: Path) -> None:
         ("write_offsets", "gx,mx", "wants axes"),
         ("save", "now", "takes nothing"),
         ("reset", "all", "no word but forget"),
+        ("tumble", None, "wants start or stop"),
+        ("tumble", "again", "wants start or stop, not 'again'"),
     ],
 )
 def test_arguments_that_are_refused(name: str, value: str | None, complaint: str) -> None:

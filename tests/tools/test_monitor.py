@@ -317,6 +317,29 @@ def test_view_tells_the_status_by_its_names() -> None:
     assert "bus_off_count" not in picture
 
 
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"phase": 1.0, "rests": 5.0, "wanted": 12.0, "next": 3.0}, "5 of 12: now -z up"),
+        ({"phase": 3.0, "rests": 7.0, "wanted": 12.0, "next": 9.0}, "7 of 12: now -x +z up"),
+        ({"phase": 2.0, "rests": 7.0, "wanted": 12.0, "next": 9.0}, "7 of 12: hold still"),
+        ({"phase": 3.0, "rests": 13.0, "wanted": 13.0, "next": 12.0}, "13 of 13: send tumble stop"),
+        ({"phase": 0.0, "result": 5.0, "next": 12.0}, "no calibration, not identified: send tumble start"),
+        ({"phase": 0.0, "applied": 1.0, "scale_y": -0.0031, "scale_y_sd": 2e-5}, "scale y -3100 ± 20 ppm"),
+        ({"phase": 0.0, "applied": 1.0, "bias_x": 0.0980665, "bias_x_sd": 0.00980665}, "bias x 10000 ± 1e+03 ug"),
+        ({"phase": 0.0, "applied": 1.0, "g_zx": -0.0123}, "G zx -0.0123 deg/s/g"),
+    ],
+)
+def test_view_of_a_calibration(monkeypatch: pytest.MonkeyPatch, values: dict[str, float], said: str) -> None:
+    """What to do next, and the result in data sheet units: 1 mg is 0.00980665 m/s^2."""
+    monkeypatch.setenv("COLUMNS", "200")
+    decoder = Decoder()
+    decoder.status.update(state=1.0)
+    decoder.tumble.update(values)
+    with can.Bus(interface="virtual", channel="selfcal-view") as bus:
+        assert said in shown(View(decoder, Link(bus), "test"))
+
+
 def test_view_tells_why_an_axis_has_no_calibration(monkeypatch: pytest.MonkeyPatch) -> None:
     """With the next step: of axes without a report in one line, of one with a report beside it. Of a reason that is
     none nothing is said."""

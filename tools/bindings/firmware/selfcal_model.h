@@ -4,6 +4,7 @@
 #define SELFCAL_MODEL_H
 
 #include "selfcal.h"
+#include "tumble.h"
 
 typedef struct {
     selfcal_pipe_t pipe;
@@ -22,6 +23,7 @@ extern const firmware_model_t *firmware_model;
 #define SELFCAL_MODEL_RATE_HZ (selfcal_model_pipe.rate_hz)
 
 #define SELFCAL_MODEL_HYPOTHESES SELFCAL_HYPOTHESES_MAX
+#define SELFCAL_MODEL_TUMBLED 0
 #define SELFCAL_MODEL_UNITS_SENT 1 /* firmware.py looks */
 #define SELFCAL_MODEL_IMU_BYTES                                                                                        \
     (SELFCAL_SIZE(SELFCAL_NODES_MAX, SELFCAL_AXES_MAX) +                                                               \

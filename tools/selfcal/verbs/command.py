@@ -15,7 +15,7 @@ def command(
     order: Annotated[
         str,
         argument(
-            "To a module: reset [forget], save, telemetry_period MS, write_offsets AXES|none. "
+            "To a module: reset [forget], save, telemetry_period MS, write_offsets AXES|none, tumble start|stop. "
             "Of a key: new-key makes one, build-flag prints what an image is built with",
             "ORDER",
         ),

@@ -12,12 +12,13 @@ import numpy as np
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import whole
 from selfcal.base.templates import of_code
+from selfcal.base.units import factor
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.file import NOT_HANDLED, Model
 from selfcal.model.forms import COLUMN_KINDS
 from selfcal.model.laws import KINDS
 from selfcal.model.tables import AxisTable, PriorRow, Tables, gate_table
-from selfcal.wire.frames import carries
+from selfcal.wire.frames import AXES, carries
 
 #: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal_parts.h, SIGMA_BITS in bank_kernel_fixed.c.
 SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
@@ -162,6 +163,7 @@ def _values(model: Model, tables: Tables, target: str, start: str, hold: bool) -
         "rate_millihz": round(1000.0 * tables.rate_hz),
         "sent": all(carries(axis.name, axis.unit) for axis in tables.axes),
         "gate": gate_table(model, tables),
+        "tumbling": _tumbling(model, tables),
         "grids": {grid.nodes: grid for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid},
         "handled": tables.handling != NOT_HANDLED,
         "means": any(column.coefficient_mean for column in tables.regressors),
@@ -169,6 +171,24 @@ def _values(model: Model, tables: Tables, target: str, start: str, hold: bool) -
         "KINDS": KINDS,
         "COLUMN_KINDS": COLUMN_KINDS,
     }
+
+
+def _tumbling(model: Model, tables: Tables) -> dict[str, Any] | None:
+    """For lib/tumble.h: places of ax ay az gx gy gz, their units in m/s^2 and rad/s, N and K of each in these: the
+    medians of the model's priors. None without all six axes and a gate."""
+    places = {axis.name: place for place, axis in enumerate(tables.axes)}
+    order = (*AXES[3:], *AXES[:3])
+    if not set(order) <= set(places) or gate_table(model, tables) is None:
+        return None
+    groups = [model.group_of(axis) for axis in order]
+    units = [factor(group.unit, unit) for group, unit in zip(groups, ("m/s^2",) * 3 + ("rad/s",) * 3, strict=True)]
+    if len({*units[:3]}) > 1 or len({*units[3:]}) > 1:
+        return None
+    noise = [
+        [size * group.priors[name].median if name in group.priors else 0.0 for name in ("N", "K")]
+        for group, size in zip(groups, units, strict=True)
+    ]
+    return {"axes": [places[a] for a in order], "noise": noise, "accel_unit": units[0], "gyro_unit": units[3]}
 
 
 def _limits(axis: AxisTable) -> list[PriorRow]:

@@ -110,7 +110,7 @@ def build_flag(key: bytes) -> str:
 
 
 def argument_of(order: str, value: str | None) -> int:
-    """The number that goes with an order: ms, axes (`gx,gz`; `none` takes offsets back), or nothing."""
+    """The number that goes with an order: ms, axes (`gx,gz`; `none` takes offsets back), a start, or nothing."""
     if order == "telemetry_period":
         if value is None or not value.isdecimal() or not 100 <= int(value) < 2**24:
             raise UserError(f"telemetry_period wants a number of ms from 100 to {2**24 - 1}")
@@ -121,6 +121,10 @@ def argument_of(order: str, value: str | None) -> int:
         if unknown:
             raise UserError(f"write_offsets wants axes ({','.join(AXES)}) or none, not '{value or ''}'")
         return sum(1 << AXES.index(name) for name in set(names))
+    if order == "tumble":
+        if value not in ("start", "stop"):
+            raise UserError(f"tumble wants start or stop, not '{value or ''}'")
+        return int(value == "start")
     if order == "reset" and value == "forget":
         return 1
     if value is not None:

@@ -220,7 +220,7 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
     for axis in axes:
         index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
         add("GX", offset("GX") + index, big, _in_unit(unit), patterns["GX"].comment.replace("gx", axis))
-    for name in ("CORRECTED", "COMMAND", "ANSWER"):
+    for name in ("CORRECTED", "COMMAND", "ANSWER", "TUMBLE"):
         add(name, offset(name), name, same, patterns[name].comment)
     small = [name.lower() for name in _different(names.hypotheses)]
     for axis in axes:

@@ -10,6 +10,7 @@ import errno
 import logging
 import math
 import os
+import re
 import shlex
 import time
 from collections.abc import Callable, Mapping
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 VERSION = 4
 #: Axis messages are named after the axis, in capitals.
 AXES = tuple(AXIS_UNITS)
-STATUS, CORRECTED, COMMAND, ANSWER = "STATUS", "CORRECTED", "COMMAND", "ANSWER"
+STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "ANSWER", "TUMBLE"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
@@ -115,6 +116,17 @@ def reasons(*messages: Mapping[str, float]) -> dict[str, str]:
             words = {axis: choices(STATUS, f"reason_{axis}").get(int(code), f"{code:g}") for axis, code in said.items()}
             known = {axis: word for axis, word in words.items() if word != "none"}
     return known
+
+
+def tumble_text(values: Mapping[str, float]) -> str:
+    """What to do in a calibration by rests in several positions, or why it came to nothing; "" if neither applies."""
+    names = ("phase", "result", "next")
+    phase, result, side = (choices(TUMBLE, name).get(int(values.get(name, 0)), "?").replace("_", " ") for name in names)
+    if phase == "off":
+        return "" if result == "none" else f"no calibration, {result}: send tumble start"
+    sides = re.sub("(minus )?([xyz]) ", lambda found: f"{'-' if found[1] else '+'}{found[2]} ", side)
+    todo = "hold still" if phase == "hold" else "send tumble stop" if sides == "none" else f"now {sides}"
+    return f"{values.get('rests', 0):.0f} of {values.get('wanted', 0):.0f}: {todo}"
 
 
 def status_text(signal: str, value: float) -> str:
@@ -327,7 +339,7 @@ def _kinds() -> dict[int, _Kind]:
         axis, _, rest = message.name.lower().partition("_")
         hypothesis = int(rest[1:]) if rest.startswith("h") else None
         part = {"": 0, "coefficients": _COEFFICIENTS, "adequacy": _ADEQUACY}.get(rest)
-        if message.name in (STATUS, CORRECTED, ANSWER):
+        if message.name in (STATUS, CORRECTED, ANSWER, TUMBLE):
             kinds[message.frame_id - BASE] = _Kind(message, "", "", 0)
         elif hypothesis is not None:
             kinds[message.frame_id - BASE] = _Kind(message, axis, f"h{hypothesis}_", 1 + hypothesis)
@@ -359,6 +371,8 @@ class Decoder:
         self._corrects = False  # what comes belongs to that sample
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
+        #: The same of the calibration by rests in several positions, since the last that came of one.
+        self.tumble: dict[str, float] = {}
         #: Latest module time of a frame, unwrapped, ms. It goes back only if the module starts anew.
         self.time_ms = 0
         #: The module has said that no sample will follow, and this was its last status.
@@ -444,6 +458,9 @@ class Decoder:
                 self._corrects = True
             if self._corrects:
                 self.corrected.update(values)
+            return self.flush()
+        if name == TUMBLE:
+            self.tumble = values if "time_ms" in values else self.tumble | values
             return self.flush()
         if name == ANSWER:
             self.answer.update(values)

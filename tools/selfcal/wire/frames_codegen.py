@@ -20,7 +20,7 @@ from selfcal.base.errors import UserError
 from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
 from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, REASON, dbc
-from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, load_dbc
+from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
@@ -37,6 +37,7 @@ HEADINGS = {
     STATUS: "Status",
     CORRECTED: "Corrected sample",
     ANSWER: "Answer to a command",
+    TUMBLE: "Calibration by rests in several positions",
 }
 #: The line of lib/WIRE.md that the lists follow.
 MARK = "<!-- The rest is generated: python -m selfcal.wire.frames_codegen -->\n"
@@ -161,13 +162,15 @@ def check(database: Database) -> None:
 def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
     check(database)
-    status, corrected, command, answer = map(database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER))
+    status, corrected, command, answer, tumble = map(
+        database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE)
+    )
     values = {
         "version": int(database.version or 0),
         "of_axis": {OF_AXIS[suffix]: _first(database, suffix) for suffix in SENT},
         "of_node": [status, corrected],
         "command": command,
-        "of_host": [answer],
+        "of_host": [answer, tumble],
         "members_of": lambda message: [field for field in fields(message) if not LATER.match(field.name)],
         "later_of": lambda message: any(LATER.match(field.name) for field in fields(message)),
         "choices_of": _choices,
@@ -195,7 +198,7 @@ def table(database: Database) -> str:
         more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
         units = {field.name: field.unit for field in fields(last)}
         messages.append((HEADINGS[suffix], ids + more, fields(first), units))
-    for message in map(database.get_message_by_name, (STATUS, CORRECTED, ANSWER)):
+    for message in map(database.get_message_by_name, (STATUS, CORRECTED, ANSWER, TUMBLE)):
         messages.append((HEADINGS[message.name], f"`0x{message.frame_id:X}` {message.name}", fields(message), {}))
     values = {
         "COMMON": COMMON,

@@ -31,6 +31,7 @@ from selfcal.wire.frames import (
     axis_unit,
     reasons,
     status_text,
+    tumble_text,
 )
 
 #: Status fields that this view omits.
@@ -320,6 +321,8 @@ class View:
         trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if _told(status, name) == text), "")
         if trouble:
             return f"{trouble}: see port/README.md"
+        if said := tumble_text(module.decoder.tumble):
+            return said
         why = {axis: word for axis, word in module.reasons.items() if axis in shown}
         word = next((word for word in URGENT if word in why.values()), next(iter(why.values()), ""))
         names = ", ".join(axis for axis, reason in why.items() if reason == word)
@@ -337,6 +340,7 @@ class View:
         advice = self.advice(module.decoder.status)
         if advice:
             lines += _flow([Text(word, "yellow") for word in advice.split()], width, 1)
+        lines += _flow([Text(said, "cyan") for said in _calibration(dict(module.decoder.tumble))], width, 3)
         last = dict(module.last)  # Live asks from a thread of its own
         lines += self._unreported(module, last, width)
         lines += self._sufficiency(last)
@@ -450,6 +454,19 @@ class View:
             chunks += [Text(name, "red") for name in HEALTH if report.values.get(name)]
             blocks.append([_line(head), *_flow(chunks, width, 2, indent=INDENT)])
         return blocks
+
+
+def _calibration(values: Mapping[str, float]) -> list[str]:
+    """The result of a calibration by rests in several positions, in data sheet units."""
+    units = {"bias": (1e6 / 9.80665, "ug"), "scale": (1e6, "ppm"), "angle": (1e3, "mrad")}
+    said = []
+    for name, value in values.items():
+        size, unit = units.get(name.partition("_")[0], (0.0, ""))
+        if f"{name}_sd" in values:
+            said.append(f"{name.replace('_', ' ')} {size * value:.6g} ± {size * values[f'{name}_sd']:.2g} {unit}")
+        elif name.startswith("g_"):
+            said.append(f"G {name[2:]} {value:.4f} deg/s/g")
+    return said
 
 
 def _told(status: Mapping[str, float], name: str) -> str:
