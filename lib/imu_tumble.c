@@ -118,8 +118,20 @@ bool selfcal_imu_tumble_start(selfcal_imu_t *imu) {
 static void use(selfcal_imu_tumble_t *self) {
     const selfcal_tumble_t *found = &self->found;
     selfcal_tumbled_t *used = &self->used;
+    /* The lines that come nearest at 1 g: where a scale has a square, `accel` is its slope at 0 g. */
+    const float straight[SELFCAL_TUMBLE_ACCEL] = {
+        found->bias[0],
+        found->bias[1],
+        found->bias[2],
+        found->matrix[0][0] - 1.0F,
+        found->matrix[1][1] - 1.0F,
+        found->matrix[2][2] - 1.0F,
+        found->matrix[0][1] / found->matrix[1][1],
+        found->matrix[0][2] / found->matrix[2][2],
+        found->matrix[1][2] / found->matrix[2][2],
+    };
     for (size_t i = 0; i < SELFCAL_TUMBLE_ACCEL; i++) {
-        used->accel[i] = (found->accel_identified >> i & 1U) != 0U ? (float)found->accel[i] : 0.0F;
+        used->accel[i] = (found->accel_identified >> i & 1U) != 0U ? straight[i] : 0.0F;
     }
     memcpy(used->covariance, found->accel_covariance, sizeof used->covariance);
     memcpy(used->G, found->G, sizeof used->G);

@@ -39,10 +39,14 @@ class Finding:
 
 @dataclass
 class Diagnosed:
-    """One axis after the loop: what it began as, what it is, and what was found in which record. `harmful`: looks that
-    predict held-out time clearly worse, which are no findings; `dropped`: those that other axes explain. `stated`: what
-    the model file has already, which is none either. `unfinished`: why it is not done, "" if it is. `hidden`: what moves
-    several axes, this one among them."""
+    """One axis after the loop: what it began as, what it is, and what was found in which record.
+
+    harmful     looks that predict held-out time clearly worse, which are no findings.
+    dropped     looks that other axes explain.
+    stated      what the model file has already, which is no finding either.
+    unfinished  why it is not done, "" if it is.
+    hidden      what moves several axes, this one among them.
+    """
 
     first: State
     state: State
