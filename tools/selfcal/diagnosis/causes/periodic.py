@@ -14,12 +14,15 @@ from scipy.ndimage import uniform_filter1d
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, Written
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
+from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.fit import Fit, finish, fit, moved
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
 from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array, Mask
 
 #: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
 TURNS_LEAST, BAND_TURNS = 1.5, 3.0
+#: A line of fewer turns is as slow as a drift: its gain must hold beside one of two terms, and its search costs more.
+SLOW_TURNS = 30.0
 #: Widths of a band in bins of the periodogram.
 BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
 #: A band must show this much, nats net of the search, before it is fitted; and explain this much more than a line.
@@ -135,7 +138,8 @@ def ln_lines(turns: Array, n: int, gain: Array) -> Array:
     1279, equation 6, for even sampling)."""
     octaves = math.log(max(math.e, 0.5 * n / TURNS_LEAST))
     places = np.log(np.maximum(1.0, octaves * math.sqrt(math.pi / 3.0) * turns))
-    return np.asarray(places + 0.5 * np.log(np.maximum(1.0, gain)))
+    slow = LN_SLOW * (turns < SLOW_TURNS)
+    return np.asarray(places + slow + 0.5 * np.log(np.maximum(1.0, gain)))
 
 
 def worth_of(gain: float, turns: float, n: int, columns: int = 2) -> float:
@@ -175,7 +179,7 @@ def _line(state: State, record: Record) -> list[Look]:
         one = _fitted(state, record, half)
         if net(gain - one[2], 2) < NET_LEAST:
             f, pair, gain, chosen = one
-    if f < 30.0 * width:
+    if f < SLOW_TURNS * width:
         gain = min(gain, state.rich_gain(pair))
     worth = worth_of(gain, f / width, n, len(pair))
     return [_look(state, record, f, pair, gain, worth, chosen)] if worth >= 1.0 else []
