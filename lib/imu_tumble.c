@@ -149,6 +149,11 @@ selfcal_tumble_status_t selfcal_imu_tumble_stop(selfcal_imu_t *imu) {
     selfcal_tumble_progress_t *progress = &self->progress;
     progress->status =
         selfcal_tumble(&self->found, &imu->pipe->tumbling->part, self->rest, progress->rests, &self->by.work);
+    /* Fewer positions, or positions alike, are no reason to lose what is known. */
+    const uint16_t before = progress->applied ? self->used.accel_identified : 1U;
+    if (progress->status == SELFCAL_TUMBLE_OK && (before & ~(unsigned)self->found.accel_identified) != 0U) {
+        progress->status = SELFCAL_TUMBLE_NOTHING;
+    }
     if (progress->status == SELFCAL_TUMBLE_OK) {
         use(self);
     }

@@ -56,7 +56,7 @@ typedef enum {
     SELFCAL_TUMBLE_TOO_FEW,      /* fewer than three rests */
     SELFCAL_TUMBLE_BAD_PART,     /* gravity, a noise or a drift that is none */
     SELFCAL_TUMBLE_BAD_REST,     /* a mean that is no number, or times that are not in order */
-    SELFCAL_TUMBLE_NOTHING,      /* no parameter of accelerometers or gyros is identified */
+    SELFCAL_TUMBLE_NOTHING,      /* no parameter is identified; of a pipe, fewer than before: that result stays */
     SELFCAL_TUMBLE_UNSETTLED /* the fit does not settle, or 10 sd off its priors: readings of another unit, no rests */
 } selfcal_tumble_status_t;
 

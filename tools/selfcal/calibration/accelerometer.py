@@ -7,7 +7,7 @@ is |f| - g; the noise of its mean acts through (T K)^T f / |f|.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,7 +125,8 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
             "six positions or more"
         )
     mean, prior = _prior(tumble, place)
-    found = Accelerometer(*tumble.fitted(ACCEL, lambda known: _problem(known, place), mean, mean, prior), place)
+    own, known = tumble.fitted(ACCEL, lambda known: _problem(known, place), mean, mean, prior)
+    found = Accelerometer(replace(own, outside=(GRAVITY,)), known, place)
     theta = found.fit.theta
     if (np.abs(theta - mean) > REACH * np.sqrt(np.diag(prior)))[:GRAVITY].any():
         bias, scale = (", ".join(f"{one:.3g}" for one in theta[part]) for part in (BIAS, SCALE))

@@ -36,7 +36,8 @@ class Fit:
     """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
     `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
     makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step` [n]:
-    to the least sum of squares by these derivatives, which takes `gain` off it."""
+    to the least sum of squares by these derivatives, which takes `gain` off it. `outside`: places of parameters of the
+    surroundings, whose prior is no part's."""
 
     theta: Array
     covariance: Array
@@ -47,6 +48,7 @@ class Fit:
     pulled: float
     step: Array
     gain: float
+    outside: tuple[int, ...] = ()
 
     @property
     def squares(self) -> float:
@@ -54,10 +56,12 @@ class Fit:
         return float(self.white @ self.white) + self.pulled
 
     def _informed(self, least: float) -> tuple[Array, Array]:
-        """The prior's factor [n, n], and the information in its units, with `least` of the prior's own."""
+        """The prior's factor [n, n], and the information in its units, with `least` of the prior's own of the part."""
         factor = np.asarray(np.linalg.cholesky(self.prior), float)
         seen = self.columns @ factor
-        return factor, seen.T @ seen + least * np.eye(len(factor))
+        share = np.full(len(factor), least)
+        share[list(self.outside)] = 1.0
+        return factor, seen.T @ seen + np.diag(share)
 
     @property
     def evidence(self) -> float:

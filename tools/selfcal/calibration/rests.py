@@ -33,9 +33,9 @@ REST_S, CUT_S = 10.0, 6.0 * PIECE_S
 LEAST_S, MOST = 2.0, 200
 #: Pieces of a rest: their differences show its drift.
 PIECES = 8
-#: Shares of a drift's mean square under a wide prior that are weighed: three decades of its deviation.
-#: Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
-SHARES, RESTLESS = 10.0 ** -np.arange(0.0, 6.5, 0.75), 10.0
+#: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
+#: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
+SHARES, RESTLESS = 10.0 ** (1.5 - np.arange(0.0, 8.0, 0.75)), 10.0
 #: N^2 of a gyro that is not recorded beside others: it weighs nothing.
 UNRECORDED = 1e6
 #: Readings at the extreme in a row that a turn clips at, and steps of the lattice to the readings beside them at least.

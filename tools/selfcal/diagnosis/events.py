@@ -375,6 +375,8 @@ def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
 def _before_and_after(one: Diagnosed, unit: str, known: Identified | None) -> dict[str, dict[str, Any]]:
     """N, K and B of an axis: without any finding, as plain noise has them; and with all, as the extended model does."""
     factor = units.factor(one.state.unit, unit)
+    if any("y" in finding.look.changes for finding in one.findings):  # the bank has the readings as they were read
+        known = None
     before, after = (numbers(state) for state in (one.first, one.state))
     found: dict[str, dict[str, Any]] = {}
     for name, key in SUMMARY.items():

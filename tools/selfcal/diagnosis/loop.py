@@ -16,7 +16,9 @@ from selfcal.base.grid import regridded, runs
 from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, step, tilt
+from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
+from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.record import TIMES, Record, carried
 from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
@@ -200,6 +202,7 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
 def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
     """What acts on several axes goes into the model of each. One that predicts held-out time worse on all is none."""
     advance("all axes together")
+    record = _curves(record, found)
     states = dict(record.axes)
     seen = module.together(states, record.channels, record.since_power_on_s + record.start_s)
     if seen is None:
@@ -217,6 +220,24 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
             times = module.sharpened(event.theta, [states[name] for name in event.names], seen.dt)
             event = replace(event, theta=times)
         _give(record, found, states, event, number, seen.dt)
+    return _with(record, found, states)
+
+
+def _curves(record: Record, found: Mapping[str, Diagnosed]) -> Record:
+    """Curves of a channel that an axis shows beyond doubt go into its model: all axes together have no such shape, and
+    take it for lines and for a quantity that nobody recorded."""
+    states = dict(record.axes)
+    for name, state in record.axes.items():
+        looks = [look for cause in record.channels for look in side_looks(state, record, cause)]
+        look = max(looks, key=lambda look: look.net, default=None)
+        if look is None or look.net < module.CERTAIN or look.estimate["form"] != FREE:
+            continue
+        after = state.refit(**look.changes)
+        held_out = score.gain(look, state, after, record)
+        if held_out is None or not held_out.harms:
+            states[name] = after
+            if name in found:
+                found[name].findings.append(Finding(look, 0, state, after, held_out=held_out))
     return _with(record, found, states)
 
 
@@ -240,6 +261,8 @@ def _give(
     own = {name: _between(states[name], event.passing, span) for name in event.names}
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     looks = tilt.of_steps(looks, {**states, **own})
+    if sum(look.gain for look in looks.values()) < EVIDENT:  # what the axes know by now explains it
+        return
     findings = {}
     for name, look in looks.items():
         after = own[name].refit(**look.changes)
@@ -343,7 +366,10 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
                 looks, idle, waiting = _by_worth([*looks, *more]), idle | unworthy, []
             if not looks or looks[0].net < NET_LEAST:
                 return
-            best, after = looks[0], one.state.refit(**looks[0].changes)
+            # Of what is as likely a channel that was recorded comes first.
+            best = next((look for look in looks if look.cause in record.channels), looks[0])
+            best = best if best.net > looks[0].net - ALIKE else looks[0]
+            after = one.state.refit(**best.changes)
             before = best.before or one.state
             known = score.gain(best, before, after, record)
             harms = known is not None and known.harms
@@ -352,7 +378,7 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
                 looks = [look for look in looks if not look.repeats(best)]
         idle = idle | set(waiting) if len(one.findings) >= BUSY else set()
         rivals = tuple(
-            dict.fromkeys(look.cause for look in looks[1:] if look.net > best.net - ALIKE and look.cause != best.cause)
+            dict.fromkeys(look.cause for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
         )
         one.state = after
         replaced = [finding for finding in one.findings if _gone(finding, after)]

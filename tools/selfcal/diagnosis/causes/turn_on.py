@@ -16,7 +16,7 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, NEARLY, Number, Shape
-from selfcal.likelihood.state import Look, Regressor, State, log_normal
+from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, log_normal
 from selfcal.likelihood.statemodel import Array
 
 #: The fastest time constant looked for, samples.
@@ -41,10 +41,13 @@ def looks(state: State, record: Record) -> list[Look]:
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
-    """The look at a settling whose time constant, s, is known, and the sd of the logarithm of that."""
+    """The look at a settling whose time constant, s, is known, and the sd of the logarithm of that. Where the axis
+    alone knows better, as it does two time constants, its own look."""
     tau_s, sd = theta
     known = {"tau_s": log_normal(math.log(tau_s), sd, "s")}
-    return columns.located(state, "turn_on", _shape(state, record, [tau_s]), known)
+    found = columns.located(state, "turn_on", _shape(state, record, [tau_s]), known)
+    own = looks(state, record)
+    return own[0] if own and own[0].gain > found.gain + NET_LEAST else found
 
 
 def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
