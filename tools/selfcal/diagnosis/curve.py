@@ -18,7 +18,7 @@ from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import SMALLER, Shape, Tried
 from selfcal.likelihood.fit import Fit, run
-from selfcal.likelihood.state import Look, Regressor, State, net
+from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, net
 from selfcal.likelihood.statemodel import Array
 
 #: Knots of the splines, even over the channel's range.
@@ -51,13 +51,13 @@ def knots_of(values: Array, count: int) -> list[float]:
 
 
 def best(state: State, found: Tried, means: Array) -> Tried:
-    """The curve of `means` [n] of the channel as one column of mean 0 and deviation 1: the spline that was found, or
-    hinges and jumps where these are worth more."""
+    """The curve of `means` [n] of the channel as one column of mean 0 and deviation 1: hinges and jumps, or the spline
+    that was found where no few of these are evident by themselves."""
     (column,) = found.shape.regressors
     heights = [0.0, *found.fit.c[-len(found.shape.columns) :]]
     whole = _as_one(state, found, column, means, column.entry["knots"], heights)
     chosen = _chosen(state, found, means)
-    return whole if chosen is None or chosen.net < found.net else chosen
+    return whole if chosen is None or chosen.net < NET_LEAST else chosen
 
 
 def _chosen(state: State, found: Tried, means: Array) -> Tried | None:
