@@ -103,13 +103,14 @@ def diagnose_record(
         _weed(found),
         *(cause.grouping.settle(record, found) for cause in CAUSES.values() if cause.grouping.settle is not None),
     ]
-    for name, one in found.items():
-        one.dropped = [look for look in named[name] if not any(look.repeats(kept.look) for kept in one.findings)]
 
     def again(name: str) -> None:
         """What a finding that was dropped stood before may be one now."""
+        one = found[name]
+        gone = [look for look in named[name] if not any(look.repeats(kept.look) for kept in one.findings)]
+        one.dropped += gone
         causes = tuple(looks for looks in (QUICK if name in means else LOOKS) if looks in OWN)
-        walk(name, causes) if found[name].dropped else _end(found[name], advance)
+        walk(name, causes) if gone else _end(one, advance)
 
     work.each(again, dict.fromkeys(name for names in settled for name in names))
     return found
@@ -234,10 +235,13 @@ def _curves(record: Record, found: Mapping[str, Diagnosed]) -> Record:
             continue
         after = state.refit(**look.changes)
         held_out = score.gain(look, state, after, record)
-        if not _refuted(look, held_out):
-            states[name] = after
+        if _refuted(look, held_out):
             if name in found:
-                found[name].findings.append(Finding(look, 0, state, after, held_out=held_out))
+                found[name].dropped.append(look)
+            continue
+        states[name] = after
+        if name in found:
+            found[name].findings.append(Finding(look, 0, state, after, held_out=held_out))
     return _with(record, found, states)
 
 

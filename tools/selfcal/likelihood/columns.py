@@ -8,7 +8,7 @@ drifts as well; the best of each form is fitted with the drift beside it, and al
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -153,15 +153,13 @@ def _between(state: State, best: Tried) -> Tried:
     paid, grid = best.shape.free > len(best.shape.columns), best.gain
     for reach in REACHES if best.shape.numbers and best.net > NEARLY else ():
         moves = np.exp2(reach * np.linspace(-1.0, 1.0, 2 * FINER + 1))
-        shapes = best.shape.near([[*np.multiply(best.shape.theta, by)] for by in product(moves, repeat=_count(best))])
+        shapes = best.shape.near(
+            [[*np.multiply(best.shape.theta, by)] for by in product(moves, repeat=len(best.shape.numbers))]
+        )
         gains = state.scores([one.columns for one in shapes], best.fit)
         moved = fitted(state, shapes[int(gains.argmax())]) if gains.max() > best.gain else best
         best = moved if moved.gain > best.gain else best
     return best if paid else replace(best, gain=grid)
-
-
-def _count(one: Tried) -> int:
-    return len(one.shape.numbers)
 
 
 def alike(found: Mapping[str, Tried]) -> list[Tried]:
@@ -172,9 +170,12 @@ def alike(found: Mapping[str, Tried]) -> list[Tried]:
     return sorted(near, key=lambda one: any(number.value > 0.5 * number.high for number in one.shape.numbers))
 
 
-def looks(state: State, cause: str, shapes: Sequence[Shape]) -> list[Look]:
-    """The look at a slow family, where it is worth one nat."""
+def looks(state: State, cause: str, shapes: Sequence[Shape], dearer: Iterable[Shape] = ()) -> list[Look]:
+    """The look at a slow family, where it is worth one nat. `dearer`: forms that are tried where a first one may be
+    named."""
     found = tried(state, shapes, slow=True)
+    if any(one.net > NEARLY for one in found.values()):
+        found |= tried(state, list(dearer), slow=True)
     chosen = alike(found)[0] if found else None
     return [look(state, cause, chosen)] if chosen is not None and chosen.net >= 1.0 else []
 
@@ -187,12 +188,11 @@ def located(state: State, cause: str, shape: Shape, known: Mapping[str, Any] | N
     return look(state, cause, fitted(state, shape))
 
 
-def look(state: State, cause: str, chosen: Tried, before: State | None = None) -> Look:
-    """The look at the shape that was chosen. `before`: the state less the columns that it takes the place of."""
-    base, shape = state if before is None else before, chosen.shape
-    changes = {"regressors": (*base.regressors, *shape.regressors)}
-    measure = partial(measured, shape)
-    return Look(cause, chosen.gain, chosen.net, _estimate(chosen), changes, measure=measure, before=before)
+def look(state: State, cause: str, chosen: Tried) -> Look:
+    """The look at the shape that was chosen."""
+    changes = {"regressors": (*state.regressors, *chosen.shape.regressors)}
+    measure = partial(measured, chosen.shape)
+    return Look(cause, chosen.gain, chosen.net, _estimate(chosen), changes, measure=measure)
 
 
 def _estimate(chosen: Tried) -> dict[str, Any]:

@@ -15,7 +15,7 @@ from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simu
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
-from selfcal.likelihood.columns import LN_SLOW, NEARLY, Number, Shape
+from selfcal.likelihood.columns import LN_SLOW, Number, Shape
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, log_normal
 from selfcal.likelihood.statemodel import Array
 
@@ -32,12 +32,8 @@ LN_LOOKS = 0.4
 def looks(state: State, record: Record) -> list[Look]:
     """The best time constant, or the best two where a single one shows settling and both are clearly more likely."""
     tau = _grid(record)
-    single = [_shape(state, record, [one]) for one in tau]
-    found = columns.looks(state, "turn_on", single)
-    if not found or found[0].net < NEARLY:
-        return found
-    pairs = [_shape(state, record, two) for two in combinations(tau, 2) if two[1] > 0.999 * APART * two[0]]
-    return columns.looks(state, "turn_on", [*single, *pairs])
+    pairs = (_shape(state, record, two) for two in combinations(tau, 2) if two[1] > 0.999 * APART * two[0])
+    return columns.looks(state, "turn_on", [_shape(state, record, [one]) for one in tau], pairs)
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
