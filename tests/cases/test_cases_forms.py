@@ -31,7 +31,7 @@ from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
 
-from conftest import case_records
+from conftest import case_records, shared_case
 
 Array = NDArray[np.float64]
 
@@ -419,3 +419,11 @@ def test_the_source_is_named_where_the_record_shows_it(tmp_path: Path) -> None:
     assert blamed >= count
     assert unsure >= math.floor(0.9 * blamed)
     assert sure >= math.floor(0.9 * count)
+
+
+def test_a_cubic_of_the_temperature_has_its_curvature(tmp_path: Path) -> None:
+    """A warm-up from -5 to 40 degC, P30 of the shared cases. A ramp is wrong."""
+    findings = diagnose(shared_case("P30_cubic.py", tmp_path), decimate=1.0)["axes"]["gx"]["findings"]
+    found = {finding["cause"]: finding["estimate"] for finding in findings}
+    assert "ramp" not in found
+    assert found.get("temperature", {}).get("form") in ("square", "cube")
