@@ -1,5 +1,5 @@
 # Suites and long runs, and the C tests: a part of the Makefile.
-.PHONY: quick test hidden hidden-physics hidden-several false-alarms c-tests
+.PHONY: quick test hidden hidden-physics hidden-several false-alarms module-null c-tests
 .PHONY: soak tolerances emulate calibration campaigns cases
 
 WARNINGS := -Wall -Wextra -Wpedantic -Wconversion -Wshadow -Wdouble-promotion -Werror
@@ -45,6 +45,9 @@ hidden-several: setup-dev
 
 false-alarms: setup-dev
 	nice $(BIN)/python tests/hidden/false_alarms.py $(RECORDS:%=--records %) $(SEED:%=--seed %) $(RATE:%=--rate %)
+
+module-null: setup-dev
+	nice $(BIN)/python tests/hidden/module_null.py $(RECORDS:%=--records %) $(SEED:%=--seed %)
 
 soak: setup-dev
 	SELFCAL_SOAK=1e8 $(LONG) $(PYTEST) -s tests/agree/test_long.py

@@ -24,7 +24,7 @@ from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import work
 from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
-from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, Regressor, State, interval
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State, interval
 from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
@@ -144,7 +144,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
         gain = sum(
             one.state.best.ln_likelihood - state.best.ln_likelihood for (one, _), state in zip(parts, less, strict=True)
         )
-        if gain - price < EVIDENT:
+        if gain - price < module.NAMED:
             for (one, finding), state in zip(parts, less, strict=True):
                 one.findings = [each for each in one.findings if each.event != finding.event]
                 one.state = state
@@ -265,7 +265,7 @@ def _give(
     own = {name: _between(states[name], event.passing, span) for name in event.names}
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     looks = tilt.of_steps(looks, {**states, **own})
-    if sum(look.gain for look in looks.values()) < EVIDENT:  # what the axes know by now explains it
+    if sum(look.gain for look in looks.values()) < module.NAMED:  # what the axes know by now explains it
         return
     findings = {}
     for name, look in looks.items():

@@ -14,11 +14,11 @@ from functools import cached_property
 
 import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from scipy.special import logsumexp, softmax
 
 from selfcal.base.grid import half_means
-from selfcal.diagnosis.causes.periodic import TURNS_LEAST, ln_lines
+from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SMOOTHINGS, LONGEST_LAG
@@ -39,10 +39,14 @@ from selfcal.likelihood.joint import (
     refitted,
     without_lines,
 )
-from selfcal.likelihood.state import EVIDENT, NET_LEAST, State
+from selfcal.likelihood.state import EVIDENT, NET_LEAST, P_MODULE, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.model.forms import formed, slope
 
+#: Chance makes an evidence of T nats and more on this times e^-T of modules on which nothing acts (`make module-null`).
+NULL = 0.05
+#: Evidence of a candidate that is named, nats.
+NAMED = math.log(NULL / P_MODULE)
 #: Means of this length at least, s: whatever the rate, what is slow is in them.
 MEANS_S = 1.0
 #: Means that the joint model takes at least, and the share of them that an axis may lack.
@@ -63,12 +67,14 @@ NEAR = 30
 PLACES = 4
 #: Lines above the means' band that are looked at.
 FAST_LINES = 6
+#: Multiples of a line that are looked at with it, if it is no slow one, and ln of the number of kinds of lines.
+MULTIPLES, LN_ALONE = 5, math.log(2.0)
 #: Samples at each end in which no step is looked for, and of a pulse at least.
 EDGE, SHORTEST = 4, 4
 #: Share of the information of a step far from the ends, from which on two of them are taken as there.
 WHOLE = 0.95
-#: Durations of a pulse, a factor apart.
-LONGER = 1.15
+#: Durations of a pulse, a factor apart, and its places in one duration.
+LONGER, PLACES_IN = 1.15, 16
 #: Bins about a frequency that tell its noise.
 BESIDE = 50
 #: A line about one that is left to the axes is its own within this share of the frequency: it wanders.
@@ -153,7 +159,11 @@ class Seen:
     channels: Mapping[str, Array]
     kept_out: Mask
     since_s: float = 0.0
-    passed: Mask = field(default_factory=lambda: np.zeros(0, bool))
+
+    @cached_property
+    def passed(self) -> Mask:
+        """[n]: where nothing jumps any more."""
+        return np.zeros(self.n, bool)
 
     @property
     def n(self) -> int:
@@ -234,9 +244,10 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         known = seen.course.known[:-length] + seen.course.known[length:] - cross - cross.T
         score[: seen.edge] = score[-seen.edge :] = 0.0
         score[near_end[:-length] | near_end[length:] | (seen.passed[:-length] & seen.passed[length:])] = 0.0
-        gain = full(score, known)
-        at = int(np.argmax(gain))
-        best.append((float(gain[at]), at, at + length))
+        apart = max(1, length // PLACES_IN)  # its ends are moved to their best places
+        gain = full(score[::apart], known[::apart])
+        at = int(np.argmax(gain)) * apart
+        best.append((float(gain.max()), at, at + length))
     places = [_moved(seen, first, last) for _, first, last in sorted(best, reverse=True)[:PLACES]]
     places = [one for one in dict.fromkeys(places) if one[1] - one[0] >= SHORTEST]
     t = np.arange(seen.n)
@@ -289,22 +300,45 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     usable[:low] = usable[-low:] = False
     padded = 2 * next_fast_len(n, real=True)
     V = rfft(weights, padded, axis=0)
-    place = np.minimum(np.rint(np.arange(V.shape[0]) * n / padded).astype(int), U.shape[0] - 1)
     turns = np.arange(V.shape[0]) * n / padded
-    gain = full(V.real, known[place]) + full(V.imag, known[place])
+    place = np.minimum(np.rint(turns).astype(int), U.shape[0] - 1)
+    price = np.where(usable[place], ln_lines(turns, n, np.ones(1)), math.inf)[:, None]
+    inverse = np.linalg.inv(known)[place]
     alone = 0.5 * np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place]
-    gain = np.where(usable[place], gain - ln_lines(turns, n, gain), -math.inf)
-    alone = np.where(usable[place][:, None], alone - ln_lines(turns[:, None], n, alone), -math.inf)
-    t = np.arange(n)
-    places = [int(np.argmax(gain)), *(int(k) for k in np.argmax(alone, axis=0))]
+    gain = 0.5 * np.einsum("ki,kij,kj->k", V.conj(), inverse, V).real
+    gains = np.column_stack([gain, alone])
+    comb = gains[: 1 + (len(gains) - 1) // MULTIPLES].copy()
+    for k in range(2, MULTIPLES + 1):  # what chance gives each axis is taken off
+        near = maximum_filter1d(gains[:, 0], 2 * (k // 2) + 1)[::k][: len(comb)]
+        comb[:, 0] += np.maximum(near - len(seen.y), 0.0)
+    comb[turns[: len(comb)] < SLOW_TURNS] = 0.0
+    places = [int(at) for each in (comb[:, :1], gains) for at in np.argmax(each - price[: len(each)], axis=0)]
     for at in dict.fromkeys(places) if usable.any() else ():
-        f = _sharpest(weights, known[place[at]], at / padded, 0.5 / padded)
-        pair = np.array([np.cos(2.0 * math.pi * f * t), np.sin(2.0 * math.pi * f * t)])
-        # Of few turns: the record ends, and a spectrum does not.
-        there = information(seen.model, seen.y, pair).mean(axis=0) * np.outer(own[place[at]], own[place[at]])
-        found = act(pair @ weights, there)
-        price = float(ln_lines(np.array(f * n), n, np.array(found.evidence)))
-        yield Candidate("periodic", (f / seen.dt,), found, price, pair)
+        most = 1 if turns[at] < SLOW_TURNS else min(MULTIPLES, (len(gains) - 1) // at)
+        there = known[place[at * np.arange(1, most + 1)]]
+        f = _sharpest(weights, there[:1], at / padded, 0.5 / padded)
+        wave = _waves(f, 1, n)
+        if most == 1:  # the record ends, and a spectrum does not
+            scale = own[place[at]]
+            there[0] = information(seen.model, seen.y, wave).mean(axis=0) * np.outer(scale, scale)
+        tried = [(LN_ALONE, f, wave)]
+        if most > 1:
+            f = _sharpest(weights, there, at / padded, 0.5 / padded)
+            waves, price_of = _waves(f, most, n), LN_ALONE + math.log(most - 1)
+            tried += [(price_of, f, waves[: 2 * count]) for count in range(2, most + 1)]
+        found = []
+        for price_of, f, parts in tried:
+            acts = act(parts @ weights, np.repeat(there[: len(parts) // 2], 2, axis=0))
+            whole = price_of + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
+            theta = (f / seen.dt, *map(float, range(2, 1 + len(parts) // 2)))
+            found.append(Candidate("periodic", theta, acts, whole, parts))
+        yield _ranked(found)[0]
+
+
+def _waves(f: float, multiples: int, n: int) -> Array:
+    """Cosine and sine of a frequency, turns a sample, and of its multiples: [2 * multiples, n]."""
+    turns = 2.0 * math.pi * f * np.outer(np.arange(1, multiples + 1), np.arange(n))
+    return np.stack([np.cos(turns), np.sin(turns)], axis=1).reshape(-1, n)
 
 
 def _level(ratio: Array, beside: int, axis: int) -> Array:
@@ -353,12 +387,15 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
 
 
 def _sharpest(weights: Array, known: Array, f: float, reach: float) -> float:
-    """The best frequency about f, turns a sample."""
+    """The best frequency about f, turns a sample, of a line with its multiples, each with its information [k, m, m]."""
     t = np.arange(weights.shape[0])
     for _ in range(3):
         tried = f + reach * np.linspace(-1.0, 1.0, 7)
-        z = np.exp(2j * math.pi * tried[:, None] * t) @ weights
-        f = float(tried[np.argmax(full(z.real, known) + full(z.imag, known))])
+        gain = np.zeros(tried.size)
+        for k, there in enumerate(known, 1):
+            z = np.exp(2j * math.pi * k * tried[:, None] * t) @ weights
+            gain += full(z.real, there) + full(z.imag, there)
+        f = float(tried[np.argmax(gain)])
         reach /= 3.0
     return f
 
@@ -463,9 +500,14 @@ def between_levels(seen: Seen, one: Candidate) -> Candidate:
     return replace(beside(replace(seen, y=y), one), passing=tuple(passing))
 
 
-#: The searches, each with the columns that it looks for.
-FAMILIES: tuple[Callable[[Seen], Iterator[Candidate]], ...] = (steps, pulses, lines, transients, channels)
-OF_JUMPS = (steps, pulses)
+#: The searches; a jump's has the name of its cause.
+FAMILIES: dict[str, Callable[[Seen], Iterator[Candidate]]] = {
+    "step": steps,
+    "pulse": pulses,
+    "line": lines,
+    "transient": transients,
+    "channel": channels,
+}
 
 
 def _ranked(found: Iterable[Candidate]) -> list[Candidate]:
@@ -491,42 +533,52 @@ class Search:
     several: list[Candidate] = field(default_factory=list)
     single: list[Candidate] = field(default_factory=list)
 
+    @cached_property
+    def seen(self) -> Seen:
+        return Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s)
+
+    @cached_property
+    def known(self) -> dict[str, list[Candidate]]:
+        """What each search finds."""
+        return {name: list(family(self.seen)) for name, family in FAMILIES.items()}
+
+    def _changed(self) -> None:
+        """The records or the model are others: look again."""
+        self.__dict__.pop("seen", None)
+        self.__dict__.pop("known", None)
+
     def go(self, least: float) -> None:
         """Look until nothing is worth `least`, nats. A candidate with the pattern of the quantity in the model is that
         one's own."""
-        passed = np.zeros(self.rest.shape[1], bool)
-        seen: Seen | None = None
-        known: dict[int, list[Candidate]] = {}
+        vain: list[Candidate] = []
         for _ in range(MOST - len(self.several) - len(self.single)):
-            if seen is None:
-                seen = Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s, passed)
-                known = {k: list(family(seen)) for k, family in enumerate(FAMILIES)}
-            found = _best_of(one for each in known.values() for one in each)
+            left = {name: [one for one in each if one not in vain] for name, each in self.known.items()}
+            found = _best_of(one for each in left.values() for one in each)
             last = found is None or found.evidence < least
             if last:
-                jumps = [_ranked(known[k])[:REFITTED] for k, family in enumerate(FAMILIES) if family in OF_JUMPS]
-                found = _best_of(beside(seen, one) for each in jumps for one in each)
+                jumps = [_ranked(left[name])[:REFITTED] for name in JUMPS]
+                found = _best_of(beside(self.seen, one) for each in jumps for one in each if one.evidence > 0.0)
             if found is None or found.evidence < least:
                 return
             own = self._is_own(found)
             if own and found.cause in JUMPS:
                 for time in found.theta:
                     at = round(time / self.dt)
-                    passed[max(0, at - 3) : at + 4] = True
-                known |= {k: list(family(seen)) for k, family in enumerate(FAMILIES) if family in OF_JUMPS}
+                    self.seen.passed[max(0, at - 3) : at + 4] = True
+                self.known.update({name: list(FAMILIES[name](self.seen)) for name in JUMPS})
                 continue
-            named = between_levels(seen, found) if found.cause in JUMPS else found
+            named = between_levels(self.seen, found) if found.cause in JUMPS else found
             if own or named.evidence < least:
                 if last:
                     return
-                known = {k: [one for one in each if one is not found] for k, each in known.items()}
+                vain.append(found)
                 continue
             (self.several if len(named.act.axes) > 1 else self.single).append(named)
             self.rest = self.rest - named.effect
             for begin, end in named.passing:
                 self.rest[:, begin:end] = np.nan
             self.model = refitted(self.model, self.rest, self.dt)
-            seen = None
+            self._changed()
 
     def _is_own(self, one: Candidate) -> bool:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
@@ -535,6 +587,7 @@ class Search:
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. Events with its pattern are its own."""
         self.model = model
+        self._changed()
         for one in filter(self._is_own, self.several):
             self.rest = self.rest + one.effect
         self.several = [one for one in self.several if not self._is_own(one)]
@@ -551,13 +604,8 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}
     if len(found) < 2 or min(y.size for y in found.values()) < LEAST:
         return None
-    y = np.array(list(found.values()))
-    scale = np.array([np.nanstd(np.diff(row)) for row in y]) / math.sqrt(2.0)
-    y = (y - np.nanmean(y, axis=1)[:, None]) / scale[:, None]
+    y, kept_out, scale = in_means(np.array(list(found.values())))
     span = block * dt
-    whole = bridged_rows(y)
-    y = np.where(np.abs(whole - median_filter(whole, (1, SPIKE_OF))) < SPIKE, y, np.nan)
-    y, kept_out = without_lines(y)
     side = {cause: half_means(values, block)[0] for cause, values in channels.items()}
     null = fitted(bins_of(y), span, False)
     search = Search(span, side, kept_out, since_s, null, y)
@@ -565,13 +613,23 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     model = weighed(search.model, search.rest, span)
     if model is not None:
         search.weigh(model)
-    search.go(EVIDENT)
+    search.go(NAMED)
     of = None
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
         y = np.where(np.isfinite(search.rest), y, np.nan) - sum(one.effect for one in search.several)
         model = refitted(search.model, y, span)
         of = Hidden(tuple(found), model, y, scale, span)
     return Module(tuple(found), span, tuple(search.several), of, scale)
+
+
+def in_means(y: Array) -> tuple[Array, Mask, Array]:
+    """Means [m, n] in units of their noise less what jumps in one of them alone and lines beyond doubt, where those are
+    in the spectrum, and the units [m]."""
+    scale = np.array([np.nanstd(np.diff(row)) for row in y]) / math.sqrt(2.0)
+    y = (y - np.nanmean(y, axis=1)[:, None]) / scale[:, None]
+    whole = bridged_rows(y)
+    y = np.where(np.abs(whole - median_filter(whole, (1, SPIKE_OF))) < SPIKE, y, np.nan)
+    return *without_lines(y), scale
 
 
 @dataclass(frozen=True)

@@ -398,7 +398,7 @@ def information(model: Joint, y: Array, columns: Array) -> Array:
 class Act:
     """What a column of unknown size on unknown axes is worth: `evidence`, nats over none, its search not paid;
     `probability` [m] that each axis has it; sizes [p, m] of its p parts with their standard deviations [m], nothing and
-    infinite where that is below a half."""
+    infinite where that is below a half. `sd` is that of the first part."""
 
     evidence: float
     probability: Array
@@ -411,24 +411,25 @@ class Act:
 
 
 def act(score: Array, known: Array) -> Act:
-    """Of scores [p, m] of the p parts of a column that share the information `known` [m, m].
+    """Of scores [p, m] of the p parts of a column, each with its information `known` [p, m, m], or all with one [m, m].
 
     The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. Sizes are
     normal about 0 with one width for all axes of a set, in standard deviations of each axis' own. The probability of an
     axis is what its own readings say: before the record it is a half, whatever the others do."""
     p, m = score.shape
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(known), 1e-300))
-    z, R = score * scale, known * np.outer(scale, scale)
+    known = np.broadcast_to(known, (p, m, m))
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known, axis1=1, axis2=2), 1e-300))
+    z, R = score * scale, known * scale[:, :, None] * scale[:, None, :]
     widths = np.array(WIDTHS)
     values, members, priors = [], [], []
     for count in range(1, m + 1):
         sets = np.array(list(combinations(range(m), count)))
-        rho = R[sets[:, :, None], sets[:, None, :]][None]
-        firm = rho + np.eye(count) / widths[:, None, None, None] ** 2
-        x = np.moveaxis(z[:, sets], 0, -1)[None]
-        explained = 0.5 * (x * np.linalg.solve(firm, np.broadcast_to(x, (widths.size, *x.shape[1:])))).sum(axis=(2, 3))
-        volume = np.linalg.slogdet(firm)[1] + 2.0 * count * np.log(widths)[:, None]
-        ln_bf = logsumexp(explained - 0.5 * p * volume, axis=0) - math.log(widths.size)
+        rho = R[:, sets[:, :, None], sets[:, None, :]]
+        firm = rho + np.eye(count) / widths[:, None, None, None, None] ** 2
+        x = np.broadcast_to(z[:, sets, None], (widths.size, p, len(sets), count, 1))
+        explained = 0.5 * (x * np.linalg.solve(firm, x)).sum(axis=(1, 3, 4))
+        volume = np.linalg.slogdet(firm)[1].sum(axis=1) + 2.0 * p * count * np.log(widths)[:, None]
+        ln_bf = logsumexp(explained - 0.5 * volume, axis=0) - math.log(widths.size)
         values.append(ln_bf)
         priors.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
         one = np.zeros((len(sets), m))
@@ -440,6 +441,7 @@ def act(score: Array, known: Array) -> Act:
     held = np.flatnonzero(probability >= 0.5)
     size, sd = np.zeros((p, m)), np.full(m, math.inf)
     if held.size:
-        inverse = np.linalg.inv(known[np.ix_(held, held)])
-        size[:, held], sd[held] = score[:, held] @ inverse, np.sqrt(np.diag(inverse))
+        inverse = np.linalg.inv(known[:, held[:, None], held])
+        size[:, held] = np.einsum("pj,pjk->pk", score[:, held], inverse)
+        sd[held] = np.sqrt(np.diag(inverse[0]))
     return Act(total, probability, size, sd)

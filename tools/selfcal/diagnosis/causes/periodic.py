@@ -186,44 +186,64 @@ def _line(state: State, record: Record) -> list[Look]:
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
-    """The look at a line of a known frequency."""
-    f, pair, gain, chosen = _fitted(state, record, theta[0])
-    return _look(state, record, f, pair, gain, net(gain, len(pair)), chosen)
+    """The look at a line of a known frequency, and multiples of it."""
+    multiples = tuple(round(k) for k in theta[1:] if k * theta[0] < 0.5 * record.rate_hz)
+    f, waves, gain, chosen = _fitted(state, record, theta[0], multiples)
+    return _look(state, record, f, waves, gain, net(gain, len(waves)), chosen, multiples)
 
 
-def _fitted(state: State, record: Record, f: float) -> tuple[float, Array, float, Fit]:
-    pair = np.array([*columns(f, record).values()])
-    return f, pair, *state.with_columns(pair)
+def _waves(f: float, record: Record, multiples: Sequence[int] = ()) -> Array:
+    """Sine and cosine of a line and its multiples [p, n]."""
+    return np.array([one for k in (1, *multiples) for one in columns(k * f, record).values()])
 
 
-def _look(state: State, record: Record, f: float, pair: Array, gain: float, worth: float, chosen: Fit) -> Look:
+def _fitted(state: State, record: Record, f: float, multiples: Sequence[int] = ()) -> tuple[float, Array, float, Fit]:
+    waves = _waves(f, record, multiples)
+    return f, waves, *state.with_columns(waves)
+
+
+def _look(
+    state: State,
+    record: Record,
+    f: float,
+    pair: Array,
+    gain: float,
+    worth: float,
+    chosen: Fit,
+    multiples: Sequence[int] = (),
+) -> Look:
     n, half = state.y.size, 0.5 * record.rate_hz
-    c, sd = chosen.c[-len(pair) :], chosen.sd[-len(pair) :]
+    own = slice(chosen.c.size - len(pair), chosen.c.size - len(pair) + 2)
+    c, sd = chosen.c[own], chosen.sd[own]
     spread = _spread(c, sd, n * state.dt)
     if worth >= NET_LEAST and f < half:
         # The null's drift has swallowed a part of a line: the frequency is the likeliest beside the one that is left.
         move = min(0.5 * spread, 0.25 * (half - f))
-        three = [np.array([*columns(f + k * move, record).values()]) for k in (-1, 0, 1)]
+        three = [_waves(f + k * move, record, multiples) for k in (-1, 0, 1)]
         gains = [finish(state.series.beside(one), chosen.terms, chosen.theta).ln_likelihood for one in three]
         bend = 2.0 * gains[1] - gains[0] - gains[2]
         if bend > 0.0:
             spread = move / math.sqrt(bend)
             f += move * min(4.0, max(-4.0, 0.5 * (gains[2] - gains[0]) / bend))
-            pair = np.array([*columns(f, record).values()])
+            pair = _waves(f, record, multiples)
     amplitude = interval(math.hypot(*c), float(np.mean(sd)), state.unit)
 
     def measure(state: State) -> dict[str, Any]:
         weight, means, sds = (of[0] for of in state.posterior(pair))
-        return {"amplitude": mixture(weight, np.linalg.norm(means, axis=1), sds.mean(axis=1), state.unit)}
+        amplitudes = np.linalg.norm(means[:, :2], axis=1)
+        return {"amplitude": mixture(weight, amplitudes, sds[:, :2].mean(axis=1), state.unit)}
 
-    name = f"line_{f:.6g}Hz"
-    entry = {"kind": "periodic", "frequency_hz": f}
-    added = [Regressor(name + end, "periodic", one, "1", entry) for end, one in columns(f, record).items()]
+    added = [
+        Regressor(f"line_{k * f:.6g}Hz{end}", "periodic", one, "1", {"kind": "periodic", "frequency_hz": k * f})
+        for k in (1, *multiples)
+        for end, one in columns(k * f, record).items()
+    ]
+    harmonics = {"harmonics": list(multiples)} if multiples else {}
     return Look(
         "periodic",
         gain,
         worth,
-        {"frequency_hz": interval(f, spread, "Hz"), "amplitude": amplitude},
+        {"frequency_hz": interval(f, spread, "Hz"), "amplitude": amplitude, **harmonics},
         {"regressors": (*state.regressors, *added)},
         measure=measure,
     )
@@ -256,7 +276,8 @@ def _harmonics(one: Diagnosed) -> None:
                 gain, worth = gain + other.look.gain, worth + other.look.net
                 one.findings.remove(other)
         if harmonics:
-            estimate = {**base.look.estimate, "harmonics": sorted(harmonics)}
+            harmonics += base.look.estimate.get("harmonics", [])
+            estimate = {**base.look.estimate, "harmonics": sorted(set(harmonics))}
             one.findings[one.findings.index(base)] = replace(
                 base, look=replace(base.look, gain=gain, net=worth, estimate=estimate)
             )
