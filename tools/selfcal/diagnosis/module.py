@@ -306,7 +306,7 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     inverse = np.linalg.inv(known)[place]
     alone = 0.5 * np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place]
     gain = 0.5 * np.einsum("ki,kij,kj->k", V.conj(), inverse, V).real
-    gains = np.column_stack([gain, alone])
+    gains = np.where(usable[place][:, None], np.column_stack([gain, alone]), 0.0)
     comb = gains[: 1 + (len(gains) - 1) // MULTIPLES].copy()
     for k in range(2, MULTIPLES + 1):  # what chance gives each axis is taken off
         near = maximum_filter1d(gains[:, 0], 2 * (k // 2) + 1)[::k][: len(comb)]
@@ -315,29 +315,30 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     places = [int(at) for each in (comb[:, :1], gains) for at in np.argmax(each - price[: len(each)], axis=0)]
     for at in dict.fromkeys(places) if usable.any() else ():
         most = 1 if turns[at] < SLOW_TURNS else min(MULTIPLES, (len(gains) - 1) // at)
-        there = known[place[at * np.arange(1, most + 1)]]
-        f = _sharpest(weights, there[:1], at / padded, 0.5 / padded)
-        wave = _waves(f, 1, n)
+        multiples = [k for k in range(1, most + 1) if usable[place[k * at]]]
+        there = known[place[at * np.array(multiples)]]
+        f = _sharpest(weights, there[:1], at / padded, 0.5 / padded, multiples)
+        waves = _waves(f, n, multiples[:1])
         if most == 1:  # the record ends, and a spectrum does not
             scale = own[place[at]]
-            there[0] = information(seen.model, seen.y, wave).mean(axis=0) * np.outer(scale, scale)
-        tried = [(LN_ALONE, f, wave)]
-        if most > 1:
-            f = _sharpest(weights, there, at / padded, 0.5 / padded)
-            waves, price_of = _waves(f, most, n), LN_ALONE + math.log(most - 1)
-            tried += [(price_of, f, waves[: 2 * count]) for count in range(2, most + 1)]
+            there[0] = information(seen.model, seen.y, waves).mean(axis=0) * np.outer(scale, scale)
+        tried = [(LN_ALONE, f, waves)]
+        if len(multiples) > 1:
+            f = _sharpest(weights, there, at / padded, 0.5 / padded, multiples)
+            waves, kinds = _waves(f, n, multiples), LN_ALONE + math.log(len(multiples) - 1)
+            tried += [(kinds, f, waves[: 2 * count]) for count in range(2, len(multiples) + 1)]
         found = []
-        for price_of, f, parts in tried:
+        for kinds, f, parts in tried:
             acts = act(parts @ weights, np.repeat(there[: len(parts) // 2], 2, axis=0))
-            whole = price_of + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
-            theta = (f / seen.dt, *map(float, range(2, 1 + len(parts) // 2)))
-            found.append(Candidate("periodic", theta, acts, whole, parts))
+            cost = kinds + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
+            theta = (f / seen.dt, *map(float, multiples[1 : len(parts) // 2]))
+            found.append(Candidate("periodic", theta, acts, cost, parts))
         yield _ranked(found)[0]
 
 
-def _waves(f: float, multiples: int, n: int) -> Array:
-    """Cosine and sine of a frequency, turns a sample, and of its multiples: [2 * multiples, n]."""
-    turns = 2.0 * math.pi * f * np.outer(np.arange(1, multiples + 1), np.arange(n))
+def _waves(f: float, n: int, multiples: Sequence[int]) -> Array:
+    """Cosine and sine of multiples of a frequency, turns a sample: [2 k, n]."""
+    turns = 2.0 * math.pi * f * np.outer(multiples, np.arange(n))
     return np.stack([np.cos(turns), np.sin(turns)], axis=1).reshape(-1, n)
 
 
@@ -386,13 +387,13 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
     return found
 
 
-def _sharpest(weights: Array, known: Array, f: float, reach: float) -> float:
-    """The best frequency about f, turns a sample, of a line with its multiples, each with its information [k, m, m]."""
+def _sharpest(weights: Array, known: Array, f: float, reach: float, multiples: Sequence[int]) -> float:
+    """The best frequency about f, turns a sample, of a line by its multiples, each with its information [k, m, m]."""
     t = np.arange(weights.shape[0])
     for _ in range(3):
         tried = f + reach * np.linspace(-1.0, 1.0, 7)
         gain = np.zeros(tried.size)
-        for k, there in enumerate(known, 1):
+        for k, there in zip(multiples, known, strict=False):
             z = np.exp(2j * math.pi * k * tried[:, None] * t) @ weights
             gain += full(z.real, there) + full(z.imag, there)
         f = float(tried[np.argmax(gain)])
