@@ -1,6 +1,8 @@
 /* Whether the model of the last report explains the readings after it: tests on the innovations of one filter an axis.
  *
  * Time is cut into epochs of half the record before them, within SELFCAL_EPOCH_MIN and SELFCAL_EPOCH_MAX bank samples.
+ * The first one has SELFCAL_EPOCH_MIN, and none is more than twice as long as the one before. At its start some axes
+ * may have no report yet, as after a restart with a long record.
  * At the start of an epoch each axis takes a law from its last report. A filter begins without a prior for the bias. It
  * goes on from epoch to epoch where changes are looked for and the law has as many states; else it begins anew.
  * The report leaves the drift open, and this doubt must not look like a fault of the model. So the filter allows the
@@ -175,7 +177,9 @@ static void carry_over(selfcal_watch_t *watch) {
 
 static void begin_epoch(selfcal_adequacy_t *self, const selfcal_t *bank) {
     const uint32_t before = bank->weight > 1.0 ? (uint32_t)bank->weight : 1U, half = before / 2U;
-    self->length = half < SELFCAL_EPOCH_MIN ? SELFCAL_EPOCH_MIN : half > SELFCAL_EPOCH_MAX ? SELFCAL_EPOCH_MAX : half;
+    const uint32_t twice = 2U * self->length, most = twice < SELFCAL_EPOCH_MAX ? twice : SELFCAL_EPOCH_MAX;
+    const uint32_t length = half < most ? half : most;
+    self->length = length < SELFCAL_EPOCH_MIN ? SELFCAL_EPOCH_MIN : length;
     self->before = before;
     self->count = 0;
     for (uint8_t axis = 0; axis < bank->model->axes; axis++) {

@@ -46,12 +46,20 @@ static void carve_all(selfcal_imu_t *imu, room_t *room) {
     }
 }
 
-/* All but the bank begins anew: no axis has a report. */
+static void no_reports(selfcal_imu_t *imu) {
+    imu->reported = 0U;
+    for (uint8_t axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
+        imu->reason[axis] = SELFCAL_REASON_NO_REPORT;
+        imu->bias[axis] = NAN;
+    }
+}
+
+/* All but the bank begins anew. */
 static selfcal_status_t begin_all(selfcal_imu_t *imu) {
     const selfcal_pipe_t *pipe = imu->pipe;
     selfcal_status_t status = SELFCAL_OK;
     imu->computing = false;
-    imu->due = imu->reported = 0U;
+    imu->due = 0U;
     imu->turn = 0U;
     if (imu->columns != NULL) {
         status = pipe->columns->begin(imu);
@@ -62,10 +70,7 @@ static selfcal_status_t begin_all(selfcal_imu_t *imu) {
     if (imu->changes != NULL && status == SELFCAL_OK) {
         status = pipe->changes->begin(imu);
     }
-    for (uint8_t axis = 0; axis < SELFCAL_AXES_MAX; axis++) {
-        imu->reason[axis] = SELFCAL_REASON_NO_REPORT;
-        imu->bias[axis] = NAN;
-    }
+    no_reports(imu);
     return status;
 }
 
@@ -108,8 +113,11 @@ selfcal_status_t selfcal_imu_init_as(uint32_t layout, selfcal_imu_t *imu, const 
 }
 
 void selfcal_imu_keep(selfcal_imu_t *imu, selfcal_kept_t *kept) {
-    memset(kept, 0, sizeof *kept);
+    if (kept != NULL) {
+        memset(kept, 0, sizeof *kept);
+    }
     imu->kept = kept;
+    no_reports(imu); /* those so far are not in it */
 }
 
 bool selfcal_imu_watch(selfcal_imu_t *imu, bool on) {

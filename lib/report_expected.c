@@ -61,11 +61,13 @@ selfcal_real_t selfcal_expected_noise(const selfcal_work_t *work, selfcal_real_t
 void selfcal_expected(const selfcal_work_t *work, selfcal_real_t ln_rho, selfcal_real_t ln_alpha, selfcal_real_t beta,
                       const selfcal_real_t passed[], expectation_t *e) {
     const selfcal_truth_t *truth = &work->truth;
-    memset(e, 0, sizeof *e);
-    e->rho_sq = r_exp(R(2.0) * ln_rho);
+    const selfcal_real_t rho_sq = r_exp(R(2.0) * ln_rho);
     if (!has_expectation(work)) {
+        memset(e, 0, sizeof *e);
+        e->rho_sq = rho_sq;
         return;
     }
+    e->rho_sq = rho_sq;
     const selfcal_real_t n = (selfcal_real_t)work->bank->weight;
     expected_t_wide wide = {0.0, 0.0, 0.0, 0.0};
     expected_t real;

@@ -75,11 +75,6 @@ static void set_lines(selfcal_real_t weight, selfcal_truth_t *truth, selfcal_fit
     }
 }
 
-static inline void rotate(selfcal_real_t *row, selfcal_real_t *mine, selfcal_real_t x, selfcal_real_t s) {
-    *row = r_fma(-x, *mine, *row);
-    *mine = r_fma(s, *row, *mine);
-}
-
 /* Rotates a row of the least squares, its right side behind it, into the triangle, without square roots: each row of
  * that is what stands in it times the root of its diagonal (Gentleman, J. Inst. Maths Applics 12, 1973). */
 static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SELFCAL_FITTED + 1]) {
@@ -94,15 +89,9 @@ static void rotate_in(selfcal_fit_t *fit, unsigned count, selfcal_real_t row[SEL
         mine[-1] = now;
         weight *= diagonal / now;
         selfcal_real_t *with = &row[m + 1U];
-        unsigned left = count - m;
-        for (; left >= 4U; left -= 4U, with += 4, mine += 4) { /* three quarters of the time of a plain loop */
-            rotate(&with[0], &mine[0], x, s);
-            rotate(&with[1], &mine[1], x, s);
-            rotate(&with[2], &mine[2], x, s);
-            rotate(&with[3], &mine[3], x, s);
-        }
-        for (; left > 0U; left--, with++, mine++) {
-            rotate(with, mine, x, s);
+        for (unsigned left = count - m; left > 0U; left--, with++, mine++) {
+            *with = r_fma(-x, *mine, *with);
+            *mine = r_fma(s, *with, *mine);
         }
     }
 }

@@ -255,8 +255,8 @@ static inline selfcal_status_t selfcal_imu_init(selfcal_imu_t *imu, const selfca
 selfcal_status_t selfcal_imu_init_as(uint32_t layout, selfcal_imu_t *imu, const selfcal_pipe_t *pipe, void *memory,
                                      size_t size);
 
-/* From here on the last report of each axis is kept, for selfcal_imu_report() and selfcal_imu_corrected(). Without it
- * the last report of all. `kept` must outlive the use. */
+/* From here on the last report of each axis is kept, for selfcal_imu_report() and selfcal_imu_corrected(). Without it,
+ * or with NULL, the last report of all. Reports from before are gone. `kept` must outlive the use. */
 typedef struct selfcal_kept selfcal_kept_t;
 void selfcal_imu_keep(selfcal_imu_t *imu, selfcal_kept_t *kept);
 
@@ -264,7 +264,7 @@ void selfcal_imu_keep(selfcal_imu_t *imu, selfcal_kept_t *kept);
 bool selfcal_imu_watch(selfcal_imu_t *imu, bool on);
 
 /* Take one sample of every axis, in the model's order and units. `channels`: of the regressors, as their sources count
- * them; NULL without any. `side`: temperature and supply, for the judgement; NULL: neither is known.
+ * them; NULL without any. `side`: temperature (degC) and supply (V), for the judgement; NULL: neither is known.
  * Returns a bit for each axis that has changed, whose last report is of the past: ask for another. Beside them
  * SELFCAL_IMU_DEAR: the sample took as long as a slice of a report. Let the next slice wait. */
 #define SELFCAL_IMU_DEAR 0x80000000UL
@@ -325,9 +325,10 @@ selfcal_status_t selfcal_imu_power_on(selfcal_imu_t *imu, uint64_t samples);
 /* All is forgotten but what the sensor adds (selfcal_imu_shift()). */
 selfcal_status_t selfcal_imu_forget(selfcal_imu_t *imu);
 
-/* The bank's state as bytes with a version and a CRC-32, see selfcal_save() and selfcal_restore() for each status. A
- * snapshot belongs to its model and its build. After a restore `gap` samples, and the rest of a bank interval, are
- * missing. */
+/* The bank's state as bytes with a version and a CRC-32, see selfcal_save() and selfcal_restore() for each status:
+ * SELFCAL_MODEL_SNAPSHOT_MAX bytes at most. A save may come amid a report, which goes on. A restore gives up a report
+ * under way. A snapshot belongs to its model and its build. After a restore `gap` samples, and the rest of a bank
+ * interval, are missing. */
 selfcal_status_t selfcal_imu_save(const selfcal_imu_t *imu, selfcal_write_t write, void *context);
 selfcal_status_t selfcal_imu_restore(selfcal_imu_t *imu, const void *snapshot, size_t length, uint64_t gap);
 

@@ -473,7 +473,7 @@ selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t ite
 
 /* Sends a message of node 0's identifier `id` next, whose values are made elsewhere: item 0 is the time, item k has
  * word[k - 1] if bit k - 1 of `there` is set, and is left out if not. `word` must stay; otherwise as
- * selfcal_telemetry_report(). `count` is 1 to 32. */
+ * selfcal_telemetry_report(). SELFCAL_BAD_ARGUMENT also if `count` is not 1 to 32. */
 selfcal_status_t selfcal_telemetry_words(selfcal_telemetry_t *self, uint32_t id, const uint32_t word[], uint8_t count,
                                          uint32_t there, uint32_t time_ms);
 

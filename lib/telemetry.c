@@ -222,7 +222,7 @@ selfcal_status_t selfcal_telemetry_answer(selfcal_telemetry_t *self, uint8_t ite
 
 selfcal_status_t selfcal_telemetry_words(selfcal_telemetry_t *self, uint32_t id, const uint32_t word[], uint8_t count,
                                          uint32_t there, uint32_t time_ms) {
-    if (self == NULL || word == NULL) {
+    if (self == NULL || word == NULL || count == 0U || count > 32U) {
         return SELFCAL_BAD_ARGUMENT;
     }
     if (!begin(self, WORDS, id, count, time_ms)) {

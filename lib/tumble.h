@@ -117,7 +117,8 @@ uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_t
  * A pipe that names selfcal_tumbling_code (`-DSELFCAL_MODEL_TUMBLED=1`) calibrates while it runs. Between start and
  * stop the gate tells rests, and the bank takes no sample. A rest counts from SELFCAL_TUMBLE_REST_S of whole windows
  * on. The result corrects samples (selfcal_imu_corrected()), and goes with the saved state (selfcal_imu_save()), which
- * SELFCAL_TUMBLE_SAVED bytes are added to. */
+ * SELFCAL_TUMBLE_SAVED bytes are added to. They have a checksum of their own: a restore takes them also where it
+ * refuses the bank. */
 #ifndef SELFCAL_TUMBLE_REST_S
 #define SELFCAL_TUMBLE_REST_S 10
 #endif

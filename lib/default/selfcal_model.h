@@ -58,6 +58,9 @@
     (SELFCAL_MODEL_BYTES + SELFCAL_MODEL_HELD_BYTES + SELFCAL_MODEL_TUMBLED_BYTES + \
      SELFCAL_PARTS_SIZE(SELFCAL_MODEL_NODES, SELFCAL_MODEL_AXES, SELFCAL_MODEL_GATE, SELFCAL_MODEL_REGRESSORS, \
                         SELFCAL_MODEL_JUDGED, SELFCAL_MODEL_JUDGED && SELFCAL_MODEL_CHANGES))
+/* What selfcal_imu_save() writes at most: for a slot of flash. */
+#define SELFCAL_MODEL_SNAPSHOT_MAX \
+    (SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_BYTES) + (SELFCAL_MODEL_TUMBLED ? SELFCAL_TUMBLE_SAVED : 0U))
 /* Rate of the samples, Hz. */
 #define SELFCAL_MODEL_RATE_HZ 819.2F
 /* The same in 1/1000 Hz, for the preprocessor: a program whose samples come at another rate must not compile. */

@@ -9,7 +9,7 @@ enum { SLOT_STRIDE = 0x8000 };
 
 /* Pages of a slot that a state of this model can take. */
 enum {
-    SLOT_BYTES = SLOTS_HEADER_BYTES + SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_BYTES),
+    SLOT_BYTES = SLOTS_HEADER_BYTES + SELFCAL_MODEL_SNAPSHOT_MAX,
     SLOT_PAGES = (SLOT_BYTES + NVMC_PAGE_BYTES - 1) / NVMC_PAGE_BYTES
 };
 typedef char the_state_fits_its_slot[SLOT_PAGES * NVMC_PAGE_BYTES <= SLOT_STRIDE ? 1 : -1];

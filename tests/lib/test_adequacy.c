@@ -85,8 +85,28 @@ static void coloured_noise(void) {
     TEST_ASSERT_EQUAL(SELFCAL_INADEQUATE, judged.state);
 }
 
+/* Epochs after a restart, whose record is long already: 256, then twice as many, so that an axis whose report came
+ * after the first one had begun waits for 768 bank samples and not for twice half of the record. */
+static void a_restart_begins_with_short_epochs(void) {
+    learn();
+    for (unsigned i = 0; i < 3400U; i++) {
+        take(0.3F + SD * noise(), 25.0F);
+    }
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_adequacy_init(&adequacy, &bank));
+    selfcal_adequacy_report(&adequacy, &model, &report, NULL);
+    for (unsigned length = SELFCAL_EPOCH_MIN; length <= 4U * SELFCAL_EPOCH_MIN; length *= 2U) {
+        for (unsigned i = 0; i < length; i++) {
+            take(0.3F + SD * noise(), 25.0F);
+        }
+        const selfcal_judgement_t judged = selfcal_judgement(&adequacy, &bank, 0);
+        TEST_ASSERT_EQUAL(SELFCAL_ADEQUATE, judged.state);
+        TEST_ASSERT_EQUAL(length, judged.samples);
+    }
+}
+
 int main(void) {
     UNITY_BEGIN();
+    RUN_TEST(a_restart_begins_with_short_epochs);
     RUN_TEST(white_noise_is_adequate);
     RUN_TEST(a_temperature);
     RUN_TEST(louder_noise);

@@ -238,6 +238,22 @@ static void test_what_the_sensor_adds_moves_with_it(void) {
     TEST_ASSERT_TRUE(isnan(selfcal_imu_bias(&imu, 1)));
 }
 
+/* Another place for the reports has none of those before: no report of zeros. NULL: the last of all is kept again. */
+static void test_reports_from_before_are_not_in_a_new_place(void) {
+    run_both(0.0F);
+    TEST_ASSERT_NOT_NULL(selfcal_imu_report(&imu, 1));
+    selfcal_imu_keep(&imu, &kept);
+    TEST_ASSERT_NULL(selfcal_imu_report(&imu, 1));
+    TEST_ASSERT_EQUAL(SELFCAL_REASON_NO_REPORT, selfcal_imu_reason(&imu, 1));
+    TEST_ASSERT_TRUE(isnan(selfcal_imu_bias(&imu, 1)));
+    selfcal_imu_keep(&imu, NULL);
+    TEST_ASSERT_EQUAL(SELFCAL_BUSY, selfcal_imu_ask(&imu, SELFCAL_ALL_AXES));
+    while (selfcal_imu_work(&imu) == SELFCAL_BUSY) {
+    }
+    TEST_ASSERT_NULL(selfcal_imu_report(&imu, AXES - 2U));
+    TEST_ASSERT_FLOAT_WITHIN(1.0F, selfcal_imu_bias(&imu, AXES - 1U), selfcal_imu_report(&imu, AXES - 1U)->bias_mean);
+}
+
 static void test_what_does_not_go_together_is_refused(void) {
     const size_t least = SELFCAL_MODEL_IMU_BYTES;
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_imu_init(&imu, &pipe, memory[0], least));
@@ -613,6 +629,7 @@ int main(void) {
     RUN_TEST(test_the_likelier_report_counts);
     RUN_TEST(test_a_corrected_sample_is_the_reading_less_the_predicted_bias);
     RUN_TEST(test_a_restored_pipe_goes_on_at_the_start_of_an_interval);
+    RUN_TEST(test_reports_from_before_are_not_in_a_new_place);
     RUN_TEST(test_what_the_sensor_adds_moves_with_it);
     RUN_TEST(test_what_does_not_go_together_is_refused);
     RUN_TEST(test_a_pipe_without_parts_is_a_bank);

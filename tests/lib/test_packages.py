@@ -18,6 +18,7 @@ import sys
 import tarfile
 from pathlib import Path
 
+import can
 import pytest
 import yaml
 
@@ -27,7 +28,6 @@ from selfcal.wire import package_codegen
 from selfcal.wire.frames import AxisReport, Decoder
 
 from conftest import ROOT
-from wire_stream import message
 
 LIBRARY, CONSUMER = ROOT / "lib", ROOT / "tests" / "consumer"
 PROGRAM = LIBRARY / "examples" / "rest_c" / "rest.c"
@@ -92,8 +92,9 @@ def test_the_loop_reports_sends_and_goes_on_after_a_power_cut(tables: Path, tmp_
     call(*compiler, *sources, "-lm", "-o", tmp_path / "loop")
     decoder = Decoder(from_start=True)
     reports: list[AxisReport] = []
-    for line in call(tmp_path / "loop").split():
-        reports += decoder.feed(message(line))
+    (tmp_path / "loop.log").write_text(call(tmp_path / "loop"))
+    for frame in can.LogReader(tmp_path / "loop.log"):
+        reports += decoder.feed(frame)
     assert all(report.complete for report in reports)
     assert decoder.statistics.refused + decoder.statistics.damaged == 0
     for axis in OWN_AXES:

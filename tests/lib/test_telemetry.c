@@ -369,6 +369,15 @@ static void test_a_corrected_sample_goes_out_by_axis(void) {
     TEST_ASSERT_EQUAL_UINT(4, drain());
 }
 
+/* 32 words at most: a bit of `there` each. */
+static void test_words_are_one_to_32(void) {
+    static const uint32_t word[33] = {5U};
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_words(&telemetry, 0x207, word, 0, ~0U, 0));
+    TEST_ASSERT_EQUAL(SELFCAL_BAD_ARGUMENT, selfcal_telemetry_words(&telemetry, 0x207, word, 33, ~0U, 0));
+    TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_words(&telemetry, 0x207, word, 32, ~0U, 0));
+    TEST_ASSERT_EQUAL_UINT(33, drain());
+}
+
 static void test_an_answer_is_one_frame(void) {
     TEST_ASSERT_EQUAL(SELFCAL_OK, selfcal_telemetry_answer(&telemetry, 1, 0x0305, 9000));
     selfcal_frame_t frame = next(1);
@@ -412,6 +421,7 @@ int main(void) {
     RUN_TEST(test_status_counts_stop_at_the_end_of_their_range);
     RUN_TEST(test_busy_until_all_frames_are_fetched);
     RUN_TEST(test_a_corrected_sample_goes_out_by_axis);
+    RUN_TEST(test_words_are_one_to_32);
     RUN_TEST(test_an_answer_is_one_frame);
     RUN_TEST(test_bad_arguments_and_models_are_refused);
     return UNITY_END();

@@ -1,6 +1,7 @@
 /* The main loop of a product: samples, reports, telemetry and saved state side by side. None of them waits for another.
  * For any C99 or C++17 compiler: the tables decide the axes and the rate. Here twenty minutes of rest are simulated,
- * with a power cut in the middle. The frames go to stdout as SLCAN. */
+ * with a power cut in the middle. The frames go to stdout as candump logs them:
+ *     loop > loop.log; selfcal monitor --read loop.log */
 #include "selfcal_model.h"
 
 #include <stdio.h>
@@ -22,6 +23,7 @@ static bool sending;
 static uint32_t sent_n[SELFCAL_MODEL_AXES];
 static uint64_t now; /* samples since power-on, the missing ones too */
 static uint64_t report_at, save_at;
+static uint64_t before; /* samples before the last power-on: for the log alone */
 
 /* --- what a board brings --- */
 
@@ -46,7 +48,7 @@ static void read_sensor(float reading[], uint32_t *missing) {
 
 /* Two slots of flash, written in turn: a cut leaves the other one whole. */
 typedef struct {
-    unsigned char bytes[SELFCAL_SNAPSHOT_MAX(SELFCAL_MODEL_BYTES)];
+    unsigned char bytes[SELFCAL_MODEL_SNAPSHOT_MAX];
     size_t length; /* 0: nothing is in it */
     uint32_t number;
 } slot_t;
@@ -54,6 +56,9 @@ static slot_t slots[2];
 
 static bool program(void *context, const void *bytes, size_t count) {
     slot_t *slot = (slot_t *)context;
+    if (count > sizeof slot->bytes - slot->length) {
+        return false;
+    }
     memcpy(slot->bytes + slot->length, bytes, count);
     slot->length += count;
     return true;
@@ -61,11 +66,11 @@ static bool program(void *context, const void *bytes, size_t count) {
 
 /* A frame on the wire; false: no room, offer it again. */
 static bool put_frame(const selfcal_frame_t *frame) {
-    printf("t%03X%u", (unsigned)frame->id, (unsigned)frame->length);
+    printf("(%.6f) can0 %03X#", (double)(before + now) / (double)SELFCAL_MODEL_RATE_HZ, (unsigned)frame->id);
     for (unsigned i = 0; i < frame->length; i++) {
         printf("%02X", (unsigned)frame->data[i]);
     }
-    putchar('\r');
+    putchar('\n');
     return true;
 }
 
@@ -79,8 +84,10 @@ static uint64_t in(float seconds) {
     return now + (uint64_t)(seconds * SELFCAL_MODEL_RATE_HZ);
 }
 
-/* Power-on: the newer of the slots that are sound, else an empty bank. */
+/* Power-on: the newer of the slots that are sound, else an empty bank. How long ago it was saved is not known here: as
+ * long as between two saves. */
 static bool begin(void) {
+    before += now;
     now = 0U;
     sending = false;
     memset(sent_n, 0, sizeof sent_n);
@@ -89,10 +96,11 @@ static bool begin(void) {
         return false; /* the model and the build do not go together */
     }
     selfcal_imu_keep(&imu, &kept);
+    const uint64_t gap = in(SAVE_S);
     const unsigned newer = slots[1].number > slots[0].number ? 1U : 0U;
     for (unsigned i = 0; i < 2U; i++) {
         const slot_t *slot = &slots[(newer + i) % 2U];
-        if (slot->length > 0U && selfcal_imu_restore(&imu, slot->bytes, slot->length, 0U) == SELFCAL_OK) {
+        if (slot->length > 0U && selfcal_imu_restore(&imu, slot->bytes, slot->length, gap) == SELFCAL_OK) {
             break;
         }
     }
@@ -115,7 +123,7 @@ static void take_sample(void) {
 
 /* A few slices of the reports that are due. */
 static void work(void) {
-    if (now >= report_at) {
+    if (now >= report_at && !sending) { /* the report that is being sent must stay */
         (void)selfcal_imu_ask(&imu, SELFCAL_ALL_AXES);
         report_at = in(REPORT_S);
     }
@@ -124,8 +132,8 @@ static void work(void) {
     }
 }
 
-/* One frame, of the report that is newer than what was sent of its axis. It stays as it is while it is sent: the axis's
- * next one is REPORT_S away. */
+/* One frame, of the report that is newer than what was sent of its axis. It stays as it is while it is sent: work()
+ * does not ask for another one meanwhile, and the axis's next one takes hundreds of calls. */
 static void send(void) {
     static selfcal_frame_t frame;
     static bool waits;
@@ -145,9 +153,9 @@ static void send(void) {
     waits = waits && !put_frame(&frame);
 }
 
-/* Between reports. The older slot is empty until the last byte is in. */
+/* A report under way goes on. The older slot is empty until the last byte is in. */
 static void save(void) {
-    if (now < save_at || imu.computing) {
+    if (now < save_at) {
         return;
     }
     slot_t *slot = &slots[slots[1].number < slots[0].number ? 1U : 0U];
