@@ -17,7 +17,8 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
-from selfcal.likelihood.state import Look
+from selfcal.diagnosis.separate import next_record
+from selfcal.likelihood.state import Look, State
 from selfcal.logs.recording import SIDE_CHANNELS, Recording
 from selfcal.model.file import MOST_COLUMNS
 from selfcal.model.regressors import coefficient_unit
@@ -61,11 +62,11 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
         **({"unfinished": one.unfinished} if one.unfinished else {}),
         **({"stated": [finding.look.cause for finding in one.stated]} if one.stated else {}),
         "findings": [
-            _finding(finding, record, factor, unit)
+            _finding(finding, record, factor, unit, one.state)
             | ({"left_out_of_model": NO_ROOM} if any(finding is each for each in out) else {})
             for finding in one.by_gain
         ],
-        **({} if first is None else {"only_in_means": [_finding(one, first.record, factor, unit) for one in only]}),
+        **({} if first is None else {"only_in_means": [_finding(one, first.record, factor, unit, first.state) for one in only]}),
         "not_found": _not_found(one, record, factor, unit),
         "not_judged": _not_judged(one, record),
         "discrepancies": [
@@ -90,8 +91,9 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
     }
 
 
-def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict[str, Any]:
+def _finding(finding: Finding, record: Record, factor: float, unit: str, final: State) -> dict[str, Any]:
     look = finding.look
+    beside = finding.before if finding.record is not None else final.without({one.name for one in finding.columns})
     record = finding.record or record
     inner = finding.before.unit
     try:
@@ -99,6 +101,10 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
         held_out, reason = deepcopy(known.gain), known.reason
     except Stopped:
         held_out, reason = None, "there was no time left to measure it"
+    try:
+        planned = next_record(look, finding.rivals, beside, record)
+    except Stopped:
+        planned = None
     if held_out is not None:
         held_out["bias_rmse"]["unit"] = unit
         for row in held_out["bias_rmse"]["horizon_s"].values():
@@ -119,7 +125,8 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
         "when": later(list(look.when), record.start_s) if look.when else None,
         "found_in_round": finding.round,
         "also_possible": list(finding.also_possible),
-        "record_next": CAUSES[look.cause].record_next,
+        "record_next": words.planned(planned, CAUSES[look.cause].record_next),
+        "next_record": planned,
         "gain": held_out,
         **({} if reason is None else {"gain_reason": reason}),
         "inflation": dict(factors),
