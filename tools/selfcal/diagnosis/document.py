@@ -12,7 +12,7 @@ from selfcal.adequacy.document import recording_entry
 from selfcal.base import units as unit_module
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError
-from selfcal.diagnosis import findable, words
+from selfcal.diagnosis import words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
@@ -66,7 +66,11 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
             | ({"left_out_of_model": NO_ROOM} if any(finding is each for each in out) else {})
             for finding in one.by_gain
         ],
-        **({} if first is None else {"only_in_means": [_finding(one, first.record, factor, unit, first.state) for one in only]}),
+        **(
+            {}
+            if first is None
+            else {"only_in_means": [_finding(one, first.record, factor, unit, first.state) for one in only]}
+        ),
         "not_found": _not_found(one, record, factor, unit),
         "not_judged": _not_judged(one, record),
         "discrepancies": [
@@ -160,16 +164,24 @@ def _plausibility(look: Look) -> str:
 
 
 def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
+    """Causes that have a size: half of the records with it would have been named."""
+    named = {finding.look.cause for finding in one.findings}
+    looked = {id: cause.least for id, cause in CAUSES.items() if cause.least is not None and id not in named}
     try:
-        rows = findable.not_found(one.state, record, {finding.look.cause for finding in one.findings})
+        sizes = {id: least(one.state, record) for id, least in looked.items()}
     except Stopped:
         return []
-    for row in rows:
-        sizes = row["would_have_been_found"]
-        row["would_have_been_found"] = {
-            key: _in_unit(value, one.state.unit, factor, unit) for key, value in sizes.items()
+    inner = one.state.unit
+    return [
+        {
+            "cause": id,
+            "would_have_been_found": {
+                key: _in_unit({"value": value, "unit": own}, inner, factor, unit) for key, (value, own) in size.items()
+            },
         }
-    return rows
+        for id, size in sizes.items()
+        if size
+    ]
 
 
 def _not_judged(one: Diagnosed, record: Record) -> list[dict[str, str]]:

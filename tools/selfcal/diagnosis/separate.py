@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
 
 import numpy as np
-from scipy.signal import lfilter
 from scipy.special import logsumexp
 
 from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.statistics import states_of
 from selfcal.likelihood.columns import Shape, grids_of
 from selfcal.likelihood.fit import Fit, Series, ln_likelihood, run
 from selfcal.likelihood.state import Look, Regressor, State
@@ -29,10 +29,8 @@ from selfcal.model.forms import NUMBER, curved, formed, slope
 NATS, SHARE, DRAWN = 10.0, 0.9, 40
 #: Sizes of the drift over the one that is fitted without either rival: e to these.
 SIZES = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
-#: Shortest period of a cycle, s: a chamber follows no faster. Samples of a period; the longest record over the first.
-PERIOD_S, SAMPLES, LONGEST = 600.0, 32, 4
-#: Cycles from the lowest to the highest value, over what the first record had.
-SWINGS = (0.5, 1.0, 2.0, 4.0)
+#: Samples in the time of the first record, and the length of the longest planned one over it.
+SAMPLES, LONGEST = 128, 4
 
 
 @dataclass(frozen=True)
@@ -95,31 +93,32 @@ def _known(shape: Shape, state: State) -> Rival:
     k = len(found)
     shapes = shape.near(list(product(*(one[k :: 2 * k] for one in found)))) if found else [shape]
     blocks = [np.array([column.values for column in one.regressors]) for one in shapes]
-    sums = [list(state.beside(state.best.terms, state.best.shrunk(-size).theta, blocks)) for size in SIZES]
-    solved = [[one.coefficients() for one in each] for each in sums]
-    mean = np.array([[c for c, _, _ in each] for each in solved])
-    G = np.array([[one.G[1:, 1:] * one.n / rss for one, (_, _, rss) in zip(*both)] for both in zip(sums, solved)])
-    information = G + 1e-9 * np.eye(mean.shape[-1]) * G
+    drifts = [state.best.shrunk(-size) for size in SIZES]
+    sums = [list(state.beside(one.terms, one.theta, blocks)) for one in drifts]
+    mean = np.array([[one.coefficients()[0] for one in each] for each in sums])
+    G = np.array([[one.G[1:, 1:] * one.n / one.coefficients()[2] for one in each] for each in sums])
+    known = np.all(np.diagonal(G, axis1=2, axis2=3) > 0.0, axis=2)  # else the model has the column
+    unit = np.eye(mean.shape[-1])
+    information = np.where(np.expand_dims(known, (2, 3)), G * (1.0 + 1e-9 * unit), unit)
     ln_weight = np.array([[ln_likelihood(one) for one in each] for each in sums])
-    ln_weight -= 0.5 * np.linalg.slogdet(information)[1]
+    ln_weight = np.where(known, ln_weight - 0.5 * np.linalg.slogdet(information)[1], -math.inf)
     return Rival(tuple(one.regressors for one in shapes), mean, information, np.exp(ln_weight - logsumexp(ln_weight)))
 
 
 def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any]:
     """The shortest record that tells two rivals apart, with the smallest cycle that suffices in the time of the first
-    record."""
+    record. A cycle takes a quarter of that time or more: of faster changes the first record says little."""
     causes = {name: cause for cause, name in record.channel_names.items()}
     taken = {str(one.entry["column"]) for rival in (a, b) for one in rival.columns[0] if "column" in one.entry}
     drives = [name for name in causes if name in taken] if taken <= set(causes) else []
     span = record.present.size / record.rate_hz
-    periods = [span / 2.0**k for k in range(8) if k == 0 or span / 2.0**k >= PERIOD_S]
     plan: dict[str, Any] = {"drive": None, "amplitude": None, "unit": None, "period_s": None, "duration_s": None}
     plan |= {"between": [], "expected_nats": 0.0}
-    for wider in SWINGS if drives else (0.0,):
-        for drive, period_s in product(drives, periods) if drives else [("", span)]:
+    for wider in (0.5, 1.0, 2.0, 4.0) if drives else (0.0,):
+        for drive, period_s in product(drives or [""], (span, span / 2.0, span / 4.0) if drives else (span,)):
             swing = float(f"{wider * float(np.ptp(record.channels[causes[drive]])):.1e}") if drive else 0.0
             planned = _drawn(a, b, state, record, drive, swing, period_s)
-            for share in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64):
+            for share in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
                 duration_s = share * (period_s if drive else span / 8.0)
                 if duration_s > LONGEST * span or duration_s >= (plan["duration_s"] or math.inf):
                     break
@@ -141,17 +140,18 @@ def _drawn(a: Rival, b: Rival, state: State, record: Record, drive: str, swing: 
     """The longest record in which a channel is cycled and the others are held. The part stays switched on after the
     first record."""
     span = record.present.size / record.rate_hz
-    dt = max(1.0 / record.rate_hz, min(period_s, span / 4.0) / SAMPLES)
-    n = round(LONGEST * span / dt)
+    dt = span / SAMPLES
+    n = LONGEST * SAMPLES
     passed = (np.arange(n) + 0.5) * dt
     random = np.random.default_rng(1)
-    values = {name: np.full(n, _middle(record.channels[cause])) for cause, name in record.channel_names.items()}
+    held = {name: record.channels[cause] for cause, name in record.channel_names.items()}
+    values = {name: np.full(n, 0.5 * (one.min() + one.max())) for name, one in held.items()}
     if drive:
         values[drive] -= 0.5 * swing * np.cos(2.0 * math.pi * passed / period_s)
     for name, other in record.axes.items():  # an axis at rest is its own noise
         steps = random.standard_normal((2, n)) * [[other.best.N / math.sqrt(dt)], [other.best.K * math.sqrt(dt)]]
         values[name] = steps[0] + steps[1].cumsum()
-    t = passed + record.since_power_on_s + record.start_s + span
+    t = np.asarray(passed + (record.since_power_on_s + record.start_s + span), np.float64)
     rows = [np.array([[_column(one, values, t, dt) for one in each] for each in rival.columns]) for rival in (a, b)]
     drifts = [_drift(state.best.shrunk(-size), dt) for size in SIZES]
     readings = []
@@ -161,7 +161,7 @@ def _drawn(a: Rival, b: Rival, state: State, record: Record, drive: str, swing: 
             d, place = divmod(int(chosen), p.shape[1])
             spread = np.linalg.inv(np.linalg.cholesky(rival.information[d, place])).T
             c = rival.mean[d, place] + spread @ random.standard_normal(len(spread))
-            readings.append(c @ columns[place] + _noise(*drifts[d], dt, n, random))
+            readings.append(c @ columns[place] + _noise(drifts[d], dt, n, random))
     series = Series(
         np.zeros(n), dt, np.ones(n), np.vstack([np.ones(n), *(one.reshape(-1, n) for one in rows), *readings])
     )
@@ -170,19 +170,11 @@ def _drawn(a: Rival, b: Rival, state: State, record: Record, drive: str, swing: 
     return Planned(dt, white, np.array([np.log(s * sigma**2) for (_, _, s), sigma in passes]))
 
 
-def _noise(terms: Terms, theta: Array, sigma: float, dt: float, n: int, random: np.random.Generator) -> Array:
-    """[n]: white noise and a drift whose terms are all of first order."""
-    m = matrices(terms, theta, dt, n * dt)
-    found = random.standard_normal(n)
-    for k, decay in enumerate(np.diag(m.F)):
-        steps = math.sqrt(m.Q[k, k]) * random.standard_normal(n)
-        steps[0] = math.sqrt(m.P0[k, k]) * random.standard_normal()
-        found += m.h[k] * lfilter([1.0], [1.0, -decay], steps)
-    return sigma * found
-
-
-def _middle(values: Array) -> float:
-    return 0.5 * float(values.min() + values.max())
+def _noise(drift: tuple[Terms, Array, float], dt: float, n: int, random: np.random.Generator) -> Array:
+    """[n]: white noise and a drift."""
+    terms, theta, sigma = drift
+    states = states_of(matrices(terms, theta, dt, n * dt), np.ones(n), random)
+    return np.asarray(sigma * (random.standard_normal(n) + states))
 
 
 def _column(column: Regressor, values: Mapping[str, Array], t: Array, dt: float) -> Array:
@@ -191,7 +183,7 @@ def _column(column: Regressor, values: Mapping[str, Array], t: Array, dt: float)
     if entry["kind"] == "turn_on":
         return np.exp(-t / float(entry["tau_s"]))
     if entry["kind"] == "time":
-        return t - t.mean()
+        return np.asarray(t - t.mean())
     channel, form = values[str(entry["column"])], str(entry.get("form", "static"))
     if form == "free":
         return curved(channel, entry["knots"])
@@ -202,9 +194,9 @@ def _column(column: Regressor, values: Mapping[str, Array], t: Array, dt: float)
 
 def _drift(at: Fit, dt: float) -> tuple[Terms, Array, float]:
     """The drift of a fit at samples of `dt` s: its terms, their parameters, and the white noise of a sample."""
-    terms = Terms(walk=at.terms.walk, markov=at.terms.markov, flicker=at.terms.flicker)
+    terms = replace(at.terms, color="", bands=())
     longer = math.log(dt / at.dt)
-    grows = {"ln_rho": longer, "ln_markov": 0.5 * longer, "ln_flicker": 0.5 * longer}
+    grows = {"ln_rho": longer} | dict.fromkeys(("ln_markov", "ln_flicker", "ln_swing"), 0.5 * longer)
     theta = np.array([at.value(name) + grows.get(name, 0.0) for name in terms.names])
     return terms, theta, (at.N_of_color if at.terms.color else at.N) / math.sqrt(dt)
 

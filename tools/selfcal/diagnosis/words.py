@@ -245,7 +245,7 @@ def planned(record: Mapping[str, Any] | None, else_: str) -> str:
         return else_
     rivals = " and ".join(record["between"]).replace("_", " ")
     if record["duration_s"] is None:
-        return f"{else_} No cycle that was tried tells {rivals} apart."
+        return f"{else_} No record that was tried tells {rivals} apart."
     length = duration_words(record["duration_s"])
     if record["drive"] is None:
         begin = f"Leave it on, with all else still, and record {length}."
