@@ -34,6 +34,7 @@ class Part:
     def __post_init__(self) -> None:
         self.random = np.random.default_rng([61, 5, self.seed, *map(ord, self.pair + self.true)])
         self.tau_s = self.random.uniform(400.0, 900.0)
+        self.slow_s = self.random.uniform(2500.0, 3500.0)
         self.size = self.random.uniform(0.8, 1.25) * self.random.choice([-1.0, 1.0])
         self.width = self.random.uniform(0.2, 0.6)
         if self.pair == "static, rate":
@@ -42,10 +43,10 @@ class Part:
     def acts(self, t: Array, values: Mapping[str, Array], step: float) -> Array:
         """Of the true rival, `t` s from power-on."""
         if self.true == "turn_on":
-            tau, size = (4000.0, 0.5) if self.pair == "turn_on, ramp" else (self.tau_s, 0.18)
+            tau, size = (self.slow_s, 0.3) if self.pair == "turn_on, ramp" else (self.tau_s, 0.18)
             return self.size * size * np.exp(-t / tau)
         if self.true == "ramp":
-            return self.size * 5e-5 * t
+            return self.size * 4e-5 * t
         if self.true == "supply":
             return self.size * (0.4 if self.pair == "supply, ramp" else 0.6) * values["supply"]
         if self.true == "rate":
@@ -117,7 +118,7 @@ def columns(rival: str, readings: Mapping[str, Array], begin_s: float) -> Array:
     """[places, n]: what a rival may look like in a record."""
     t = begin_s + means(readings["t[s]"] + 0.5)
     if rival == "turn_on":
-        return np.exp(-t / np.geomspace(100.0, 20000.0, 25)[:, None])
+        return np.exp(-t / np.geomspace(100.0, FIRST_S, 20)[:, None])
     if rival == "ramp":
         return t[None] / 1000.0
     if rival == "supply":

@@ -164,7 +164,7 @@ def shape_of(channel: Channel, state: State, form: str, number: float, width_s: 
     numbers = {part: {NUMBER[part]: number} if part in NUMBER else {} for part in parts}
     found = tuple(regressor(part, values(part), **numbers[part]) for part in parts)
     keys = tuple((KEYS.get(form_of(one)[2], "coefficient"), coefficient_unit(state.unit, one.unit)) for one in found)
-    rows = np.array([one.values for one in found])
+    rows = np.array([one.values for one in found]).reshape(-1, channel.values.size)
     if form == "first_order":
         value, late = rows
         rows = np.array([late, (value - late) / number])

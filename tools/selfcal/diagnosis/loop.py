@@ -264,6 +264,8 @@ def _give(
     of the event in the module; `span`: of the means that show it, s."""
     own = {name: _between(states[name], event.passing, span) for name in event.names}
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
+    # An axis whose model has the column already has no look.
+    looks = {name: look for name, look in looks.items() if look.shape is None or look.shape.regressors}
     looks = tilt.of_steps(looks, {**states, **own})
     if sum(look.gain for look in looks.values()) < EVIDENT:  # what the axes know by now explains it
         return
