@@ -34,7 +34,6 @@ class Part:
     def __post_init__(self) -> None:
         self.random = np.random.default_rng([61, 5, self.seed, *map(ord, self.pair + self.true)])
         self.tau_s = self.random.uniform(400.0, 900.0)
-        self.slow_s = self.random.uniform(2500.0, 3500.0)
         self.size = self.random.uniform(0.8, 1.25) * self.random.choice([-1.0, 1.0])
         self.width = self.random.uniform(0.2, 0.6)
         if self.pair == "static, rate":
@@ -43,10 +42,11 @@ class Part:
     def acts(self, t: Array, values: Mapping[str, Array], step: float) -> Array:
         """Of the true rival, `t` s from power-on."""
         if self.true == "turn_on":
-            tau, size = (self.slow_s, 0.3) if self.pair == "turn_on, ramp" else (self.tau_s, 0.18)
-            return self.size * size * np.exp(-t / tau)
+            if self.pair == "turn_on, ramp":
+                return self.size * 0.3 * np.exp(-t / (1700.0 + 2.0 * self.tau_s))
+            return self.size * 0.18 * np.exp(-t / self.tau_s)
         if self.true == "ramp":
-            return self.size * 4e-5 * t
+            return self.size * (4e-5 if self.pair == "turn_on, ramp" else 5e-5) * t
         if self.true == "supply":
             return self.size * (0.4 if self.pair == "supply, ramp" else 0.6) * values["supply"]
         if self.true == "rate":
