@@ -44,16 +44,6 @@ class Rival:
     probability: Array
 
 
-@dataclass(frozen=True)
-class Planned:
-    """A record that may come next, of n samples of `dt` s: the columns of both rivals, and readings drawn under each,
-    behind the filter of every drift [d, n, 1 + m + 2 DRAWN], and ln of the variance of each sample [d, n]."""
-
-    dt: float
-    white: Array
-    ln_variance: Array
-
-
 def next_record(look: Look, rivals: Sequence[Look], beside: State, record: Record) -> dict[str, Any] | None:
     """The shortest record by which a look differs from the rival that takes longest; None where it has no rival with a
     shape. `beside`: the model less the columns of the look. `duration_s` is None where no record suffices."""
@@ -117,14 +107,16 @@ def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any
     for wider in (0.5, 1.0, 2.0, 4.0) if drives else (0.0,):
         for drive, period_s in product(drives or [""], (span, span / 2.0, span / 4.0) if drives else (span,)):
             swing = float(f"{wider * float(np.ptp(record.channels[causes[drive]])):.1e}") if drive else 0.0
-            planned = _drawn(a, b, state, record, drive, swing, period_s)
+            white, ln_variance = _drawn(a, b, state, record, drive, swing, period_s)
             for share in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
                 duration_s = share * (period_s if drive else span / 8.0)
                 if duration_s > LONGEST * span or duration_s >= (plan["duration_s"] or math.inf):
                     break
-                nats = _differences(a, b, planned, round(duration_s / planned.dt))
+                samples = round(SAMPLES * duration_s / span)
+                nats = _differences(a, b, white[:, :samples], ln_variance[:, :samples])
                 least = float(nats.mean(axis=1).min())
                 if np.mean(nats >= NATS, axis=1).min() < SHARE:
+                    plan["expected_nats"] = plan["expected_nats"] if plan["duration_s"] else least
                     continue
                 plan |= {"duration_s": duration_s, "expected_nats": least}
                 if drive:
@@ -136,9 +128,12 @@ def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any
     return plan
 
 
-def _drawn(a: Rival, b: Rival, state: State, record: Record, drive: str, swing: float, period_s: float) -> Planned:
-    """The longest record in which a channel is cycled and the others are held. The part stays switched on after the
-    first record."""
+def _drawn(
+    a: Rival, b: Rival, state: State, record: Record, drive: str, swing: float, period_s: float
+) -> tuple[Array, Array]:
+    """The longest record in which a channel is cycled and the others are held, [d, n, 1 + m + 2 DRAWN]: a level, the
+    columns of both rivals, and readings drawn under each, behind the filter of every drift; ln of their variances [d,
+    n]. The part stays switched on after the first record."""
     span = record.present.size / record.rate_hz
     dt = span / SAMPLES
     n = LONGEST * SAMPLES
@@ -167,7 +162,7 @@ def _drawn(a: Rival, b: Rival, state: State, record: Record, drive: str, swing: 
     )
     passes = [(run(series, terms, theta, innovations=True), sigma) for terms, theta, sigma in drifts]
     white = np.array([white[:, 1:] / sigma for (_, white, _), sigma in passes])
-    return Planned(dt, white, np.array([np.log(s * sigma**2) for (_, _, s), sigma in passes]))
+    return white, np.array([np.log(s * sigma**2) for (_, _, s), sigma in passes])
 
 
 def _noise(drift: tuple[Terms, Array, float], dt: float, n: int, random: np.random.Generator) -> Array:
@@ -201,11 +196,10 @@ def _drift(at: Fit, dt: float) -> tuple[Terms, Array, float]:
     return terms, theta, (at.N_of_color if at.terms.color else at.N) / math.sqrt(dt)
 
 
-def _differences(a: Rival, b: Rival, planned: Planned, samples: int) -> Array:
-    """Evidence for the true rival over the other one in the first samples of the drawn records, nats [2, DRAWN]."""
-    white = planned.white[:, :samples]
+def _differences(a: Rival, b: Rival, white: Array, ln_variance: Array) -> Array:
+    """Evidence for the true rival over the other one in the drawn records of `_drawn`, nats [2, DRAWN]."""
     G = white.transpose(0, 2, 1) @ white
-    ln_det = planned.ln_variance[:, :samples].sum(axis=1) + np.log(G[:, 0, 0])
+    ln_det = ln_variance.sum(axis=1) + np.log(G[:, 0, 0])
     G = G - G[:, :, :1] * G[:, :1, :] / G[:, :1, :1]  # less the bias
     first = a.mean.shape[1] * a.mean.shape[2]
     squares = np.diagonal(G, axis1=1, axis2=2)[:, -2 * DRAWN :] + ln_det[:, None]
