@@ -39,7 +39,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--records", type=int, default=10, help="first records of each truth")
     parser.add_argument("--again", type=int, default=2, help="next records of each plan")
-    parser.add_argument("--most", type=int, default=60, help="records drawn at most until so many are confused")
+    parser.add_argument("--most", type=int, default=40, help="records drawn at most until so many are confused")
     parser.add_argument("--pairs", nargs="+", default=list(PAIRS))
     parser.add_argument("--verbose", action="store_true")
     given = parser.parse_args()
