@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from selfcal.diagnosis import module
 from selfcal.diagnosis.causes import tilt
-from selfcal.diagnosis.finding import Finding
-from selfcal.diagnosis.loop import diagnose_record
+from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.loop import _give, diagnose_record
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.joint import Joint, act, course, information
 from selfcal.likelihood.state import Look, State, interval
@@ -170,6 +170,22 @@ def test_a_recorded_temperature_comes_before_a_hidden_quantity() -> None:
     assert found.hidden is None
     assert {event.cause for event in found.events} == {"temperature"}
     assert found.events[0].act.axes == [0, 1, 2, 3, 4]
+
+
+def test_a_column_that_an_axis_has_is_no_event_again() -> None:
+    """A noisy thermometer is two events: means of 1 s and of 30 s show it. The second one is the column of the first
+    one, and ended in a traceback."""
+    random = np.random.default_rng(3)
+    temp = 25.0 + 0.1 * random.standard_normal(400).cumsum()
+    y = 3.0 * (temp - 25.0) + random.standard_normal(400)
+    state = State("gx", "deg/s", y, 1.0, 0.0, np.ones(400)).refit()
+    record = Record(1.0, {"gx": state}, {"temperature": temp}, {"temperature": "temp"}, np.ones(400, bool))
+    found = {"gx": Diagnosed(state, state, record)}
+    states = {"gx": state}
+    for number, width_s in enumerate((1.0, 30.0), 1):
+        _give(record, found, states, module.Event(("gx",), "temperature", (0.0, width_s), 20.0), number, 1.0)
+    (finding,) = found["gx"].findings
+    assert [column.name for column in finding.columns] == ["temperature"]
 
 
 def test_axes_of_their_own_have_no_events() -> None:

@@ -23,9 +23,10 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
 from selfcal.base.output import print_lines
 from selfcal.base.units import duration_words
-from selfcal.batch.plan import LEAST, MOST, SHARE, Wish, part_of
+from selfcal.batch.plan import LEAST, MOST, Wish, part_of
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.response import answer_of
+from selfcal.diagnosis.separate import SHARE
 from selfcal.diagnosis.transfer import Drive, Input, Structure, late
 from selfcal.likelihood.fit import Series, run
 from selfcal.likelihood.state import State

@@ -32,6 +32,7 @@ from selfcal.base.grid import Array
 from selfcal.base.output import plotter, print_lines, save_picture
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
+from selfcal.diagnosis.separate import SHARE
 from selfcal.diagnosis.simulate import truth_of
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import made
@@ -41,8 +42,6 @@ from selfcal.model.tables import make_tables
 from selfcal.show.plot import COLORS
 
 SCHEMA = "selfcal.plan/1"
-#: Share of the records that have what is wanted at the planned length.
-SHARE = 0.9
 #: Bank samples of the shortest record, and of the longest.
 LEAST, MOST = 64, 200_000
 #: Halvings of the last step of the length, in its logarithm.

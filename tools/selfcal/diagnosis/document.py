@@ -12,12 +12,13 @@ from selfcal.adequacy.document import recording_entry
 from selfcal.base import units as unit_module
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError
-from selfcal.diagnosis import findable, words
+from selfcal.diagnosis import words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
-from selfcal.likelihood.state import Look
+from selfcal.diagnosis.separate import next_record
+from selfcal.likelihood.state import Look, State
 from selfcal.logs.recording import SIDE_CHANNELS, Recording
 from selfcal.model.file import MOST_COLUMNS
 from selfcal.model.regressors import coefficient_unit
@@ -61,11 +62,15 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
         **({"unfinished": one.unfinished} if one.unfinished else {}),
         **({"stated": [finding.look.cause for finding in one.stated]} if one.stated else {}),
         "findings": [
-            _finding(finding, record, factor, unit)
+            _finding(finding, record, factor, unit, one.state)
             | ({"left_out_of_model": NO_ROOM} if any(finding is each for each in out) else {})
             for finding in one.by_gain
         ],
-        **({} if first is None else {"only_in_means": [_finding(one, first.record, factor, unit) for one in only]}),
+        **(
+            {}
+            if first is None
+            else {"only_in_means": [_finding(one, first.record, factor, unit, first.state) for one in only]}
+        ),
         "not_found": _not_found(one, record, factor, unit),
         "not_judged": _not_judged(one, record),
         "discrepancies": [
@@ -90,8 +95,9 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
     }
 
 
-def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict[str, Any]:
+def _finding(finding: Finding, record: Record, factor: float, unit: str, final: State) -> dict[str, Any]:
     look = finding.look
+    beside = finding.before if finding.record is not None else final.without({one.name for one in finding.columns})
     record = finding.record or record
     inner = finding.before.unit
     try:
@@ -99,6 +105,10 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
         held_out, reason = deepcopy(known.gain), known.reason
     except Stopped:
         held_out, reason = None, "there was no time left to measure it"
+    try:
+        planned = next_record(look, finding.rivals, beside, record)
+    except Stopped:
+        planned = None
     if held_out is not None:
         held_out["bias_rmse"]["unit"] = unit
         for row in held_out["bias_rmse"]["horizon_s"].values():
@@ -119,7 +129,8 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str) -> dict
         "when": later(list(look.when), record.start_s) if look.when else None,
         "found_in_round": finding.round,
         "also_possible": list(finding.also_possible),
-        "record_next": CAUSES[look.cause].record_next,
+        "record_next": words.planned(planned, CAUSES[look.cause].record_next),
+        "next_record": planned,
         "gain": held_out,
         **({} if reason is None else {"gain_reason": reason}),
         "inflation": dict(factors),
@@ -153,16 +164,24 @@ def _plausibility(look: Look) -> str:
 
 
 def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
+    """Causes that have a size: half of the records with it would have been named."""
+    named = {finding.look.cause for finding in one.findings}
+    looked = {id: cause.least for id, cause in CAUSES.items() if cause.least is not None and id not in named}
     try:
-        rows = findable.not_found(one.state, record, {finding.look.cause for finding in one.findings})
+        sizes = {id: least(one.state, record) for id, least in looked.items()}
     except Stopped:
         return []
-    for row in rows:
-        sizes = row["would_have_been_found"]
-        row["would_have_been_found"] = {
-            key: _in_unit(value, one.state.unit, factor, unit) for key, value in sizes.items()
+    inner = one.state.unit
+    return [
+        {
+            "cause": id,
+            "would_have_been_found": {
+                key: _in_unit({"value": value, "unit": own}, inner, factor, unit) for key, (value, own) in size.items()
+            },
         }
-    return rows
+        for id, size in sizes.items()
+        if size
+    ]
 
 
 def _not_judged(one: Diagnosed, record: Record) -> list[dict[str, str]]:

@@ -283,6 +283,7 @@ def _entry(event: Event) -> dict[str, Any]:
         }
         counted = list(pairs.values()) if CAUSES[event.cause].grouping.pairs else event.members
         gain = sum(member.finding.look.gain for member in counted)
+        longest = max(rows, key=lambda row: (row["next_record"] or {"duration_s": 0.0})["duration_s"] or math.inf)
         entry = {
             "cause": event.cause,
             "estimate": _common([row["estimate"] for row in rows]),
@@ -291,7 +292,7 @@ def _entry(event: Event) -> dict[str, Any]:
             "net_nats": min(gain, _worth(counted)),
             "confirmed": _confirmed([row["gain"] for row in rows]),
             "also_possible": list(dict.fromkeys(cause for row in rows for cause in row["also_possible"])),
-            "record_next": rows[0]["record_next"],
+            **{key: longest[key] for key in ("record_next", "next_record")},
         }
     on_second = [row.get("gain_on") for row in rows] + [entry.get("gain_on")]
     if any(on_second):

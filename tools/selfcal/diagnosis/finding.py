@@ -25,6 +25,7 @@ class Finding:
     before: State
     after: State
     also_possible: tuple[str, ...] = ()
+    rivals: tuple[Look, ...] = ()
     partner: State | None = None
     held_out: HeldOut | None = None
     event: int = 0

@@ -164,7 +164,7 @@ def shape_of(channel: Channel, state: State, form: str, number: float, width_s: 
     numbers = {part: {NUMBER[part]: number} if part in NUMBER else {} for part in parts}
     found = tuple(regressor(part, values(part), **numbers[part]) for part in parts)
     keys = tuple((KEYS.get(form_of(one)[2], "coefficient"), coefficient_unit(state.unit, one.unit)) for one in found)
-    rows = np.array([one.values for one in found])
+    rows = np.array([one.values for one in found]).reshape(-1, channel.values.size)
     if form == "first_order":
         value, late = rows
         rows = np.array([late, (value - late) / number])
@@ -280,18 +280,19 @@ def _look(state: State, channel: Channel) -> list[Look]:
         chosen = replace(chosen, gain=chosen.gain - plain)
         if chosen.net < 1.0:
             return []
-    rivals = [one.shape.form for one in alike if one.shape.form != chosen.shape.form]
+    rivals = tuple(one.shape for one in alike if one.shape.form != chosen.shape.form)
     chosen = curve.best(state, chosen, chosen.shape.regressors[0].values) if chosen.shape.form == FREE else chosen
     before, chosen = _whole(state, channel, chosen)
     if before is state:
-        return [_of_shape(state, channel, chosen, {"form_also_possible": rivals} if rivals else {})]
-    return [replace(_of_shape(before, channel, chosen, {}), before=before)]
+        return [_of_shape(state, channel, chosen, rivals)]
+    return [replace(_of_shape(before, channel, chosen), before=before)]
 
 
-def _of_shape(state: State, channel: Channel, chosen: Tried, more: Mapping[str, Any]) -> Look:
+def _of_shape(state: State, channel: Channel, chosen: Tried, rivals: tuple[Shape, ...] = ()) -> Look:
     """The look at a form; of a channel with noise of its own the size is of the channel without it."""
+    more = {"form_also_possible": [one.form for one in rivals]} if rivals else {}
     shape = replace(chosen.shape, stated={**chosen.shape.stated, **more})
-    found = columns.look(state, channel.cause, replace(chosen, shape=shape))
+    found = replace(columns.look(state, channel.cause, replace(chosen, shape=shape)), rivals=rivals)
     return replace(found, measure=partial(_noiseless, channel, shape)) if channel.noisy else found
 
 

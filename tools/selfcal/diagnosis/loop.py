@@ -264,6 +264,8 @@ def _give(
     of the event in the module; `span`: of the means that show it, s."""
     own = {name: _between(states[name], event.passing, span) for name in event.names}
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
+    # An axis whose model has the column already has no look.
+    looks = {name: look for name, look in looks.items() if look.shape is None or look.shape.regressors}
     looks = tilt.of_steps(looks, {**states, **own})
     if sum(look.gain for look in looks.values()) < module.NAMED:  # what the axes know by now explains it
         return
@@ -381,15 +383,14 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
                 (one.dropped if _free(best) else one.harmful).append(best)
                 looks = [look for look in looks if not look.repeats(best)]
         idle = idle | set(waiting) if len(one.findings) >= BUSY else set()
-        rivals = tuple(
-            dict.fromkeys(look.cause for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
-        )
+        rivals = tuple(look for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
+        possible = tuple(dict.fromkeys(look.cause for look in rivals))
         one.state = after
         replaced = [finding for finding in one.findings if _gone(finding, after)]
         best = replace(best, gain=best.gain + sum(finding.look.gain for finding in replaced))
         best = replace(best, net=best.net + sum(finding.look.net for finding in replaced))
         one.findings = [finding for finding in one.findings if not _gone(finding, after)]
-        one.findings.append(Finding(best, number, before, after, rivals, held_out=known))
+        one.findings.append(Finding(best, number, before, after, possible, rivals, held_out=known))
         number += 1
 
 

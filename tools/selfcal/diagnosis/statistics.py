@@ -308,7 +308,7 @@ def simulated(state: State, random: np.random.Generator) -> Array:
         white = max(fit.sigma**2 * m.R - state.lsb**2 / 12.0, (0.05 * fit.sigma) ** 2 * m.R)
     lost = fit.sigma**2 * m.lost * (state.r - 1.0)
     y = np.sqrt(np.maximum(white * state.r + lost, 0.1 * white * state.r)) * random.standard_normal(n)
-    y += _states(m, np.sqrt(state.r), random) * fit.sigma
+    y += states_of(m, np.sqrt(state.r), random) * fit.sigma
     y += fit.c @ state.series.columns
     if fit.quantized:
         y = _counted(y, fit, random, means=state.redrawn)
@@ -330,7 +330,7 @@ def _counted(y: Array, fit: Fit, random: np.random.Generator, *, means: bool) ->
     return np.asarray((np.diff(total, prepend=0.0) - gain) * step)
 
 
-def _states(m: Matrices, level: Array, random: np.random.Generator) -> Array:
+def states_of(m: Matrices, level: Array, random: np.random.Generator) -> Array:
     """h x over n steps; `level` [n] scales white noise with memory. Small blocks: each is filtered by itself."""
     from scipy.signal import lfilter
 

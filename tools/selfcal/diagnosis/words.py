@@ -6,8 +6,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from selfcal.base.units import duration_words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import ROUNDS
+from selfcal.diagnosis.separate import NATS
 
 
 def verdict(axis: Mapping[str, Any]) -> str:
@@ -232,9 +234,25 @@ def action(finding: Mapping[str, Any]) -> str:
     if "readings_hz" in finding["estimate"]:
         return f"Look for what turns or switches at {finding['estimate']['readings_hz']['median']:.3g} Hz."
     known = [one["estimate"].get("coefficient") for one in finding["axes"].values()]
-    if "source" not in finding["estimate"] and all(map(_sure, known)):
+    if not finding.get("next_record") and "source" not in finding["estimate"] and all(map(_sure, known)):
         return f"Apply it: it is known to {100.0 * APPLIED:.0f} %. --write-model states it."
     return str(finding["record_next"])
+
+
+def planned(record: Mapping[str, Any] | None, else_: str) -> str:
+    """The next record in words; without one the advice of the cause."""
+    if record is None:
+        return else_
+    rivals = " and ".join(record["between"]).replace("_", " ")
+    if record["duration_s"] is None:
+        return f"{else_} No record that was tried tells {rivals} apart."
+    length = duration_words(record["duration_s"])
+    if record["drive"] is None:
+        begin = f"Leave it on, with all else still, and record {length}."
+    else:
+        swing, period = f"{record['amplitude']:g} {record['unit']}", duration_words(record["period_s"])
+        begin = f"Leave it on and cycle the {record['drive']} by {swing} with a period of {period} for {length}."
+    return f"{begin} Then {rivals} differ by {NATS:g} nats."
 
 
 def _sure(coefficient: Mapping[str, Any] | None) -> bool:

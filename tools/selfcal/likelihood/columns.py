@@ -192,7 +192,7 @@ def look(state: State, cause: str, chosen: Tried) -> Look:
     """The look at the shape that was chosen."""
     changes = {"regressors": (*state.regressors, *chosen.shape.regressors)}
     measure = partial(measured, chosen.shape)
-    return Look(cause, chosen.gain, chosen.net, _estimate(chosen), changes, measure=measure)
+    return Look(cause, chosen.gain, chosen.net, _estimate(chosen), changes, measure=measure, shape=chosen.shape)
 
 
 def _estimate(chosen: Tried) -> dict[str, Any]:
@@ -209,7 +209,7 @@ def _estimate(chosen: Tried) -> dict[str, Any]:
 def measured(shape: Shape, state: State) -> dict[str, Any]:
     """Posteriors of the coefficients and the numbers, over the drifts, the spread of their parameters, and each other.
     The prior of a number is flat in its logarithm, that of a coefficient is flat."""
-    grids = _grids(state, shape)
+    grids = grids_of(state, shape)
     shapes = [shape, *shape.near(list(product(*grids)))] if grids else [shape]
     weight, means, sds = state.posterior(*(one.columns for one in shapes))
     if grids:  # the first one is on the grid as well
@@ -226,7 +226,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
     return found
 
 
-def _grids(state: State, shape: Shape) -> list[Array]:
+def grids_of(state: State, shape: Shape) -> list[Array]:
     """Values of each number that hold its posterior, an even step of the logarithm apart."""
     if not shape.numbers:
         return []

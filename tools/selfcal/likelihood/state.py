@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.special import chdtrc, ndtr
@@ -15,6 +15,9 @@ from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Terms
+
+if TYPE_CHECKING:
+    from selfcal.likelihood.columns import Shape
 
 #: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
 P_LOOK = 5e-4
@@ -282,7 +285,7 @@ class Look:
     """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
     interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be. `measure`: sizes
     beside a model that lacks the look's columns alone. `before`: the state less earlier columns of its channel, which
-    it takes the place of."""
+    it takes the place of. `shape`: of its columns, `rivals`: other forms of it that are as likely."""
 
     cause: str
     gain: float
@@ -295,6 +298,8 @@ class Look:
     others: tuple[str, ...] = ()
     measure: Callable[[State], Mapping[str, Any]] | None = None
     before: State | None = None
+    shape: Shape | None = None
+    rivals: tuple[Shape, ...] = ()
 
     def repeats(self, other: Look) -> bool:
         """Whether both are the same cause of the same channel."""

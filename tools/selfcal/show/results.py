@@ -272,6 +272,7 @@ class Event(Object):
     changes: dict[str, Change]
     also_possible: list[str]
     record_next: str
+    next_record: dict[str, Any] | None
     gain_on: dict[str, Any] | None
     navigation: dict[str, Any] | None
     navigation_reason: str | None
@@ -293,6 +294,7 @@ class Finding(Object):
     of: str
     shared_with: list[str]
     record_next: str | None
+    next_record: dict[str, Any] | None
     gain: dict[str, Any] | None
     gain_reason: str | None
     gain_on: dict[str, Any] | None

@@ -81,8 +81,9 @@ def plan(
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.batch.plan import SCHEMA, SHARE, SWEEP_S, Ensemble, Wish, cycling, picture, rates, refusal
+    from selfcal.batch.plan import SCHEMA, SWEEP_S, Ensemble, Wish, cycling, picture, rates, refusal
     from selfcal.batch.spread import record_seeds
+    from selfcal.diagnosis.separate import SHARE
     from selfcal.logs.recording import list_of
     from selfcal.model.regressors import coefficient_unit
 
@@ -193,8 +194,9 @@ def _response(
     """The document of an input for `response`."""
     from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.batch.design import DRAWN, Experiment, designed
-    from selfcal.batch.plan import SCHEMA, SHARE, Wish
+    from selfcal.batch.plan import SCHEMA, Wish
     from selfcal.batch.spread import record_seeds
+    from selfcal.diagnosis.separate import SHARE
     from selfcal.logs.recording import SIDE_CHANNELS
     from selfcal.model.regressors import coefficient_unit
 
