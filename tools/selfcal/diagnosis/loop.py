@@ -15,7 +15,7 @@ from selfcal.base.ending import Stopped
 from selfcal.base.grid import regridded, runs
 from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
-from selfcal.diagnosis.causes import CAUSES, motion, step, tilt
+from selfcal.diagnosis.causes import CAUSES, motion, tilt
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.forms import side_looks
@@ -23,6 +23,7 @@ from selfcal.diagnosis.record import TIMES, Record, carried
 from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import work
+from selfcal.likelihood.edges import raised
 from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, Regressor, State, interval
 from selfcal.readings.motion import Moved
@@ -335,7 +336,7 @@ def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
     edges = module.sharpened([*times.values()], [state], span)
     begin, end = round(edges[0] / state.dt), round(edges[1] / state.dt) if len(edges) > 1 else n
     entry = {**column.entry, **dict(zip(times, edges, strict=True))}
-    return replace(column, values=step.raised(n, begin, end), entry=entry)
+    return replace(column, values=raised(n, begin, end), entry=entry)
 
 
 def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], state: State) -> Finding:

@@ -66,20 +66,29 @@ class Shape:
 
     columns     [k, n]: those whose coefficients are the estimate's, `keys` with their units.
     regressors  the same space as columns of the model file.
-    price       ln of the number of independent looks of its search.
+    price       ln of the number of independent looks of its search, or that by the gain.
     free        degrees of freedom of its gain.
     numbers     theta, and `moved`, the shape at other numbers.
+    sharper     the best shape beside a fit, in the place of a search among other numbers.
+    where       when or at which frequency it is, by its fit; `when` of a Look.
     stated      what the estimate says beside.
+    measure     its posterior, of a family that knows more of it than `measured` does.
+
+    Fewer keys than columns: the last one is the norm of its coefficients.
     """
 
     form: str
     columns: Array
     regressors: tuple[Regressor, ...]
     keys: tuple[tuple[str, str], ...]
-    price: float = 0.0
+    price: float | Callable[[float], float] = 0.0
     free: int = 1
     numbers: tuple[Number, ...] = ()
     moved: Callable[[Sequence[float]], Shape] | None = None
+    sharper: Callable[[Fit], Shape] | None = None
+    where: Callable[[Fit], Mapping[str, Any]] = field(default=lambda fit: {})
+    when: tuple[float, float] | None = None
+    measure: Callable[[State], Mapping[str, Any]] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -88,7 +97,7 @@ class Shape:
 
     def worth(self, gain: float) -> float:
         """A gain net of the search."""
-        return net(gain, self.free, self.price)
+        return net(gain, self.free, self.price(gain) if callable(self.price) else self.price)
 
     def near(self, thetas: Sequence[Sequence[float]]) -> list[Shape]:
         """The shapes at other numbers, within their limits."""
@@ -140,18 +149,23 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
         better = max((j for j, one in enumerate(shapes) if one.form == best.shape.form), key=lambda j: gains[j])
         if better != k and gains[better] > best.gain:
             best = fitted(state, shapes[better])
-        best = _between(state, best)
-        if slow:
+        best = between(state, best)
+        if slow and best.net >= 1.0:
             best = replace(best, gain=min(best.gain, state.rich_gain(best.shape.columns)))
         done[best.shape.form] = best
     # A form whose score alone is known is fitted by who takes it: only a finding needs that.
     return {form: done[form] for form in dict.fromkeys(one.form for one in shapes) if form in done}
 
 
-def _between(state: State, best: Tried) -> Tried:
+def between(state: State, best: Tried) -> Tried:
     """The best numbers between those of the grid. Where the price is that of the grid alone, they gain nothing."""
+    if best.net <= NEARLY:
+        return best
+    if best.shape.sharper is not None:
+        moved = fitted(state, best.shape.sharper(best.fit))
+        return moved if moved.gain > best.gain else best
     paid, grid = best.shape.free > len(best.shape.columns), best.gain
-    for reach in REACHES if best.shape.numbers and best.net > NEARLY else ():
+    for reach in REACHES if best.shape.numbers else ():
         moves = np.exp2(reach * np.linspace(-1.0, 1.0, 2 * FINER + 1))
         shapes = best.shape.near(
             [[*np.multiply(best.shape.theta, by)] for by in product(moves, repeat=len(best.shape.numbers))]
@@ -170,40 +184,51 @@ def alike(found: Mapping[str, Tried]) -> list[Tried]:
     return sorted(near, key=lambda one: any(number.value > 0.5 * number.high for number in one.shape.numbers))
 
 
-def looks(state: State, cause: str, shapes: Sequence[Shape], dearer: Iterable[Shape] = ()) -> list[Look]:
-    """The look at a slow family, where it is worth one nat. `dearer`: forms that are tried where a first one may be
+def looks(
+    state: State, cause: str, shapes: Sequence[Shape], dearer: Iterable[Shape] = (), *, slow: bool = True
+) -> list[Look]:
+    """The look at a family, where it is worth one nat. `dearer`: forms that are tried where a first one may be
     named."""
-    found = tried(state, shapes, slow=True)
+    found = tried(state, shapes, slow=slow)
     if any(one.net > NEARLY for one in found.values()):
-        found |= tried(state, list(dearer), slow=True)
+        found |= tried(state, list(dearer), slow=slow)
     chosen = alike(found)[0] if found else None
     return [look(state, cause, chosen)] if chosen is not None and chosen.net >= 1.0 else []
 
 
 def located(state: State, cause: str, shape: Shape, known: Mapping[str, Any] | None = None) -> Look:
     """The look at a shape that is known to act: no search is paid for. `known`: posteriors of its numbers."""
-    shape = replace(shape, price=0.0, free=len(shape.columns))
+    shape = replace(shape, price=0.0, free=len(shape.columns), measure=None)
     if known is not None:
         shape = replace(shape, numbers=(), moved=None, stated={**shape.stated, **known})
-    return look(state, cause, fitted(state, shape))
+    found = fitted(state, shape)
+    return look(state, cause, between(state, found) if shape.sharper else found)
 
 
 def look(state: State, cause: str, chosen: Tried) -> Look:
     """The look at the shape that was chosen."""
     changes = {"regressors": (*state.regressors, *chosen.shape.regressors)}
-    measure = partial(measured, chosen.shape)
-    return Look(cause, chosen.gain, chosen.net, _estimate(chosen), changes, measure=measure)
+    measure = chosen.shape.measure or partial(measured, chosen.shape)
+    return Look(cause, chosen.gain, chosen.net, _estimate(chosen), changes, when=chosen.shape.when, measure=measure)
 
 
 def _estimate(chosen: Tried) -> dict[str, Any]:
     """As the fit has it: its coefficients, and the best numbers alone."""
     shape, fit = chosen.shape, chosen.fit
-    places = range(fit.c.size - len(shape.keys), fit.c.size)
-    found = {
-        key: interval(float(fit.c[place]), float(fit.sd[place]), unit)
-        for (key, unit), place in zip(shape.keys, places, strict=True)
-    }
-    return {**found, **{one.key: interval(one.value, 0.0, one.unit) for one in shape.numbers}, **shape.stated}
+    k = len(shape.columns)
+    c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
+    found = {key: interval(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
+    numbers = {one.key: interval(one.value, 0.0, one.unit) for one in shape.numbers}
+    return {**shape.where(fit), **found, **numbers, **shape.stated}
+
+
+def _sizes(shape: Shape, c: Array, sd: Array) -> tuple[Array, Array]:
+    """Coefficients [..., columns] and their deviations as the keys have them."""
+    one = len(shape.keys) - 1
+    if one + 1 == len(shape.columns):
+        return c, sd
+    norm, mean = np.linalg.norm(c[..., one:], axis=-1, keepdims=True), sd[..., one:].mean(axis=-1, keepdims=True)
+    return np.concatenate([c[..., :one], norm], axis=-1), np.concatenate([sd[..., :one], mean], axis=-1)
 
 
 def measured(shape: Shape, state: State) -> dict[str, Any]:
@@ -214,6 +239,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
     weight, means, sds = state.posterior(*(one.columns for one in shapes))
     if grids:  # the first one is on the grid as well
         weight, means, sds = weight[1:], means[1:], sds[1:]
+    means, sds = _sizes(shape, means, sds)
     found = {
         key: mixture(weight.ravel(), means[..., j].ravel(), sds[..., j].ravel(), unit)
         for j, (key, unit) in enumerate(shape.keys)

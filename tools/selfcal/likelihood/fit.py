@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 
 from selfcal import _likelihood
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Mask, Terms, matrices
+from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Mask, Terms, matrices
 
 #: Columns that the compiled filter takes in one pass (bindings/likelihood.cpp).
 COLUMNS_MOST = 39
@@ -159,6 +159,14 @@ class Fit:
         low = np.array(self.terms.limits(self.dt)).reshape(-1, 2)[:, 0]
         return replace(self, theta=np.maximum(self.theta - less, low))
 
+    def of_means(self, block: int, less: float) -> Array:
+        """Its parameters for means of so many samples, sizes of the drift times e to `less`: they are relative to the
+        white noise."""
+        by = {name: 0.5 * math.log(block) for name in DRIFT_SIZES} | {"ln_rho": math.log(block)}
+        low = math.log(SIZE_LIMITS[0])
+        each = zip(self.terms.names, self.theta, strict=True)
+        return np.array([max(value + by[name] + less, low) if name in by else value for name, value in each])
+
     @property
     def N(self) -> float:
         """White noise density, unit/sqrt(Hz)."""
@@ -225,6 +233,15 @@ def passed(
     return G, D, n, x, white, s
 
 
+def whitened(series: Series, terms: Terms, theta: Array) -> Sums:
+    """The sums of a pass over many columns: the filter whitens each by itself."""
+    parts = np.array_split(series.columns, math.ceil(len(series.columns) / COLUMNS_MOST))
+    each = [run(replace(series, columns=part), terms, theta, innovations=True) for part in parts]
+    first = each[0][0][0]
+    white = np.nan_to_num(np.hstack([each[0][1], *(one[1][:, 1:] for one in each[1:])]))
+    return Sums(white.T @ white, first.D, first.n, np.vstack([first.x, *(one[0][0].x[1:] for one in each[1:])]))
+
+
 def _whole(
     columns: Array, of: Callable[[Array], tuple[Array, ...]], by_column: Mapping[int, tuple[int, ...]]
 ) -> tuple[Array, ...]:
@@ -270,7 +287,7 @@ def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
         return tuple(np.asarray(one) for one in found)
 
     G, D, A, B, impulse = _whole(series.columns, of, {0: (0, 1), 3: (1,)})
-    return Shifts(Sums(G, float(D), float(series.n), np.empty(0)), A, B, impulse)
+    return Shifts(Sums(G, float(D), float(series.n), np.empty((len(G), 0))), A, B, impulse)
 
 
 def ln_det(covariance: NDArray[np.floating[Any]]) -> float:

@@ -13,6 +13,7 @@ from scipy.special import chdtrc, ndtr
 
 from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
+from selfcal.base.grid import half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Terms
 
@@ -32,6 +33,8 @@ ALIKE = 3.0
 SCREEN = 2.0
 #: Columns that one pass of the filter takes beside the model's.
 ABREAST = 8
+#: Means of a record that are enough for a first search.
+MEANS_MOST = 3000
 
 
 #: No term beside white noise and the drift.
@@ -83,6 +86,17 @@ class State:
     def series(self) -> Series:
         columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
         return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol, self.block)
+
+    def means(self, longest_s: float = math.inf) -> tuple[Series, int]:
+        """Means of blocks of `longest_s` at most, NaN where half of one is missing, and the samples of a block."""
+        n = self.y.size
+        block = max(1, int(min(n // MEANS_MOST, longest_s / self.dt)))
+        mean, used = half_means(self.y, block)
+        r, columns = (
+            rows[..., : n // block * block].reshape(*rows.shape[:-1], n // block, block).mean(axis=-1)
+            for rows in (self.r, self.series.columns)
+        )
+        return Series(mean, self.dt * block, r * block / np.maximum(used, 1), np.ascontiguousarray(columns)), block
 
     @property
     def best(self) -> Fit:

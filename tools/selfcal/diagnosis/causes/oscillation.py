@@ -18,7 +18,6 @@ import numpy as np
 from selfcal.bank.result import HALF_90
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes import periodic
-from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
@@ -79,12 +78,13 @@ def _line(state: State, record: Record, period: float, gain: float) -> list[Look
     damping. Of the band in which oscillations are looked for."""
     width = 1.0 / (state.y.size * state.dt)
     tried = [1.0 / period + move * width for move in np.linspace(-1.0, 1.0, 17)]
-    gains = state.scores([np.array([*periodic.columns(f, record).values()]) for f in tried])
+    gains = state.scores([np.array([*periodic.pair(f, record).values()]) for f in tried])
     found = periodic.at(state, record, (tried[int(np.argmax(gains))],))
     if found.gain < gain - ALIKE:
         return []
     n = round(2.0 * state.y.size * state.dt / PERIOD_LIMITS[0])
-    return [replace(found, net=periodic.worth_of(found.gain, 1.0 / (period * width), n), others=("oscillation",))]
+    price = float(periodic.ln_lines(np.array(1.0 / (period * width)), n, np.array(found.gain)))
+    return [replace(found, net=net(found.gain, 2, price), others=("oscillation",))]
 
 
 def _sizes(chosen: Fit, unit: str) -> dict[str, Any]:
@@ -97,7 +97,7 @@ def _sizes(chosen: Fit, unit: str) -> dict[str, Any]:
 
 def _search(state: State) -> dict[str, float] | None:
     """ln of period, damping, and size over the white noise of a sample; `less`: of the drift beside it."""
-    series, block = blocks(state, PERIOD_LIMITS[0] / SAMPLES_LEAST)
+    series, block = state.means(PERIOD_LIMITS[0] / SAMPLES_LEAST)
     low = max(PERIOD_LIMITS[0], SAMPLES_LEAST * series.dt)
     high = min(PERIOD_LIMITS[1], series.duration_s / TURNS_LEAST)
     if high < low:
@@ -109,7 +109,7 @@ def _search(state: State) -> dict[str, float] | None:
     period, _, size, less = at
     second = [(period * by, damping, size, less) for by in NEAR for damping in DAMPINGS if low <= period * by <= high]
     at, value = _best_of(state, series, block, second)
-    none = ln_likelihood(run(series, state.best.terms, of_blocks(state.best, block, 0.0))[0][0])
+    none = ln_likelihood(run(series, state.best.terms, state.best.of_means(block, 0.0))[0][0])
     if value - none < LEAST:
         return None
     period, damping, size, less = at
@@ -126,7 +126,7 @@ def _best_of(
 ) -> tuple[tuple[float, float, float, float], float]:
     """The likeliest of period, damping, size and smallness of the drift, and its ln likelihood."""
     terms = replace(state.best.terms, oscillation=True)
-    drift = {less: of_blocks(state.best, block, -less) for less in {one[3] for one in tried}}
+    drift = {less: state.best.of_means(block, -less) for less in {one[3] for one in tried}}
     values = [
         ln_likelihood(run(series, terms, _theta(terms, state.best.terms, drift[less], p, d, s))[0][0])
         for p, d, s, less in tried

@@ -17,10 +17,9 @@ from scipy.special import gammaincinv
 
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
-from selfcal.diagnosis.causes.pulse import blocks, of_blocks
-from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_SLOW
+from selfcal.likelihood.edges import scan
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
 from selfcal.likelihood.statemodel import Array, Mask
 
@@ -92,10 +91,10 @@ def looks(state: State, record: Record) -> list[Look]:
     # Two levels that jump often have the correlation of a Gauss-Markov drift, which leaves no jump to see.
     if scan(state.series, state.best).gain.max() < SCREEN + 2.0 and _law(state) < SCREEN:
         return []
-    series, block = blocks(state)
+    series, block = state.means()
     y = series.y - state.best.c[1:] @ series.columns[1:]
     walk = next(fit for fit in state.fits if fit.terms.walk)
-    ln_rho = of_blocks(walk, block, 0.0)[walk.terms.names.index("ln_rho")]
+    ln_rho = walk.of_means(block, 0.0)[walk.terms.names.index("ln_rho")]
     ln_sigma = math.log(walk.sigma / math.sqrt(block))
     none = _without(y, ln_rho, ln_sigma) + _law(state)
     tried = np.array(
