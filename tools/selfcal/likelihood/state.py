@@ -252,11 +252,12 @@ def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, fl
 
 
 def gain_for(worth: Callable[[float], float]) -> float:
-    """The gain that is worth NET_LEAST after its search, over NET_LEAST."""
-    from scipy.optimize import brentq
-
-    gain = brentq(lambda gain: worth(gain) - NET_LEAST, NET_LEAST / 2.0, 10.0 * NET_LEAST)
-    return float(gain) / NET_LEAST
+    """The gain that is worth NET_LEAST after its search, over NET_LEAST: its price hardly changes with it."""
+    gain, lacks = 0.0, NET_LEAST
+    while abs(lacks) > 1e-6:
+        gain += lacks
+        lacks = NET_LEAST - worth(gain)
+    return gain / NET_LEAST
 
 
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
