@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations, product
+from itertools import product
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -218,52 +219,33 @@ def run(
 def passed(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances."""
+    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances. The filter
+    whitens each column by itself: where they are too many for one pass, G is of the whitened ones."""
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
     at = list(marks) or [series.y.size]
+    parts = _parts(series.columns)
 
     def of(columns: Array) -> tuple[Array, ...]:
         work.count(series.y.size, len(columns))
+        whitened = innovations or len(parts) > 1
         found: tuple[Array, ...] = _likelihood.run(
-            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver, at, innovations
+            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver, at, whitened
         )
         return found
 
-    G, D, n, x, white, s = _whole(series.columns, of, {0: (1, 2), 3: (1,), 4: (1,)})
+    (G, D, n, x, white, s), *more = [of(part) for part in parts]
+    if more:
+        x = np.concatenate([x, *(one[3][:, 1:] for one in more)], axis=1)
+        white = np.concatenate([white, *(one[4][:, 1:] for one in more)], axis=1)
+        pieces = np.split(np.nan_to_num(white), at)[: len(at)]
+        G = np.cumsum([piece.T @ piece for piece in pieces], axis=0)
     return G, D, n, x, white, s
 
 
-def whitened(series: Series, terms: Terms, theta: Array) -> Sums:
-    """The sums of a pass over many columns: the filter whitens each by itself."""
-    parts = np.array_split(series.columns, math.ceil(len(series.columns) / COLUMNS_MOST))
-    each = [run(replace(series, columns=part), terms, theta, innovations=True) for part in parts]
-    first = each[0][0][0]
-    white = np.nan_to_num(np.hstack([each[0][1], *(one[1][:, 1:] for one in each[1:])]))
-    return Sums(white.T @ white, first.D, first.n, np.vstack([first.x, *(one[0][0].x[1:] for one in each[1:])]))
-
-
-def _whole(
-    columns: Array, of: Callable[[Array], tuple[Array, ...]], by_column: Mapping[int, tuple[int, ...]]
-) -> tuple[Array, ...]:
-    """The arrays of a pass over all columns [p, n]. A pass `of` too many is one of every pair of their parts: the
-    filter whitens each column by itself. `by_column`: array by its place -> its axes of length 1 + p."""
-    if len(columns) <= COLUMNS_MOST:
-        return of(columns)
-    parts = np.array_split(np.arange(len(columns)), math.ceil(len(columns) / (COLUMNS_MOST // 2)))
-    whole: list[Array] = []
-    for pair in combinations(parts, 2):
-        chosen = np.concatenate(pair)
-        found = of(np.ascontiguousarray(columns[chosen]))
-        rows = np.concatenate([[0], 1 + chosen])
-        if not whole:
-            whole = [one.copy() for one in found]
-            for place, axes in by_column.items():
-                shape = [1 + len(columns) if axis in axes else size for axis, size in enumerate(found[place].shape)]
-                whole[place] = np.zeros(shape)
-        for place, axes in by_column.items():
-            at = [rows if axis in axes else np.arange(size) for axis, size in enumerate(whole[place].shape)]
-            whole[place][np.ix_(*at)] = found[place]
-    return tuple(whole)
+def _parts(columns: Array) -> list[Array]:
+    """Columns [p, n] as the filter takes them."""
+    count = math.ceil(len(columns) / COLUMNS_MOST)
+    return [columns] if count == 1 else [np.ascontiguousarray(part) for part in np.array_split(columns, count)]
 
 
 @dataclass(frozen=True)
@@ -282,11 +264,12 @@ def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
     """One pass of the filter, and one backwards over its gains: exact beside gaps, and where the noise changes."""
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
 
-    def of(columns: Array) -> tuple[Array, ...]:
-        found = _likelihood.shifts(series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver)
-        return tuple(np.asarray(one) for one in found)
-
-    G, D, A, B, impulse = _whole(series.columns, of, {0: (0, 1), 3: (1,)})
+    parts = _parts(series.columns)
+    each = [_likelihood.shifts(series.y, part, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver) for part in parts]
+    G, D, A, B, impulse = each[0]
+    if len(parts) > 1:
+        G = run(series, terms, theta)[0][0].G
+        B = np.concatenate([B, *(one[3][:, 1:] for one in each[1:])], axis=1)
     return Shifts(Sums(G, float(D), float(series.n), np.empty((len(G), 0))), A, B, impulse)
 
 
@@ -568,8 +551,8 @@ def best(fits: Sequence[Fit]) -> Fit:
     return max(fits, key=lambda one: one.ln_likelihood)
 
 
-def moved(fit_: Fit, terms: Terms) -> Array:
-    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small."""
-    known = dict(zip(fit_.terms.names, fit_.theta, strict=True))
+def moved(fit_: Fit, terms: Terms, own: Mapping[str, float] = MappingProxyType({})) -> Array:
+    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small, or as `own`."""
+    known = {**dict(zip(fit_.terms.names, fit_.theta, strict=True)), **own}
     fresh = {"ln_rho": -6.0, "ln_markov": -2.5, "ln_alpha": -4.0, "ln_flicker": -3.0, "color": 0.2}
     return np.array([known.get(name, fresh.get(name, 0.0)) for name in terms.names])

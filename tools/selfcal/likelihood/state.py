@@ -150,6 +150,15 @@ class State:
         fits = [self.fitted_with(terms, more) for terms in self.near()]
         return best(fits).ln_likelihood - self.best.ln_likelihood, best(fits)
 
+    def with_terms(self, own: Mapping[str, float], less: float = 0.0, **terms: Any) -> tuple[float, tuple[Fit, ...]]:
+        """Gain of ln likelihood by further terms of the noise, and the fit of every near drift with them: from the
+        parameters `own` on, and from a drift smaller by exp(-less)."""
+        near, fits = self.near(), []
+        for one in (one for one in self.fits if one.terms in near):
+            more = replace(one.terms, **terms)
+            fits.append(fit(self.series, more, moved(one.shrunk(less), more, own)))
+        return best(fits).ln_likelihood - self.best.ln_likelihood, tuple(fits)
+
     def fitted_with(self, terms: Terms, more: Array) -> Fit:
         """The fit of one drift with further columns [k, n]."""
         return _fit_from(self.series.beside(more), terms, self.fits)
@@ -335,18 +344,20 @@ def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
     }
 
 
+def of_parameter(fit: Fit, name: str, unit_size: float, unit: str) -> dict[str, Any]:
+    """The posterior of a parameter of the noise whose logarithm the fit knows."""
+    sd = float(np.linalg.norm(fit.spread[fit.terms.names.index(name)]))
+    return log_normal(math.log(unit_size) + fit.value(name), sd, unit)
+
+
 def log_normal(ln_median: float, sd: float, unit: str) -> dict[str, Any]:
-    """A posterior whose logarithm is normal with this standard deviation."""
-    mean = math.exp(ln_median + 0.5 * sd**2)
+    """A posterior whose logarithm is normal with this standard deviation. Mean and width of one that is hardly known
+    are those of a deviation of 1."""
+    square = min(sd, 1.0) ** 2
+    mean = math.exp(ln_median + 0.5 * square)
     q05, median, q95 = (math.exp(ln_median + k * HALF_90 * sd) for k in (-1.0, 0.0, 1.0))
-    width = mean * math.sqrt(math.expm1(sd**2))
+    width = mean * math.sqrt(math.expm1(square))
     return {"mean": mean, "median": median, "sd": width, "q05": q05, "q95": q95, "unit": unit}
-
-
-def sizes(column: Array, key: str, unit: str, state: State) -> dict[str, Any]:
-    """The posterior of a column's coefficient in the form of the contract."""
-    weight, means, sds = (of[0] for of in state.posterior(column))
-    return {key: mixture(weight, means[:, 0], sds[:, 0], unit)}
 
 
 def mixture(weight: Array, mean: Array, sd: Array | float, unit: str) -> dict[str, Any]:

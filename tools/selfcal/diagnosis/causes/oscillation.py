@@ -15,16 +15,15 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import HALF_90
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes import periodic
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import swinging
-from selfcal.likelihood.fit import Fit, Series, best, fit, ln_likelihood, run
-from selfcal.likelihood.state import ALIKE, Look, State, net
-from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms
+from selfcal.likelihood.fit import Fit, Series, best, ln_likelihood, moved, run
+from selfcal.likelihood.state import ALIKE, Look, State, net, of_parameter
+from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array
 from selfcal.model.file import Model
 from selfcal.model.laws import RATIO_LIMITS, swing
 
@@ -50,11 +49,7 @@ def looks(state: State, record: Record) -> list[Look]:
     found = _search(state)
     if found is None:
         return []
-    extras = replace(state.extras, oscillation=True)
-    fits = [
-        fit(state.series, replace(one.terms, oscillation=True), start)
-        for one, start in ((one, _start(one, found)) for one in state.fits if one.terms in state.near())
-    ]
+    fits = state.with_terms(found, found.pop("less"), oscillation=True)[1]
     chosen = best(fits)
     # A poor drift model makes some nats of any slow term.
     none = max(state.best.ln_likelihood, 0.0 if state.extras.flicker else state.rich.ln_likelihood)
@@ -68,7 +63,7 @@ def looks(state: State, record: Record) -> list[Look]:
     line = _line(state, record, period, gain) if coherent else []
     if line:
         return line
-    changes, unit = {"extras": extras, "fits": tuple(fits)}, state.unit
+    changes, unit = {"extras": replace(state.extras, oscillation=True), "fits": fits}, state.unit
     sizes = _sizes(chosen, unit)
     return [Look("oscillation", gain, worth, sizes, changes, measure=lambda final: _sizes(final.best, unit))]
 
@@ -89,9 +84,9 @@ def _line(state: State, record: Record, period: float, gain: float) -> list[Look
 
 def _sizes(chosen: Fit, unit: str) -> dict[str, Any]:
     return {
-        "period_s": _interval(chosen, "ln_period", 1.0, "s"),
-        "damping": _interval(chosen, "ln_damping", 1.0, "1"),
-        "sd": _interval(chosen, "ln_swing", chosen.sigma, unit),
+        "period_s": of_parameter(chosen, "ln_period", 1.0, "s"),
+        "damping": of_parameter(chosen, "ln_damping", 1.0, "1"),
+        "sd": of_parameter(chosen, "ln_swing", chosen.sigma, unit),
     }
 
 
@@ -126,42 +121,16 @@ def _best_of(
 ) -> tuple[tuple[float, float, float, float], float]:
     """The likeliest of period, damping, size and smallness of the drift, and its ln likelihood."""
     terms = replace(state.best.terms, oscillation=True)
-    drift = {less: state.best.of_means(block, -less) for less in {one[3] for one in tried}}
-    values = [
-        ln_likelihood(run(series, terms, _theta(terms, state.best.terms, drift[less], p, d, s))[0][0])
-        for p, d, s, less in tried
-    ]
+
+    def value(numbers: tuple[float, float, float, float]) -> float:
+        period, damping, size = map(math.log, numbers[:3])
+        drift = replace(state.best, theta=state.best.of_means(block, -numbers[3]))
+        theta = moved(drift, terms, {"ln_swing": size, "ln_period": period, "ln_damping": damping})
+        return ln_likelihood(run(series, terms, theta)[0][0])
+
+    values = [value(one) for one in tried]
     k = int(np.argmax(values))
     return tried[k], values[k]
-
-
-def _theta(terms: Terms, without: Terms, drift: Array, period: float, damping: float, size: float) -> Array:
-    known = dict(zip(without.names, drift, strict=True))
-    own = {"ln_swing": math.log(size), "ln_period": math.log(period), "ln_damping": math.log(damping)}
-    return np.array([own[name] if name in own else known[name] for name in terms.names])
-
-
-def _start(one: Fit, found: Mapping[str, float]) -> Array:
-    """Where the fit begins, in the order of its parameters."""
-    terms = replace(one.terms, oscillation=True)
-    small = one.shrunk(found["less"])
-    return np.array([found[name] if name in found else small.value(name) for name in terms.names])
-
-
-def _interval(chosen: Fit, name: str, unit_size: float, unit: str) -> dict[str, Any]:
-    """Of a parameter whose logarithm is normal."""
-    k = chosen.terms.names.index(name)
-    sd = float(np.linalg.norm(chosen.spread[k]))
-    median = unit_size * math.exp(float(chosen.theta[k]))
-    mean = median * math.exp(0.5 * min(sd, 1.0) ** 2)
-    return {
-        "mean": mean,
-        "median": median,
-        "sd": mean * math.sqrt(math.expm1(min(sd, 1.0) ** 2)),
-        "q05": median * math.exp(-HALF_90 * sd),
-        "q95": median * math.exp(HALF_90 * sd),
-        "unit": unit,
-    }
 
 
 def _alike(a: Look, b: Look) -> bool:

@@ -17,7 +17,7 @@ from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.edges import EDGE, SHORTEST, Scan, edge, raised, scan
-from selfcal.likelihood.fit import Fit, whitened
+from selfcal.likelihood.fit import Fit, run
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array
 
@@ -59,7 +59,7 @@ def _coarse(state: State) -> list[tuple[Fit, tuple[int, int]]]:
     drifts = [(fit, less) for fit in state.fits if fit.terms in state.near() for less in SIZES]
     values = []
     for fit, less in drifts:
-        sums = whitened(more, fit.terms, fit.of_means(block, -less)).less(len(series.columns))
+        sums = run(more, fit.terms, fit.of_means(block, -less))[0][0].less(len(series.columns))
         G, size = sums.G, np.diag(sums.G)[1:]
         information = size[:, None] + size[None, :] - 2.0 * G[1:, 1:]
         usable = np.triu(information > 1e-6 * size.max(), 1)
