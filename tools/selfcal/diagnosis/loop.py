@@ -333,10 +333,9 @@ def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
     times = {key: float(column.entry[key]) for key in TIMES if key in column.entry}
     if not times:
         return replace(column, values=regridded(column.values, span, n, state.dt))
-    edges = module.sharpened([*times.values()], [state], span)
-    begin, end = round(edges[0] / state.dt), round(edges[1] / state.dt) if len(edges) > 1 else n
-    entry = {**column.entry, **dict(zip(times, edges, strict=True))}
-    return replace(column, values=raised(n, begin, end), entry=entry)
+    places = [round(time / state.dt) for time in module.sharpened([*times.values()], [state], span)]
+    entry = {**column.entry, **{key: place * state.dt for key, place in zip(times, places, strict=True)}}
+    return replace(column, values=raised(n, *places), entry=entry)
 
 
 def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], state: State) -> Finding:

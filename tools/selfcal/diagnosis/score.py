@@ -19,7 +19,7 @@ from selfcal.base.units import FLICKER_FLOOR
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import Fit, passed, run
+from selfcal.likelihood.fit import passed, run
 from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
@@ -263,7 +263,7 @@ def numbers(state: State) -> dict[str, float]:
     """N, K and B of plain white noise and random walk fitted beside the model of a state, in the axis' unit; 0 where
     the record shows none. B is that of the model's flicker noise, else by the minimum of the Allan deviation."""
     plain, best = next(one for one in state.fits if one.terms.walk), state.best
-    N, K = plain.N * _low_gain(plain), plain.K
+    N, K = plain.N_of_color, plain.K
     if not K * plain.duration_s > WALK_LEAST * N:
         K = 0.0
     if best.terms.flicker:
@@ -295,11 +295,3 @@ def inflation(before: State, after: State) -> Mapping[str, float]:
         return dict.fromkeys(("N", "K", "B"), 1.0)
     old, new = numbers(before), numbers(after)
     return {name: old[name] / new[name] if new[name] else math.inf if old[name] else 1.0 for name in new}
-
-
-def _low_gain(one: Fit) -> float:
-    """Amplitude of the white noise at 0 Hz over its own standard deviation."""
-    if not one.terms.color:
-        return 1.0
-    m = math.tanh(one.value("color"))
-    return (1.0 + m) / math.sqrt(1.0 + m * m) if one.terms.color == "ma" else math.sqrt((1.0 + m) / (1.0 - m))

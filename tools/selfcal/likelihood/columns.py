@@ -40,13 +40,13 @@ SMALLER = (1.5, 3.0)
 #: Forms of a family that are fitted: those that rank best. After the first one only forms whose score is within so many
 #: nats, and this share of the best, of what a form needs to be taken, or to be as likely as the best.
 FITTED, FIT_ADDS, COARSE = 3, 3.0, 0.05
-#: Numbers between those of the grid: places on either side of the best, over so many octaves.
-FINER, REACHES = 4, (1.0, 0.25)
+#: Numbers between those of the grid: steps of their logarithms, the first and the last.
+STEP_FIRST, STEP_LAST = 0.35, 0.005
 #: Worth from which on a shape may be named, or be as likely as the one that is, nats.
 NEARLY = NET_LEAST - ALIKE
-#: A number's posterior reaches to where ln likelihood is this much lower, in reaches a factor 2 apart, and has so many
-#: places: of one number, and of each of two.
-LOWER, REACH_LEAST, PLACES = 6.0, 0.002, (17, 11)
+#: A number's posterior is on a lattice of such steps, standard deviations, as far as ln likelihood is this much lower,
+#: with so many nodes at most. How far off the standard deviation is looked for first, and how often.
+NODE, POSSIBLE, NODES_MOST, REACH_FIRST, REACHES = 0.5, 6.0, 400, 0.01, 10
 
 
 @dataclass(frozen=True)
@@ -99,11 +99,15 @@ class Shape:
         """A gain net of the search."""
         return net(gain, self.free, self.price(gain) if callable(self.price) else self.price)
 
-    def near(self, thetas: Sequence[Sequence[float]]) -> list[Shape]:
-        """The shapes at other numbers, within their limits."""
+    @property
+    def limits(self) -> Array:
+        """Least and most [m, 2] of the numbers."""
+        return np.array([(one.low, one.high) for one in self.numbers])
+
+    def near(self, thetas: Iterable[Array]) -> list[Shape]:
+        """The shapes at other numbers [g, m], within their limits."""
         assert self.moved is not None, self.form
-        low, high = (np.array([getattr(one, key) for one in self.numbers]) for key in ("low", "high"))
-        return [self.moved([float(x) for x in np.clip(theta, low, high)]) for theta in thetas]
+        return [self.moved(np.clip(theta, *self.limits.T).tolist()) for theta in thetas]
 
 
 @dataclass(frozen=True)
@@ -164,16 +168,32 @@ def between(state: State, best: Tried) -> Tried:
     if best.shape.sharper is not None:
         moved = fitted(state, best.shape.sharper(best.fit))
         return moved if moved.gain > best.gain else best
-    paid, grid = best.shape.free > len(best.shape.columns), best.gain
-    for reach in REACHES if best.shape.numbers else ():
-        moves = np.exp2(reach * np.linspace(-1.0, 1.0, 2 * FINER + 1))
-        shapes = best.shape.near(
-            [[*np.multiply(best.shape.theta, by)] for by in product(moves, repeat=len(best.shape.numbers))]
-        )
-        gains = state.scores([one.columns for one in shapes], best.fit)
-        moved = fitted(state, shapes[int(gains.argmax())]) if gains.max() > best.gain else best
-        best = moved if moved.gain > best.gain else best
-    return best if paid else replace(best, gain=grid)
+    if not best.shape.numbers:
+        return best
+
+    def score(thetas: Array) -> Array:
+        return state.scores([one.columns for one in best.shape.near(thetas)], best.fit)
+
+    moved = fitted(state, *best.shape.near([top(score, best.shape.theta, best.shape.limits)]))
+    if best.shape.free == len(best.shape.columns):
+        moved = replace(moved, gain=best.gain)
+    return moved if moved.gain >= best.gain else best
+
+
+def top(score: Callable[[Array], Array], start: Sequence[float], limits: Array) -> Array:
+    """The numbers [m] of the highest score [g] of [g, m] from `start` on, by ever shorter steps of their logarithms."""
+    moves = np.array([move for move in product((-1.0, 0.0, 1.0), repeat=len(limits)) if any(move)])
+    here, step = np.log(start), STEP_FIRST
+    best = float(score(np.exp(here)[None])[0])
+    while step > STEP_LAST:
+        near = np.clip(here + step * moves, *np.log(limits).T)
+        values = score(np.exp(near))
+        place = int(np.argmax(values))
+        if values[place] > best + 1e-3:
+            here, best = near[place], float(values[place])
+        else:
+            step /= 2.0
+    return np.asarray(np.exp(here))
 
 
 def alike(found: Mapping[str, Tried]) -> list[Tried]:
@@ -234,10 +254,17 @@ def _sizes(shape: Shape, c: Array, sd: Array) -> tuple[Array, Array]:
 def measured(shape: Shape, state: State) -> dict[str, Any]:
     """Posteriors of the coefficients and the numbers, over the drifts, the spread of their parameters, and each other.
     The prior of a number is flat in its logarithm, that of a coefficient is flat."""
-    grids = _grids(state, shape)
-    shapes = [shape, *shape.near(list(product(*grids)))] if grids else [shape]
+    shapes = [shape]
+    if shape.numbers:
+        fit = fitted(state, shape).fit
+
+        def scores(thetas: Array) -> Array:
+            return state.scores([one.columns for one in shape.near(thetas)], fit)[None]
+
+        points, steps = nodes(scores, shape.theta, shape.limits)
+        shapes += shape.near(np.exp(points))
     weight, means, sds = state.posterior(*(one.columns for one in shapes))
-    if grids:  # the first one is on the grid as well
+    if shape.numbers:  # the first one is on the lattice as well
         weight, means, sds = weight[1:], means[1:], sds[1:]
     means, sds = _sizes(shape, means, sds)
     found = {
@@ -245,35 +272,53 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
         for j, (key, unit) in enumerate(shape.keys)
     }
     for k, number in enumerate(shape.numbers):
-        values = np.array([one.theta[k] for one in shapes[1:]])
-        # The deviation within a cell of the grid: its width over the root of 12.
-        width = np.interp(values, grids[k], np.gradient(grids[k])) / math.sqrt(12.0)
-        found[number.key] = mixture(weight.sum(axis=1), values, width, number.unit)
+        # The deviation within a cell of the lattice: its width over the root of 12.
+        values, width = np.exp(points[:, k]), float(np.linalg.norm(steps[k])) / math.sqrt(12.0)
+        found[number.key] = mixture(weight.sum(axis=1), values, values * width, number.unit)
     return found
 
 
-def _grids(state: State, shape: Shape) -> list[Array]:
-    """Values of each number that hold its posterior, an even step of the logarithm apart."""
-    if not shape.numbers:
-        return []
-    best = fitted(state, shape)
-    reach = REACH_LEAST * np.exp2(np.arange(12))
-    count = PLACES[min(len(shape.numbers), len(PLACES)) - 1]
-    grids = []
-    for k, number in enumerate(shape.numbers):
-        moves = np.concatenate([-reach[::-1], reach])
-        thetas = [[x * math.exp(move * (j == k)) for j, x in enumerate(shape.theta)] for move in moves]
-        lower = best.gain - state.scores([one.columns for one in shape.near(thetas)], best.fit)
-        ends = []
-        for side in (lower[: reach.size][::-1], lower[reach.size :]):
-            enough = np.flatnonzero(side > LOWER)
-            ends.append(float(reach[enough[0] if enough.size else -1]))
-        low, high = (
-            max(number.low, number.value * math.exp(-ends[0])),
-            min(number.high, number.value * math.exp(ends[1])),
-        )
-        grids.append(np.geomspace(low, high, count))
-    return grids
+def nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Array) -> tuple[Array, Array]:
+    """Logarithms of numbers that the record leaves possible [points, m], on a lattice about the best with the steps
+    [m, m], its columns. `scores` [d, points] of [points, m] at some drifts, the likeliest first."""
+    limits, middle, m = np.log(limits), np.log(start), len(limits)
+    if not m:
+        return np.empty((1, 0)), np.empty((0, 0))
+    best = scores(np.exp(middle)[None])[:, 0]
+    reach = np.full(m, REACH_FIRST)
+    for _ in range(REACHES):
+        moved = np.clip(middle + np.vstack([np.diag(reach), -np.diag(reach)]), *limits.T)
+        fall = best[0] - scores(np.exp(moved))[0].reshape(2, m).max(axis=0)
+        if np.all(fall > 0.3):
+            break
+        reach = np.where(fall > 0.3, reach, 1.6 * reach)
+    stencil = np.array(list(product((-1.0, 0.0, 1.0), repeat=m)))
+    values = scores(np.exp(np.clip(middle + stencil * reach, *limits.T)))[0]
+    # A parabola through the stencil.
+    pairs = [(i, j) for i in range(m) for j in range(i, m)]
+    products = [stencil[:, i] * stencil[:, j] for i, j in pairs]
+    design = np.column_stack([np.ones(len(stencil)), stencil, *products])
+    bend = np.linalg.lstsq(design, values, rcond=None)[0][1 + m :]
+    curvature = np.zeros((m, m))
+    for (i, j), value in zip(pairs, bend, strict=True):
+        curvature[i, j] -= value
+        curvature[j, i] -= value
+    sizes, ways = np.linalg.eigh(curvature)
+    steps = NODE * (reach[:, None] * ways) / np.sqrt(np.maximum(sizes, 0.1))
+    found: dict[tuple[int, ...], Array] = {}
+    seen = waiting = {(0,) * m}
+    while waiting and len(found) < NODES_MOST:
+        inside = [at for at in waiting if np.all(np.abs(np.clip(x := middle + steps @ at, *limits.T) - x) < 1e-9)]
+        if not inside:
+            break
+        values = scores(np.exp([middle + steps @ at for at in inside])).T
+        best = np.maximum(best, values.max(axis=0))
+        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > best - POSSIBLE)}
+        found |= near
+        moves = [(j, way) for j in range(m) for way in (1, -1)]
+        waiting = {tuple(x + way * (i == j) for i, x in enumerate(at)) for at in near for j, way in moves} - seen
+        seen = seen | waiting
+    return np.array([middle + steps @ at for at in found]), steps
 
 
 def least(state: State, shape: Shape, key: str) -> dict[str, tuple[float, str]]:

@@ -186,8 +186,8 @@ class Fit:
 
     @property
     def N_of_color(self) -> float:
-        """White noise density at low frequency, of a fit with memory."""
-        m = math.tanh(self.value("color"))
+        """White noise density at low frequency."""
+        m = math.tanh(self.value("color")) if self.terms.color else 0.0
         of_all = (1.0 + m) ** 2 / (1.0 + m * m) if self.terms.color == "ma" else (1.0 + m) / (1.0 - m)
         return self.N * math.sqrt(of_all)
 

@@ -37,8 +37,6 @@ HARMONIC_MOST = 0.1
 ONE_LINE = 0.01
 #: Share of its frequency within which another line is a side band.
 SIDE_BAND = 0.1
-#: The best frequency of the periodogram is looked for between its places, in bins, so many on either side.
-ZOOM, ZOOMED = (0.25, 0.06, 0.015, 0.004), 4
 #: A band lies at so many of its own widths at least: what is wider is coloured or flicker noise.
 NARROW = 4
 
@@ -188,8 +186,8 @@ def _line(state: State, record: Record) -> list[Look]:
     f = float(frequency[at])
     if net(float(power[at]), 2, float(ln_lines(np.array(f / width), n, power[at]))) <= 0.0:
         return []
-    for move in ZOOM:
-        near = np.minimum(f + move * width * np.linspace(-1.0, 1.0, 2 * ZOOMED + 1), half)
+    for move in 0.25 ** np.arange(1.0, 5.0):
+        near = np.minimum(f + move * width * np.linspace(-1.0, 1.0, 9), half)
         f = float(near[int(np.argmax([_power(one, t, w, there) for one in near]))])
     # A line at half the rate also fits beside it, with a column and a frequency more than it needs.
     tried = [*([shape(state, record, half)] if f > half - TURNS_LEAST * width else []), shape(state, record, f)]

@@ -13,20 +13,18 @@ from selfcal.likelihood import columns, edges
 from selfcal.likelihood.edges import KEYS, scan
 from selfcal.likelihood.state import SCREEN, Look, Regressor, State
 
-#: Samples that a record has at least; best places that are tried, and how far they are apart at least, s.
-LEAST, PEAKS, APART_S = 50, 3, 2.0
 #: Jumps of two axes so close to each other, s, are one event.
 ONE_EVENT_S = 30.0
 
 
 def looks(state: State, record: Record) -> list[Look]:
     """The best place."""
-    if state.y.size < LEAST:
+    if state.y.size < 50:
         return []
     steps = scan(state.series, state.best)
     if steps.gain.max() < SCREEN + 2.0:
         return []
-    places = steps.peaks(PEAKS, max(3, int(APART_S / state.dt)))
+    places = steps.peaks(3, max(3, int(2.0 / state.dt)))
     return columns.looks(state, "step", [edges.shape(state, "step", (place,), steps) for place in places])
 
 
