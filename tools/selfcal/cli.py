@@ -175,6 +175,8 @@ def main() -> NoReturn:
     """Entry point. Exit codes: 0, USER_ERROR with one line on stderr, 128 + its number after a signal (Ctrl-C: 130); a
     traceback is our bug."""
     install()
+    # Verbs run side by side by themselves. Threads of numpy's would wait for each other over small matrices.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if not sys.warnoptions:  # a library's warning is none for the user
         warnings.simplefilter("ignore")
     try:
