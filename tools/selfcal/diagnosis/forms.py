@@ -19,7 +19,7 @@ from scipy.special import chdtrc
 
 from selfcal.base.units import power
 from selfcal.diagnosis import curve
-from selfcal.diagnosis.cause import Channels, Key, medians, positive
+from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
@@ -461,3 +461,26 @@ def of_look(look: Look) -> dict[str, Any]:
 def as_text(knots: Sequence[Sequence[float]]) -> str:
     """A curve as a value of `--effect`: CHANNEL/HEIGHT+CHANNEL/HEIGHT..."""
     return "+".join(f"{place:.7f}/{height:.6f}" for place, height in knots)
+
+
+def side_cause(cause: str, name: str, record_next: str, coefficient: Key, *, from_zero: bool) -> Cause:
+    """The cause that a side channel is."""
+    return Cause(
+        cause,
+        f"The bias follows the {name}.",
+        record_next,
+        source="surroundings",
+        looks=lambda state, record: side_looks(state, record, cause),
+        at=lambda state, record, theta: side_at(state, record, cause, theta),
+        of_means=True,
+        pictures=shown("means", "evidence"),
+        least=lambda state, record: least(state, record, cause),
+        grouping=Grouping(alike=lambda a, b: True),
+        score=Scored(trained=curve.trained),
+        written=Written(smoothed=True, from_zero=from_zero, of_column=of_column),
+        simulated=Simulated(
+            keys={"coefficient": coefficient, **EFFECT_KEYS},
+            of_estimate=of_look,
+            add=lambda keys, channels: added(keys, channels, getattr(channels, cause)),
+        ),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -124,11 +125,8 @@ def shape(state: State, cause: str, places: tuple[int, ...], steps: Scan) -> Sha
     first = np.where(after > 0, there[np.maximum(after - 1, 0)] + 1, at)
     last = np.where(after < there.size, there[np.minimum(after, there.size - 1)], at)
     at = (first + last) // 2  # any place of a gap may be the one
-    times = [float(time) for time in at * state.dt]
-    width = [float(w) for w in (last - first + 1) * state.dt / math.sqrt(12.0)]
-    stated = {"time_s": interval(times[0] - 0.5 * state.dt / state.block, width[0], "s")}
-    if len(times) > 1:
-        stated["duration_s"] = interval(times[1] - times[0], math.hypot(*width), "s")
+    times = (at * state.dt).tolist()
+    stated = known(state, at, last - first + 1)
     values = raised(state.y.size, *at)
     entry = {"kind": cause, **dict(zip(KEYS[len(times)], times, strict=True))}
     return Shape(
@@ -143,6 +141,16 @@ def shape(state: State, cause: str, places: tuple[int, ...], steps: Scan) -> Sha
         when=(times[0], times[-1]),
         measure=partial(posterior, tuple(int(k) for k in at)),
     )
+
+
+def known(state: State, places: Sequence[int] | Array, samples: Sequence[int] | Array) -> dict[str, Any]:
+    """When a change is: each edge lies between the last reading before it and the first one after it, so many samples
+    apart. Means begin with their first reading."""
+    width = np.asarray(samples) * state.dt / math.sqrt(12.0)
+    found = {"time_s": interval(float(places[0] - 0.5 / state.block) * state.dt, float(width[0]), "s")}
+    if len(places) > 1:
+        found["duration_s"] = interval(float(places[1] - places[0]) * state.dt, math.hypot(*width), "s")
+    return found
 
 
 def name(cause: str, times: list[float]) -> str:
@@ -183,14 +191,13 @@ def posterior(places: tuple[int, ...], state: State) -> dict[str, Any]:
         size -= (m - 1) * middle.B[place] / middle.A[place]
         ln_weight = ln_share + middle.none + gain - 0.5 * ln_information
         rows.append(np.vstack([ln_weight, size, -0.5 * ln_information, *each]))
-    known = np.hstack(rows) if rows else np.array([[0.0, fit.c[-1], math.log(fit.sd[-1]), *values]]).T
-    weight = np.exp(known[0] - known[0].max())
-    # An edge lies between the last reading before it and the first one after it: means begin with their first reading.
+    all_of = np.hstack(rows) if rows else np.array([[0.0, fit.c[-1], math.log(fit.sd[-1]), *values]]).T
+    weight = np.exp(all_of[0] - all_of[0].max())
     width = state.dt / math.sqrt(12.0)
-    estimate = {"time_s": mixture(weight, known[3] * state.dt - 0.5 * state.dt / state.block, width, "s")}
+    estimate = {"time_s": mixture(weight, all_of[3] * state.dt - 0.5 * state.dt / state.block, width, "s")}
     if m > 1:
-        estimate["duration_s"] = mixture(weight, (known[4] - known[3]) * state.dt, math.sqrt(2.0) * width, "s")
-    return {**estimate, "amplitude": mixture(weight, known[1], np.exp(known[2]), state.unit)}
+        estimate["duration_s"] = mixture(weight, (all_of[4] - all_of[3]) * state.dt, math.sqrt(2.0) * width, "s")
+    return {**estimate, "amplitude": mixture(weight, all_of[1], np.exp(all_of[2]), state.unit)}
 
 
 def _likely(found: Scan, place: int, edges: int) -> Array:

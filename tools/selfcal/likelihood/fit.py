@@ -20,6 +20,8 @@ from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Mask,
 
 #: Columns that the compiled filter takes in one pass (bindings/likelihood.cpp).
 COLUMNS_MOST = 39
+#: Products of matrices that numpy leaves to one thread.
+ONE_THREAD = 200_000
 #: A column of which the others leave less than this share is one of theirs.
 SPENT = 1e-9
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
@@ -238,8 +240,14 @@ def passed(
         x = np.concatenate([x, *(one[3][:, 1:] for one in more)], axis=1)
         white = np.concatenate([white, *(one[4][:, 1:] for one in more)], axis=1)
         pieces = np.split(np.nan_to_num(white), at)[: len(at)]
-        G = np.cumsum([piece.T @ piece for piece in pieces], axis=0)
+        G = np.cumsum([_products(piece) for piece in pieces], axis=0)
     return G, D, n, x, white, s
+
+
+def _products(rows: Array) -> Array:
+    """Sums of the products of columns [n, p], [p, p], in parts too small for threads, which wait for each other."""
+    parts = np.array_split(rows, 1 + rows.size * rows.shape[1] // ONE_THREAD)
+    return np.asarray(sum(part.T @ part for part in parts))
 
 
 def _parts(columns: Array) -> list[Array]:

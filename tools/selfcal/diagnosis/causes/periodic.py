@@ -63,50 +63,40 @@ def _band(state: State, record: Record) -> list[Look]:
         if width > power.size // 8:
             break
         mean = uniform_filter1d(power, width, mode="reflect")
-        gain = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
-        gain[: max(low + width, NARROW * width)] = 0.0
-        at = int(np.argmax(gain))
-        if best is None or gain[at] > best[0]:
-            best = (float(gain[at]), at, width)
+        gains = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
+        gains[: max(low + width, NARROW * width)] = 0.0
+        at = int(np.argmax(gains))
+        if best is None or gains[at] > best[0]:
+            best = (float(gains[at]), at, width)
     if best is None:
         return []
     ln_places = math.log(max(1.0, 0.5 * count)) + 1.0
     if net(best[0], 2, ln_places) < BAND_LEAST or len(state.extras.bands) >= BANDS_MOST:
         return []
     f, width_hz = best[1] / (n * state.dt), best[2] / (n * state.dt)
+    size, wide = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count)), math.log(max(1.1e-4, 0.3 * width_hz))
     terms = replace(state.best.terms, trial=f)
-    start = moved(state.best, terms)
-    start[terms.names.index("ln_band")] = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count))
-    start[terms.names.index("ln_width")] = math.log(max(1.1e-4, 0.3 * width_hz))
-    chosen = fit(state.series, terms, start)
-    gain_of_fit = chosen.ln_likelihood - state.best.ln_likelihood
-    worth = net(gain_of_fit, 3, ln_places)
+    chosen = fit(state.series, terms, moved(state.best, terms, {"ln_band": size, "ln_width": wide}))
+    gain = chosen.ln_likelihood - state.best.ln_likelihood
+    worth = net(gain, 3, ln_places)
     centre = f * math.exp(chosen.value("shift"))
     half_width = math.exp(chosen.value("ln_width"))
     if worth < 1.0 or half_width * NARROW > centre:
         return []
-    extras = replace(state.extras, bands=(*state.extras.bands, (centre, half_width, chosen.value("ln_band"))))
-    share = math.exp(chosen.value("ln_band"))
-    turns = max(1.0, half_width * n * state.dt)
+    share, sd = math.exp(chosen.value("ln_band")), 1.0 / math.sqrt(max(1.0, half_width * n * state.dt))
 
     def amplitude(sigma: float) -> dict[str, Any]:
-        return interval(math.sqrt(2.0) * sigma * share, sigma * share / math.sqrt(turns), state.unit)
+        return {"amplitude": interval(math.sqrt(2.0) * sigma * share, sigma * share * sd, state.unit)}
 
-    return [
-        Look(
-            "periodic",
-            gain_of_fit,
-            worth,
-            {
-                "frequency_hz": interval(centre, half_width / math.sqrt(turns), "Hz"),
-                "amplitude": amplitude(chosen.sigma),
-                "width_hz": interval(half_width, half_width / math.sqrt(turns), "Hz"),
-            },
-            {"extras": extras},
-            shown_by="band",
-            measure=lambda final: {"amplitude": amplitude(final.best.sigma)},
-        )
-    ]
+    estimate = {
+        "frequency_hz": interval(centre, half_width * sd, "Hz"),
+        **amplitude(chosen.sigma),
+        "width_hz": interval(half_width, half_width * sd, "Hz"),
+    }
+    bands = (*state.extras.bands, (centre, half_width, math.log(share)))
+    changes = {"extras": replace(state.extras, bands=bands)}
+    look = Look("periodic", gain, worth, estimate, changes, shown_by="band")
+    return [replace(look, measure=lambda final: amplitude(final.best.sigma))]
 
 
 def pair(f: float, record: Record) -> dict[str, Array]:
