@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from types import MappingProxyType
 from typing import Any
@@ -12,7 +13,7 @@ from selfcal.adequacy.document import recording_entry
 from selfcal.base import units as unit_module
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError
-from selfcal.diagnosis import findable, words
+from selfcal.diagnosis import words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
@@ -153,15 +154,16 @@ def _plausibility(look: Look) -> str:
 
 
 def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
-    try:
-        rows = findable.not_found(one.state, record, {finding.look.cause for finding in one.findings})
-    except Stopped:
-        return []
-    for row in rows:
-        sizes = row["would_have_been_found"]
-        row["would_have_been_found"] = {
-            key: _in_unit(value, one.state.unit, factor, unit) for key, value in sizes.items()
-        }
+    """For every cause that has a size the one from which half of the records with it would have been named."""
+    named = {finding.look.cause for finding in one.findings}
+    rows = []
+    with suppress(Stopped):
+        for cause in CAUSES.values():
+            least = cause.least(one.state, record) if cause.least is not None and cause.id not in named else None
+            sizes = {key: {"value": value, "unit": of} for key, (value, of) in (least or {}).items()}
+            sizes = {key: _in_unit(size, one.state.unit, factor, unit) for key, size in sizes.items()}
+            if sizes:
+                rows.append({"cause": cause.id, "would_have_been_found": sizes})
     return rows
 
 

@@ -35,13 +35,8 @@ WALK_LEAST = 3.0
 BIAS_S = 60.0
 
 
-@dataclass(frozen=True)
-class Sequential:
-    """One model along the record: ln evidence [marks] of the samples before each mark, and by horizon the bias that
-    is predicted from each of its places."""
-
-    ln_evidence: Array
-    bias: Mapping[float, Array]
+#: ln evidence [marks] of the samples before each mark; by horizon the bias that is predicted from each of its places.
+Sequential = tuple[Array, Mapping[float, Array]]
 
 
 @dataclass(frozen=True)
@@ -89,12 +84,12 @@ def gain(
         old = _sequential(before, cut.marks, {})
         one, two = (_residual(state, split) for state in (before, partner))
         more, sd = cause.score.together(one, two, before.dt, split, look.estimate)
-        scores = cut.scores(old.ln_evidence)
+        scores = cut.scores(old[0])
         return _held_out(cut, scores, scores + more, sd, before.unit, {})
     horizons = _horizons(before.dt, n, split)
     cut = replace(cut, marks=np.union1d(cut.marks, np.concatenate([*horizons.values(), cut.edges])))
     old, new = (_sequential(state, cut.marks, horizons) for state in (before, after))
-    scores, later = cut.scores(old.ln_evidence), cut.scores(new.ln_evidence)
+    scores, later = cut.scores(old[0]), cut.scores(new[0])
     at = int(np.searchsorted(cut.edges, _begin(before, after, split), "right")) - 1
     later[at] -= _price(look, before, after, split) / cut.sizes[at]
     sd = float((later - scores).std(ddof=1)) / math.sqrt(PIECES)
@@ -213,7 +208,7 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
         horizon: (weight[:, np.searchsorted(marks, places)] * bias[horizon]).sum(axis=0)
         for horizon, places in horizons.items()
     }
-    return Sequential(logsumexp(ln_evidence, axis=0), predicted)
+    return logsumexp(ln_evidence, axis=0), predicted
 
 
 def _residual(state: State, split: int) -> Array:
@@ -242,7 +237,7 @@ def _errors(
     for horizon, places in horizons.items():
         first = places + _ahead(horizon, state.dt) - 1
         read = np.array([_mean(state.y[at : at + window]) for at in first])
-        errors = [one.bias[horizon] - read for one in (old, new)]
+        errors = [one[horizon] - read for _, one in (old, new)]
         good = np.isfinite(errors[0]) & np.isfinite(errors[1])
         if good.sum() < 10:
             continue

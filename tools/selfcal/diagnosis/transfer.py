@@ -20,9 +20,9 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.forms import LONGEST_LAG, agreement, whitened
+from selfcal.diagnosis.forms import LONGEST_LAG, agreement
 from selfcal.likelihood.columns import LN_SLOW, NODES_MOST, POSSIBLE, nodes, top
-from selfcal.likelihood.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
+from selfcal.likelihood.fit import Fit, Sums, left, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
 from selfcal.model.forms import POWER, played, slope
@@ -443,12 +443,10 @@ def left_over(state: State, drive: Drive, one: Tried) -> float:
     uneven = behind(np.abs(drive.u - v), drive.dt, number)[0]
     own = one.columns[: len(one.structure.keys)]
     foreign = np.array([drive.u, v**2, v**3, own[0] * np.linspace(-1.0, 1.0, v.size), uneven])
-    w, columns, q = whitened(replace(state, fits=(one.fit,)), np.vstack([own, foreign]), one.columns)
-    w -= q @ (q.T @ w)
+    w, *others = left(state.series.beside(one.columns), one.fit, foreign).T
     found = []
-    for k, column in enumerate(columns):
-        u = column if k < len(own) else column - q @ (q.T @ column)
-        if float(u @ u) > 1e-6 * float(column @ column):
+    for u in (*left(state.series, one.fit, own).T[1:], *others):
+        if float(u @ u) > 0.0:
             chi, bands = agreement(u, w, any_phase=True)
             found += [net(0.5 * chi, 2 * bands), net(0.5 * float(u @ w) ** 2 / float(u @ u) / float(np.var(w)))]
     return max(found) - math.log(len(found))

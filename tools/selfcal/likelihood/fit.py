@@ -244,6 +244,18 @@ def passed(
     return G, D, n, x, white, s
 
 
+def left(series: Series, fit: Fit, more: Array) -> Array:
+    """The record and further columns [n, 1 + k] behind the filter of a fit, less what the series' own columns explain:
+    nothing of one that is theirs, and 0 where the record is missing."""
+    white = np.nan_to_num(run(series.beside(more), fit.terms, fit.theta, innovations=True)[1])
+    k = 1 + len(series.columns)
+    q, rest = np.linalg.qr(white[:, 1:k])[0], np.delete(white, range(1, k), axis=1)
+    size = 1e-6 * (rest**2).sum(axis=0)
+    rest -= q @ (q.T @ rest)
+    rest[:, 1:] *= (rest[:, 1:] ** 2).sum(axis=0) > size[1:]
+    return rest
+
+
 def _products(rows: Array) -> Array:
     """Sums of the products of columns [n, p], [p, p], in parts too small for threads, which wait for each other."""
     parts = np.array_split(rows, 1 + rows.size * rows.shape[1] // ONE_THREAD)

@@ -246,12 +246,8 @@ class State:
 
     def least(self, column: Array) -> float:
         """The coefficient of a column that gains NET_LEAST at the fitted noise."""
-        series = self.series.beside(column)
-        G = run(series, self.best.terms, self.best.theta)[0][0].G / self.best.sigma**2
-        k = len(G) - 1
-        cross = G[1:k, k]
-        A = G[k, k] - cross @ np.linalg.pinv(G[1:k, 1:k], rcond=1e-12, hermitian=True) @ cross
-        return math.sqrt(2.0 * NET_LEAST / A) if 1e-9 * G[k, k] < A else math.inf
+        (sums,) = self.beside(self.best.terms, self.best.theta, [np.atleast_2d(column)])
+        return self.best.sigma * math.sqrt(2.0 * NET_LEAST / sums.G[1, 1]) if sums.G[1, 1] > 0.0 else math.inf
 
 
 def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, float]]:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import swinging
-from selfcal.likelihood.fit import Fit, Series, best, ln_likelihood, moved, run
+from selfcal.likelihood.fit import Fit, best, ln_likelihood, moved, run
 from selfcal.likelihood.state import ALIKE, Look, State, net, of_parameter
 from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array
 from selfcal.model.file import Model
@@ -35,8 +36,6 @@ PER_OCTAVE, DAMPING, SWINGS, SIZES = 3.0, 0.15, (0.12, 0.35, 1.0), (0.0, 1.5, 4.
 DAMPINGS, NEAR = (0.02, 0.05, 0.15, 0.4), tuple(float(2.0 ** (k / 12.0)) for k in range(-3, 4))
 #: The prior of the size in the model file, over the size found.
 RATIOS = (0.1, 10.0)
-#: Gains of the search below this are not worth a fit.
-LEAST = 1.0
 #: Price of the search over periods beside three degrees of freedom. At 1.8 more, 3 of 800 clean hours at 1 Hz showed
 #: 3 nats, where 40 were due.
 LN_LOOKS = 1.0
@@ -97,40 +96,28 @@ def _search(state: State) -> dict[str, float] | None:
     high = min(PERIOD_LIMITS[1], series.duration_s / TURNS_LEAST)
     if high < low:
         return None
-    count = 1 + math.ceil(PER_OCTAVE * math.log2(high / low))
-    periods = np.geomspace(low, high, count)
-    first = [(p, DAMPING, s, less) for p in periods for s in SWINGS for less in SIZES]
-    at, value = _best_of(state, series, block, first)
-    period, _, size, less = at
-    second = [(period * by, damping, size, less) for by in NEAR for damping in DAMPINGS if low <= period * by <= high]
-    at, value = _best_of(state, series, block, second)
+    terms = replace(state.best.terms, oscillation=True)
+
+    def value(numbers: tuple[float, ...]) -> float:
+        """ln likelihood of a period, a damping, a size over the white noise of a mean, and a drift smaller by exp."""
+        period, damping, size = map(math.log, numbers[:3])
+        drift = replace(state.best, theta=state.best.of_means(block, -numbers[3]))
+        theta = moved(drift, terms, {"ln_swing": size, "ln_period": period, "ln_damping": damping})
+        return ln_likelihood(run(series, terms, theta)[0][0])
+
+    periods = np.geomspace(low, high, 1 + math.ceil(PER_OCTAVE * math.log2(high / low))).tolist()
+    period, damping, size, less = max(product(periods, (DAMPING,), SWINGS, SIZES), key=value)
+    near = [period * by for by in NEAR if low <= period * by <= high]
+    period, damping, size, less = best_of = max(product(near, DAMPINGS, (size,), (less,)), key=value)
     none = ln_likelihood(run(series, state.best.terms, state.best.of_means(block, 0.0))[0][0])
-    if value - none < LEAST:
+    if value(best_of) - none < 1.0:  # not worth a fit
         return None
-    period, damping, size, less = at
     return {
         "ln_period": math.log(period),
         "ln_damping": math.log(damping),
         "ln_swing": math.log(size) - 0.5 * math.log(block),
         "less": less,
     }
-
-
-def _best_of(
-    state: State, series: Series, block: int, tried: list[tuple[float, float, float, float]]
-) -> tuple[tuple[float, float, float, float], float]:
-    """The likeliest of period, damping, size and smallness of the drift, and its ln likelihood."""
-    terms = replace(state.best.terms, oscillation=True)
-
-    def value(numbers: tuple[float, float, float, float]) -> float:
-        period, damping, size = map(math.log, numbers[:3])
-        drift = replace(state.best, theta=state.best.of_means(block, -numbers[3]))
-        theta = moved(drift, terms, {"ln_swing": size, "ln_period": period, "ln_damping": damping})
-        return ln_likelihood(run(series, terms, theta)[0][0])
-
-    values = [value(one) for one in tried]
-    k = int(np.argmax(values))
-    return tried[k], values[k]
 
 
 def _alike(a: Look, b: Look) -> bool:

@@ -16,6 +16,7 @@ from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simu
 from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns, edges
+from selfcal.likelihood.columns import SMALLER
 from selfcal.likelihood.edges import EDGE, SHORTEST, Scan, edge, raised, scan
 from selfcal.likelihood.fit import Fit, run
 from selfcal.likelihood.state import Look, State
@@ -23,8 +24,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: Places of a step among which pairs are looked for, of blocks.
 PLACES = 96
-#: Drifts that the pairs are ranked at: the fitted one's size over e to these.
-SIZES = (0.0, 1.5, 3.0)
 #: Pairs that are tried, and how far they are apart, places.
 TRIED, APART = 2, 3
 #: Two steps that gain so much more with sizes of their own, nats and share of the gain, are no pulse. Of pulses 2 in
@@ -56,7 +55,7 @@ def _coarse(state: State) -> list[tuple[Fit, tuple[int, int]]]:
     m = series.y.size
     places = np.unique(np.linspace(0, m, PLACES + 2).astype(int)[1:-1])
     more = series.beside((np.arange(m)[None, :] >= places[:, None]).astype(np.float64))
-    drifts = [(fit, less) for fit in state.fits if fit.terms in state.near() for less in SIZES]
+    drifts = [(fit, less) for fit in state.fits if fit.terms in state.near() for less in (0.0, *SMALLER)]
     values = []
     for fit, less in drifts:
         sums = run(more, fit.terms, fit.of_means(block, -less))[0][0].less(len(series.columns))
