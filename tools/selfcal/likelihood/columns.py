@@ -46,7 +46,7 @@ STEP_FIRST, STEP_LAST = 0.35, 0.005
 NEARLY = NET_LEAST - ALIKE
 #: A number's posterior is on a lattice of such steps, standard deviations, as far as ln likelihood is this much lower,
 #: with so many nodes at most. How far off the standard deviation is looked for first, and how often.
-NODE, POSSIBLE, NODES_MOST, REACH_FIRST, REACHES = 0.5, 6.0, 400, 0.01, 10
+NODE, POSSIBLE, NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
 
 
 @dataclass(frozen=True)
