@@ -232,6 +232,9 @@ def _curves(record: Record, found: Mapping[str, Diagnosed]) -> Record:
         look = max(looks, key=lambda look: look.net, default=None)
         if look is None or look.net < module.CERTAIN or not _free(look):
             continue
+        jumps = [jump for cause in module.JUMPS if (own := CAUSES[cause].looks) for jump in own(state, record)]
+        if any(jump.net > look.net - ALIKE for jump in jumps):  # a curve of a channel that only rises has any jump
+            continue
         after = state.refit(**look.changes)
         held_out = score.gain(look, state, after, record)
         if _refuted(look, held_out):
