@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.cause import Channels
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.forms import added, inconstancy
-from selfcal.diagnosis.loop import LOOKS, diagnose_record
+from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, State
 from selfcal.logs.recording import load
@@ -218,11 +219,8 @@ def test_a_curve_of_the_temperature_is_found(kind: str) -> None:
 def test_clean_channels_are_no_cause() -> None:
     """At most 1 of 200 clean axes is named a cause with a channel: the clean twin of every form."""
     wanted, named, seed = case_records(4, 200), 0, 0
-    looks = [
-        one
-        for one in LOOKS
-        if one.__module__.rpartition(".")[2] in ("temperature", "supply", "cross_axis", "vibration")
-    ]
+    causes = [CAUSES[cause] for cause in ("temperature", "supply", "cross_axis", "vibration")]
+    looks = [cause.looks for cause in causes if cause.looks]
     assert len(looks) == 4
     for seed in range(wanted // 2):
         record = Drawn(9000 + seed, minutes=25.0).record()

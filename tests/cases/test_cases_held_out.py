@@ -15,9 +15,10 @@ from scipy.special import logsumexp
 
 from selfcal.diagnosis import loop, score
 from selfcal.diagnosis.cause import Looks
-from selfcal.diagnosis.causes import outliers, step
+from selfcal.diagnosis.causes import outliers
 from selfcal.diagnosis.finding import Diagnosed, HeldOut
 from selfcal.diagnosis.record import Record
+from selfcal.likelihood import edges
 from selfcal.likelihood.fit import passed
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State
 from selfcal.likelihood.statemodel import Terms
@@ -78,12 +79,12 @@ def test_a_right_step_gains_and_a_false_one_does_not(late: bool) -> None:
         y = of_one(random, SAMPLES, 0.012, 300.0)
         place = round(SAMPLES * (random.uniform(0.6, 0.9) if late else random.uniform(0.1, 0.4)))
         for size, gains in ((2.5, right), (0.0, false)):
-            state = fitted(y + size * step.raised(SAMPLES, place))
+            state = fitted(y + size * edges.raised(SAMPLES, place))
             record = record_of(state)
-            scan = step.scan(state.series, state.best)
+            scan = edges.scan(state.series, state.best)
             inside = np.arange(SAMPLES) >= SAMPLES // 2
             at = int(np.argmax(np.where(inside == late, scan.gain, 0.0)))
-            column = Regressor("step", "step", step.raised(SAMPLES, at), "1", {"kind": "step", "time_s": float(at)})
+            column = Regressor("step", "step", edges.raised(SAMPLES, at), "1", {"kind": "step", "time_s": float(at)})
             gain = state.with_columns(column.values)[0]
             look = Look("step", gain, scan.worth(gain), {}, {"regressors": (column,)}, when=(float(at), float(at)))
             gains.append(nats(score.gain(look, state, state.refit(**look.changes), record)))

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from drifts import noise, recorded
 
-from selfcal.diagnosis.causes import pulse
 from selfcal.diagnosis.loop import diagnose_record
+from selfcal.likelihood import edges
 from selfcal.likelihood.statemodel import Array
 
 from conftest import case_records
@@ -43,11 +43,11 @@ def test_a_pulse_that_no_drift_can_judge_has_the_fit_as_its_size(monkeypatch: py
     """Each drift forgets too fast to know either place: the estimate is the fit's."""
     random = np.random.default_rng(435)
     shape, start, length, _ = drawn(random, 1.0)
-    state, record = recorded(noise(random, "walk", shape.size, 1.0) + shape, 1.0)
+    state, _ = recorded(noise(random, "walk", shape.size, 1.0) + shape, 1.0)
     begin, end = math.ceil(start), math.ceil(start + length)
     _, fit = state.with_columns((np.arange(shape.size) >= begin) * 1.0 - (np.arange(shape.size) >= end))
-    none = pulse.Pulses(np.zeros(shape.size), np.zeros(shape.size), 0.0)
-    monkeypatch.setattr(pulse, "_other", lambda *_, **__: none)
-    found = pulse.posterior(record.time_s, begin, end, state)
+    none = edges.Scan(*np.zeros((3, shape.size)), 0.0, 0.0)
+    monkeypatch.setattr(edges, "edge", lambda *_: none)
+    found = edges.posterior((begin, end), state)
     assert found["amplitude"]["mean"] == pytest.approx(fit.c[-1])
     assert found["duration_s"]["mean"] == pytest.approx(end - begin)

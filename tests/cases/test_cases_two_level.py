@@ -9,7 +9,7 @@ import numpy as np
 from drifts import noise, recorded
 
 from selfcal.diagnosis.causes import two_level
-from selfcal.diagnosis.causes.step import scan
+from selfcal.likelihood.edges import scan
 from selfcal.likelihood.statemodel import Array
 
 from conftest import case_records

@@ -17,7 +17,8 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import SMALLER, Shape, Tried
-from selfcal.likelihood.fit import Fit, run
+from selfcal.likelihood.fit import Fit
+from selfcal.likelihood.fit import left as left_of
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, net
 from selfcal.likelihood.statemodel import Array
 
@@ -95,13 +96,8 @@ def _sorted(places: Array, heights: Array) -> tuple[Array, Array]:
 def _picked(state: State, fit: Fit, terms: Array) -> list[int]:
     """Terms [k, n] one after the other: the one that gains most beside those before it, while it pays its search."""
     parts = np.array_split(terms, math.ceil(len(terms) / ABREAST))
-    white = [run(state.series.beside(part), fit.terms, fit.theta, innovations=True)[1] for part in parts]
-    known = len(state.regressors) + 2
-    q = np.linalg.qr(np.nan_to_num(white[0][:, 1:known]))[0]
-    u = np.nan_to_num(np.concatenate([one[:, known:] for one in white], axis=1))
-    u -= q @ (q.T @ u)
-    left = np.nan_to_num(white[0][:, 0]) / fit.sigma
-    left -= q @ (q.T @ left)
+    each = [left_of(state.series, fit, part) for part in parts]
+    u, left = np.concatenate([one[:, 1:] for one in each], axis=1), each[0][:, 0] / fit.sigma
     size = (u**2).sum(axis=0)
     picked: list[int] = []
     while len(picked) < TERMS_MOST:

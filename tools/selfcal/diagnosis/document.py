@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from copy import deepcopy
 from types import MappingProxyType
 from typing import Any
@@ -164,24 +165,17 @@ def _plausibility(look: Look) -> str:
 
 
 def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
-    """Causes that have a size: half of the records with it would have been named."""
+    """For every cause that has a size the one from which half of the records with it would have been named."""
     named = {finding.look.cause for finding in one.findings}
-    looked = {id: cause.least for id, cause in CAUSES.items() if cause.least is not None and id not in named}
-    try:
-        sizes = {id: least(one.state, record) for id, least in looked.items()}
-    except Stopped:
-        return []
-    inner = one.state.unit
-    return [
-        {
-            "cause": id,
-            "would_have_been_found": {
-                key: _in_unit({"value": value, "unit": own}, inner, factor, unit) for key, (value, own) in size.items()
-            },
-        }
-        for id, size in sizes.items()
-        if size
-    ]
+    rows = []
+    with suppress(Stopped):
+        for cause in CAUSES.values():
+            least = cause.least(one.state, record) if cause.least is not None and cause.id not in named else None
+            sizes = {key: {"value": value, "unit": of} for key, (value, of) in (least or {}).items()}
+            sizes = {key: _in_unit(size, one.state.unit, factor, unit) for key, size in sizes.items()}
+            if sizes:
+                rows.append({"cause": cause.id, "would_have_been_found": sizes})
+    return rows
 
 
 def _not_judged(one: Diagnosed, record: Record) -> list[dict[str, str]]:

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from scipy.signal import fftconvolve, lfilter
 
 from selfcal.diagnosis.forms import LONGEST_LAG
-from selfcal.likelihood.fit import Fit, run
+from selfcal.likelihood.fit import Fit, left
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 
@@ -214,14 +214,9 @@ def beside(
     samples, and what it would make of records that `answers` [draws, n] to that input, the likeliest first, and the
     fitted noise make. `before` [n]: what the input left from before the record; it is taken out."""
     rest = replace(state, y=state.y - before)
-    _, white, _ = run(rest.series.beside(np.vstack([u, read, answers])), fit.terms, fit.theta, innovations=True)
-    white = np.nan_to_num(white)
-    kept = 2 + len(answers)
-    known, _ = np.linalg.qr(white[:, 1:-kept])
-    white = np.delete(white, range(1, white.shape[1] - kept), axis=1)
-    white -= known @ (known.T @ white)
+    white = left(rest.series, fit, np.vstack([u, read, answers]))
     count = white.shape[0] // steps
-    y, quiet, raw, *due = white[: count * steps].reshape(count, steps, 1 + kept).mean(axis=1).T
+    y, quiet, raw, *due = white[: count * steps].reshape(count, steps, white.shape[1]).mean(axis=1).T
     noise = float(np.std(y - due[0]))
     random = np.random.default_rng(1)
     drawn = [one + noise * random.standard_normal(count) for one in due]

@@ -23,6 +23,7 @@ from selfcal.base import units
 from selfcal.diagnosis import hidden, words
 from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.causes.variance_change import ENDS
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood.heldout import HARM_SD, in_sd
@@ -35,8 +36,6 @@ from selfcal.readings.motion import joined
 LEAST = 0.05
 #: The numbers, and their names in a summary.
 SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}
-#: Shares of the record that have less noise than the quiet level and the loud one.
-LEVELS = (0.05, 0.95)
 #: What has no name.
 UNEXPLAINED = "unexplained"
 #: Units of what several axes have in common; all else is a size on an axis. Probability of axes that differ as much by
@@ -64,7 +63,7 @@ class Member:
             return {**old, "N": old["N"] * self.plain}, old
         new = {name: value * self.factor for name, value in numbers(after).items()}
         if after.r is not before.r:  # the noise level is several: the one that is farthest from a single one's
-            levels = new["N"] * np.sqrt(np.quantile(after.r / before.r, LEVELS))
+            levels = new["N"] * np.sqrt(np.quantile(after.r / before.r, ENDS))
             new["N"] = float(max(levels, key=lambda level: abs(math.log(level / old["N"]))))
         return old, new
 

@@ -18,6 +18,7 @@ from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError, remark
 from selfcal.diagnosis.cause import Cause, Extension
 from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.causes.vibration import WIDTHS_S
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import form_of
 from selfcal.diagnosis.model_tree import digits
@@ -33,8 +34,6 @@ from selfcal.model.regressors import trailing_mean
 WIDE = 5.0
 #: Begins each file that is written here.
 HEAD = "# Written by `selfcal diagnose`"
-#: Windows of a channel's trailing mean, s.
-WINDOWS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 
 
 def extended(
@@ -182,7 +181,7 @@ def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) ->
     explained = [one for one in found.values() if any(column.name == name for column in one.state.regressors)]
     record = max((one.record for one in explained), key=lambda record: record.rate_hz)
     gains: dict[float, float] = {}
-    for width in WINDOWS_S:
+    for width in WIDTHS_S:
         window = max(1, round(width * record.rate_hz))
         if window > record.present.size // 10:
             break

@@ -19,12 +19,12 @@ from scipy.special import chdtrc
 
 from selfcal.base.units import power
 from selfcal.diagnosis import curve
-from selfcal.diagnosis.cause import Channels, Key, medians, positive
+from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Number, Shape, Tried
-from selfcal.likelihood.fit import run
+from selfcal.likelihood.fit import left
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
@@ -344,20 +344,10 @@ def inconstancy(state: State, column: Array, beside: Array | None = None) -> flo
     shock agree at some frequencies only, and the axis that is followed does not follow with one coefficient either.
     `beside`: columns [k, n] that are in the model as well.
     """
-    w, (u,), q = whitened(state, column[None], beside)
-    u, w = u - q @ (q.T @ u), w - q @ (q.T @ w)
+    series = state.series if beside is None or not len(beside) else state.series.beside(beside)
+    w, u = left(series, state.best, column[None]).T
     chi, bands = agreement(u, w - float(u @ w) / float(u @ u) * u)
     return -math.log(max(float(chdtrc(bands - 1, chi)), 1e-300)) if bands > 1 else 0.0
-
-
-def whitened(state: State, columns: Array, beside: Array | None = None) -> tuple[Array, Array, Array]:
-    """The record [n] and columns [k, n] behind the filter of the drift, and an orthonormal base [n, p] of what the
-    model has, and `beside` [j, n]."""
-    more = columns if beside is None or not len(beside) else np.vstack([beside, columns])
-    _, white, _ = run(state.series.beside(more), state.best.terms, state.best.theta, innovations=True)
-    white = np.nan_to_num(white)
-    k = len(columns)
-    return white[:, 0], white[:, -k:].T, np.linalg.qr(white[:, 1:-k])[0]
 
 
 def agreement(u: Array, w: Array, *, any_phase: bool = False) -> tuple[float, int]:
@@ -384,13 +374,9 @@ def _kept(state: State, column: Array, channel: Channel, window: int) -> float:
     """
     random = np.random.default_rng(1)
     noise = math.sqrt(0.5 * float(np.var(np.diff(channel.values)))) * random.standard_normal((NOISES, column.size))
-    columns = np.vstack([column, *(smoothed(row, window) for row in noise)])
-    known = 1 + len(state.regressors) + 1
-    fit = state.best
-    G = run(state.series.beside(columns), fit.terms, fit.theta)[0][0].G
-    cross = G[1:known, known]
-    information = G[known, known] - cross @ np.linalg.pinv(G[1:known, 1:known], rcond=1e-12, hermitian=True) @ cross
-    return float(np.clip(1.0 - np.diag(G)[known + 1 :].mean() / max(information, 1e-300), KEPT_LEAST, 1.0))
+    rows = [column[None], *(smoothed(row, window)[None] for row in noise)]
+    own, *of_noise = (sums.G[1, 1] for sums in state.beside(state.best.terms, state.best.theta, rows))
+    return float(np.clip(1.0 - np.mean(of_noise) / max(own, 1e-300), KEPT_LEAST, 1.0))
 
 
 def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, str]] | None:
@@ -407,8 +393,6 @@ EFFECT_KEYS = {
     **{key: positive(None) for key in ("lag_s", "width", "window_s")},
     **{key: Key(None) for key in ("rate", "square", "cube", "knots")},
 }
-#: Window of a rate whose effect states none, s.
-RATE_WINDOW_S = 60.0
 
 
 def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
@@ -424,7 +408,7 @@ def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
         late = formed(values, "lag", float(keys["lag_s"]), 0.0, interval_s)
         total += float(keys["rate"]) * (values - late) / float(keys["lag_s"])
     elif "rate" in keys:
-        window_s = float(keys.get("window_s", RATE_WINDOW_S))
+        window_s = float(keys.get("window_s", RATE_WINDOWS_S[2]))
         total += float(keys["rate"]) * slope(values, window_s, interval_s)
     if "knots" in keys:
         bent = curved(values, keys["knots"])
@@ -462,3 +446,26 @@ def of_look(look: Look) -> dict[str, Any]:
 def as_text(knots: Sequence[Sequence[float]]) -> str:
     """A curve as a value of `--effect`: CHANNEL/HEIGHT+CHANNEL/HEIGHT..."""
     return "+".join(f"{place:.7f}/{height:.6f}" for place, height in knots)
+
+
+def side_cause(cause: str, name: str, record_next: str, coefficient: Key, *, from_zero: bool) -> Cause:
+    """The cause that a side channel is."""
+    return Cause(
+        cause,
+        f"The bias follows the {name}.",
+        record_next,
+        source="surroundings",
+        looks=lambda state, record: side_looks(state, record, cause),
+        at=lambda state, record, theta: side_at(state, record, cause, theta),
+        of_means=True,
+        pictures=shown("means", "evidence"),
+        least=lambda state, record: least(state, record, cause),
+        grouping=Grouping(alike=lambda a, b: True),
+        score=Scored(trained=curve.trained),
+        written=Written(smoothed=True, from_zero=from_zero, of_column=of_column),
+        simulated=Simulated(
+            keys={"coefficient": coefficient, **EFFECT_KEYS},
+            of_estimate=of_look,
+            add=lambda keys, channels: added(keys, channels, getattr(channels, cause)),
+        ),
+    )

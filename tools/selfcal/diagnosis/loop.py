@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -15,16 +14,16 @@ from selfcal.base.ending import Stopped
 from selfcal.base.grid import regridded, runs
 from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
-from selfcal.diagnosis.causes import CAUSES, motion, step, tilt
+from selfcal.diagnosis.causes import CAUSES, motion, tilt
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.record import TIMES, Record, carried
 from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
-from selfcal.likelihood import work
+from selfcal.likelihood import edges, work
 from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State, interval
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State
 from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
@@ -233,6 +232,9 @@ def _curves(record: Record, found: Mapping[str, Diagnosed]) -> Record:
         look = max(looks, key=lambda look: look.net, default=None)
         if look is None or look.net < module.CERTAIN or not _free(look):
             continue
+        jumps = [jump for cause in module.JUMPS if (own := CAUSES[cause].looks) for jump in own(state, record)]
+        if any(jump.net > look.net - ALIKE for jump in jumps):  # a curve of a channel that only rises has any jump
+            continue
         after = state.refit(**look.changes)
         held_out = score.gain(look, state, after, record)
         if _refuted(look, held_out):
@@ -334,10 +336,9 @@ def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
     times = {key: float(column.entry[key]) for key in TIMES if key in column.entry}
     if not times:
         return replace(column, values=regridded(column.values, span, n, state.dt))
-    edges = module.sharpened([*times.values()], [state], span)
-    begin, end = round(edges[0] / state.dt), round(edges[1] / state.dt) if len(edges) > 1 else n
-    entry = {**column.entry, **dict(zip(times, edges, strict=True))}
-    return replace(column, values=step.raised(n, begin, end), entry=entry)
+    places = [round(time / state.dt) for time in module.sharpened([*times.values()], [state], span)]
+    entry = {**column.entry, **{key: place * state.dt for key, place in zip(times, places, strict=True)}}
+    return replace(column, values=edges.raised(n, *places), entry=entry)
 
 
 def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], state: State) -> Finding:
@@ -345,15 +346,11 @@ def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], stat
     finding = replace(finding, record=means, round=0)
     of_name = {column.name: column.entry for column in columns}
     entry = next((of_name[own.name] for own in finding.columns if own.name in of_name), {})
-    edges = [float(entry[key]) for key in TIMES if key in entry]
-    places = np.array([round(edge / state.dt) for edge in edges], int)
-    if not edges or not np.isfinite(state.y[np.concatenate([places - 1, np.minimum(places, state.y.size - 1)])]).all():
+    places = np.array([round(float(entry[key]) / state.dt) for key in TIMES if key in entry], int)
+    about = np.concatenate([places - 1, np.minimum(places, state.y.size - 1)])
+    if not places.size or not np.isfinite(state.y[about]).all():
         return finding
-    width = state.dt / math.sqrt(12.0)
-    times = {"time_s": interval(edges[0] - 0.5 * state.dt / state.block, width, "s")}
-    if len(edges) > 1:
-        times["duration_s"] = interval(edges[1] - edges[0], math.sqrt(2.0) * width, "s")
-    estimate = {**finding.look.estimate, **times}
+    estimate = {**finding.look.estimate, **edges.known(state, places, np.ones(places.size))}
     return replace(finding, look=replace(finding.look, estimate=estimate))
 
 

@@ -19,12 +19,12 @@ from scipy.special import logsumexp, softmax
 
 from selfcal.base.grid import half_means
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
-from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SMOOTHINGS, LONGEST_LAG
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
 from selfcal.likelihood.columns import LN_SLOW
+from selfcal.likelihood.edges import scan
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
     Act,

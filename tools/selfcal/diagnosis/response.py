@@ -42,7 +42,8 @@ FREQUENCIES = 60
 ROUNDS = 2
 #: A misfit is named that chance makes once in so many records.
 MISFIT = 500.0
-LOW, HIGH = 0.5 - PROBABILITY / 2.0, 0.5 + PROBABILITY / 2.0
+#: Quantiles of an interval.
+ENDS = tuple(0.5 + end * PROBABILITY / 2.0 for end in (-1.0, 0.0, 1.0))
 #: How the readings of a held input were taken.
 LINES = "straight lines between readings"
 NO_INFLUENCE = "this record shows no influence of the input"
@@ -262,7 +263,7 @@ def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
         key: {
             "mean": float(draws.mean()),
             "sd": float(draws.std()),
-            **dict(zip(("q05", "median", "q95"), np.quantile(draws, (LOW, 0.5, HIGH)).tolist(), strict=True)),
+            **dict(zip(("q05", "median", "q95"), np.quantile(draws, ENDS).tolist(), strict=True)),
             "unit": "s" if key.endswith("_s") else named.get(key, coefficient_unit(output, unit)),
         }
         for key, draws in values.items()
@@ -309,9 +310,9 @@ def _band(pooled: Pooled, n: int, dt: float) -> dict[str, list[float]]:
     """Gain and phase over frequency with their 90 % bands, point by point."""
     frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, FREQUENCIES)
     G = pooled.of(lambda one: one.at(frequency), pooled.each[0].structure.keys[0])
-    gain = np.quantile(np.abs(G), (LOW, 0.5, HIGH), axis=0)
+    gain = np.quantile(np.abs(G), ENDS, axis=0)
     middle = G.mean(axis=0)
-    turn = np.quantile(np.angle(G / middle), (LOW, 0.5, HIGH), axis=0)
+    turn = np.quantile(np.angle(G / middle), ENDS, axis=0)
     phase = np.degrees(np.unwrap(np.angle(middle)) + turn)
     named = {"gain_q05": gain[0], "gain": gain[1], "gain_q95": gain[2]}
     named |= {"phase_deg_q05": phase[0], "phase_deg": phase[1], "phase_deg_q95": phase[2]}

@@ -19,7 +19,7 @@ from selfcal.base.units import FLICKER_FLOOR
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import Fit, passed, run
+from selfcal.likelihood.fit import passed, run
 from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
@@ -35,13 +35,8 @@ WALK_LEAST = 3.0
 BIAS_S = 60.0
 
 
-@dataclass(frozen=True)
-class Sequential:
-    """One model along the record: ln evidence [marks] of the samples before each mark, and by horizon the bias that
-    is predicted from each of its places."""
-
-    ln_evidence: Array
-    bias: Mapping[float, Array]
+#: ln evidence [marks] of the samples before each mark; by horizon the bias that is predicted from each of its places.
+Sequential = tuple[Array, Mapping[float, Array]]
 
 
 @dataclass(frozen=True)
@@ -89,12 +84,12 @@ def gain(
         old = _sequential(before, cut.marks, {})
         one, two = (_residual(state, split) for state in (before, partner))
         more, sd = cause.score.together(one, two, before.dt, split, look.estimate)
-        scores = cut.scores(old.ln_evidence)
+        scores = cut.scores(old[0])
         return _held_out(cut, scores, scores + more, sd, before.unit, {})
     horizons = _horizons(before.dt, n, split)
     cut = replace(cut, marks=np.union1d(cut.marks, np.concatenate([*horizons.values(), cut.edges])))
     old, new = (_sequential(state, cut.marks, horizons) for state in (before, after))
-    scores, later = cut.scores(old.ln_evidence), cut.scores(new.ln_evidence)
+    scores, later = cut.scores(old[0]), cut.scores(new[0])
     at = int(np.searchsorted(cut.edges, _begin(before, after, split), "right")) - 1
     later[at] -= _price(look, before, after, split) / cut.sizes[at]
     sd = float((later - scores).std(ddof=1)) / math.sqrt(PIECES)
@@ -213,7 +208,7 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
         horizon: (weight[:, np.searchsorted(marks, places)] * bias[horizon]).sum(axis=0)
         for horizon, places in horizons.items()
     }
-    return Sequential(logsumexp(ln_evidence, axis=0), predicted)
+    return logsumexp(ln_evidence, axis=0), predicted
 
 
 def _residual(state: State, split: int) -> Array:
@@ -242,7 +237,7 @@ def _errors(
     for horizon, places in horizons.items():
         first = places + _ahead(horizon, state.dt) - 1
         read = np.array([_mean(state.y[at : at + window]) for at in first])
-        errors = [one.bias[horizon] - read for one in (old, new)]
+        errors = [one[horizon] - read for _, one in (old, new)]
         good = np.isfinite(errors[0]) & np.isfinite(errors[1])
         if good.sum() < 10:
             continue
@@ -263,7 +258,7 @@ def numbers(state: State) -> dict[str, float]:
     """N, K and B of plain white noise and random walk fitted beside the model of a state, in the axis' unit; 0 where
     the record shows none. B is that of the model's flicker noise, else by the minimum of the Allan deviation."""
     plain, best = next(one for one in state.fits if one.terms.walk), state.best
-    N, K = plain.N * _low_gain(plain), plain.K
+    N, K = plain.N_of_color, plain.K
     if not K * plain.duration_s > WALK_LEAST * N:
         K = 0.0
     if best.terms.flicker:
@@ -295,11 +290,3 @@ def inflation(before: State, after: State) -> Mapping[str, float]:
         return dict.fromkeys(("N", "K", "B"), 1.0)
     old, new = numbers(before), numbers(after)
     return {name: old[name] / new[name] if new[name] else math.inf if old[name] else 1.0 for name in new}
-
-
-def _low_gain(one: Fit) -> float:
-    """Amplitude of the white noise at 0 Hz over its own standard deviation."""
-    if not one.terms.color:
-        return 1.0
-    m = math.tanh(one.value("color"))
-    return (1.0 + m) / math.sqrt(1.0 + m * m) if one.terms.color == "ma" else math.sqrt((1.0 + m) / (1.0 - m))

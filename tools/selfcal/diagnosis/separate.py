@@ -18,7 +18,7 @@ from scipy.special import logsumexp
 
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import states_of
-from selfcal.likelihood.columns import Shape, grids_of
+from selfcal.likelihood.columns import Shape, possible
 from selfcal.likelihood.fit import Fit, Series, ln_likelihood, run
 from selfcal.likelihood.state import Look, Regressor, State
 from selfcal.likelihood.statemodel import Array, Terms, matrices
@@ -31,6 +31,8 @@ NATS, SHARE, DRAWN = 10.0, 0.9, 40
 SIZES = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 #: Samples in the time of the first record, and the length of the longest planned one over it.
 SAMPLES, LONGEST = 128, 4
+#: Places of a rival's numbers, about.
+NODES = 9
 
 
 @dataclass(frozen=True)
@@ -79,9 +81,8 @@ def _nested(a: Shape, b: Shape) -> bool:
 
 def _known(shape: Shape, state: State) -> Rival:
     """A shape by the first record."""
-    found = grids_of(state, shape)
-    k = len(found)
-    shapes = shape.near(list(product(*(one[k :: 2 * k] for one in found)))) if found else [shape]
+    points, _ = possible(state, shape)
+    shapes = shape.near(np.exp(points[:: 1 + len(points) // NODES])) if shape.numbers else [shape]
     blocks = [np.array([column.values for column in one.regressors]) for one in shapes]
     drifts = [state.best.shrunk(-size) for size in SIZES]
     sums = [list(state.beside(one.terms, one.theta, blocks)) for one in drifts]

@@ -7,7 +7,7 @@ are simulated from the fitted model with the recording's own length, gaps, latti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -72,10 +72,10 @@ class Judged:
     p: float
 
 
-def all_statistics(w: Array, y: Array | None, lsb: float, response: Response | None = None) -> dict[str, float]:
-    """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read.
-
-    Without the `response` to a step of the bias no jumps are looked for."""
+def all_statistics(
+    w: Array, y: Array | None, lsb: float, jumps: Callable[[Array], float] | None = None
+) -> dict[str, float]:
+    """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read."""
     present = np.isfinite(w)
     x = w[present]
     n = x.size
@@ -109,9 +109,8 @@ def all_statistics(w: Array, y: Array | None, lsb: float, response: Response | N
     for size in SEGMENTS:
         if filled.size >= 4 * size:
             found[f"spectrogram_of_{size}_samples"] = _uneven(np.clip(filled, -5.0, 5.0), size)
-    jumps = None if response is None else _jumps(np.clip(filled, -5.0, 5.0), response)
     if jumps is not None:
-        found["jumps_of_the_bias"] = jumps
+        found["jumps_of_the_bias"] = jumps(np.clip(filled, -5.0, 5.0))
     clipped = np.clip(x, -12.0, 12.0)
     squared = clipped * clipped
     found["innovation_excess_kurtosis"] = (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0)
@@ -216,44 +215,28 @@ def _uneven(x: Array, size: int) -> float:
     return (float((cells**2).mean()) - 2.0) * math.sqrt(cells.size / 20.0)
 
 
-@dataclass(frozen=True)
-class Response:
-    """How residuals answer a unit step of the bias, over places of `block` samples each: `count` of them, and the times
-    that the drift `forgets` among them. `spectrum`: of the answer, padded to `padded` places. `size` [count]: root of
-    the information of a step at each place."""
-
-    block: int
-    count: int
-    forgets: float
-    padded: int
-    spectrum: NDArray[np.complex128]
-    size: Array
-
-
-def response_of(answer: Array) -> Response:
-    """`answer` [n]: residuals to a unit step at the first sample."""
+def jumps_of(answer: Array) -> Callable[[Array], float] | None:
+    """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger.
+    `answer` [n]: residuals to a unit step of the bias at the first sample. None where the drift forgets too seldom for
+    a kurtosis. A long record is looked at in blocks."""
     block = max(1, answer.size // JUMP_PLACES)
     count = answer.size // block
     g = answer[: count * block].reshape(count, block).sum(axis=1)
     forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
-    padded = 2 * next_fast_len(count)
-    # A step near the end is known by few samples.
-    return Response(block, count, forgets, padded, np.conj(rfft(g, padded)), np.sqrt(np.cumsum(g**2)[::-1]))
-
-
-def _jumps(x: Array, response: Response) -> float | None:
-    """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger.
-
-    None where the drift forgets too seldom for a kurtosis."""
-    count, block = response.count, response.block
-    if response.forgets < TURNS_LEAST:
+    if forgets < TURNS_LEAST:
         return None
-    x = x[: count * block].reshape(count, block).sum(axis=1)
-    scores = irfft(rfft(x, response.padded) * response.spectrum, response.padded)[:count] / response.size
-    scores = scores[: max(50, count - count // 20)]
-    scores -= scores.mean()
-    squared = scores**2
-    return (float((squared**2).mean()) / float(squared.mean()) ** 2 - 3.0) * math.sqrt(response.forgets / 24.0)
+    padded = 2 * next_fast_len(count)
+    spectrum, size = np.conj(rfft(g, padded)), np.sqrt(np.cumsum(g**2)[::-1])
+    known = max(50, count - count // 20)  # a step near the end is known by few samples
+
+    def jumps(x: Array) -> float:
+        x = x[: count * block].reshape(count, block).sum(axis=1)
+        scores = (irfft(rfft(x, padded) * spectrum, padded)[:count] / size)[:known]
+        scores -= scores.mean()
+        squared = scores**2
+        return (float((squared**2).mean()) / float(squared.mean()) ** 2 - 3.0) * math.sqrt(forgets / 24.0)
+
+    return jumps
 
 
 def _power(x: Array, count: int) -> Array:
@@ -417,13 +400,13 @@ def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tu
 
 def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
     """Every statistic of the state against `count` records of its model."""
-    response = response_of(_step_response(state.series, state.best))
-    measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, response)
+    jumps = jumps_of(_step_response(state.series, state.best))
+    measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, jumps)
     if SPREAD in measured:
         return Judged([Statistic(SPREAD, measured[SPREAD], 0.9, 1.1, 0.0)], 0.0)
     rows = []
     for w, y in _drawn(state, np.random.default_rng(seed), count):
-        found = all_statistics(w, None if state.redrawn else y, state.lsb, response)
+        found = all_statistics(w, None if state.redrawn else y, state.lsb, jumps)
         rows.append([found.get(name, math.nan) for name in measured])
     sample = np.array(rows).reshape(count, len(measured))
     usual = np.isfinite(sample).sum(axis=0) >= FEWEST

@@ -8,7 +8,7 @@ the ratio of multitaper spectra, with no model at all.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -20,9 +20,9 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.forms import LONGEST_LAG, agreement, whitened
-from selfcal.likelihood.columns import LN_SLOW
-from selfcal.likelihood.fit import Fit, Sums, ln_det, ln_likelihood, refit, run
+from selfcal.diagnosis.forms import LONGEST_LAG, agreement
+from selfcal.likelihood.columns import LN_SLOW, NODES_MOST, POSSIBLE, nodes, top
+from selfcal.likelihood.fit import Fit, Sums, left, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
 from selfcal.model.forms import POWER, played, slope
@@ -36,15 +36,10 @@ PROBABILITY = 0.9
 STIFF, ROUGH = (-10.0, 25.0), 30
 #: Factors between a filter's numbers that are tried first, beside 2.
 COARSE = {"pure_delay_s": 1.6, "damping": 3.0}
-#: Steps of their logarithms from there on: the first, and the last.
-STEP_FIRST, STEP_LAST = 0.35, 0.005
-#: Draws of a posterior, from points within so many nats of the best one. A drift whose weight is less by so many nats
-#: than the likeliest's is none of them.
-DRAWS, POSSIBLE, WEIGHTY = 4000, 6.0, 5.0
-#: Steps of the drift's parameters at least and at most, and nodes of a lattice at most. Steps of the filter's numbers,
-#: standard deviations; how far off these are looked for first, and how often.
-NODE_STEPS, NODES_MOST = (0.05, 0.7), 150
-NODE, REACH_FIRST, REACHES = 0.5, 0.01, 10
+#: Draws of a posterior. A drift whose weight is less by so many nats than the likeliest's is none of them.
+DRAWS, WEIGHTY = 4000, 5.0
+#: Steps of the drift's parameters at least and at most.
+NODE_STEPS = (0.05, 0.7)
 #: Price of a number of a structure beside half BIC, nats: several structures have one more than a lag, each another.
 LN_CHOICE = 1.0
 #: ln of the number of independent looks: the structures and their numbers.
@@ -211,6 +206,10 @@ class Drive:
         more = [one * v for one in before] if "square" in structure.keys else []
         return np.array([*map(of, structure.keys), *before, *more])
 
+    def each(self, structure: Structure, points: Iterable[Sequence[float] | Array]) -> list[Array]:
+        """The columns at several points."""
+        return [self.columns(structure, tuple(map(float, point))) for point in points]
+
 
 def quiet(values: Array, lattice: float = 0.0) -> Array:
     """[n]: what readings [n] with a noise of their own are of: an integrated random walk, whose size the readings
@@ -293,38 +292,18 @@ class Posterior:
 def tried(state: State, drive: Drive, structure: Structure) -> Tried:
     """A structure at its best point: of those tried first, and the numbers of a filter then looked for between them."""
     points = drive.points(structure)
-    blocks = [drive.columns(structure, one) for one in points]
+    blocks = drive.each(structure, points)
     drifts = [state.best, *state.stiffer(1.5)]
-    columns = blocks[int(np.argmax(np.max([state.scores(blocks, at) for at in drifts], axis=0)))]
-    gain, fit = state.with_columns(columns)
-    place = int(np.argmax(state.scores(blocks, fit)))
-    point, columns = points[place], blocks[place]
+    fit = state.with_columns(blocks[int(np.argmax(np.max([state.scores(blocks, at) for at in drifts], axis=0)))])[1]
+    point = points[int(np.argmax(state.scores(blocks, fit)))]
     if structure.shape:
-
-        def score(some: Sequence[Point]) -> Array:
-            return state.scores([drive.columns(structure, one) for one in some], fit)
-
-        point = _top(score, point, drive.limits(structure))
-        columns = drive.columns(structure, point)
+        known = fit
+        found = top(lambda some: state.scores(drive.each(structure, some), known), point, drive.limits(structure))
+        point = tuple(found.tolist())
+    columns = drive.columns(structure, point)
     gain, fit = state.with_columns(columns)
     free = len(columns) + len(structure.shape)
     return Tried(structure, point, columns, gain, gain - free * (0.5 * math.log(fit.n) + LN_CHOICE), fit)
-
-
-def _top(score: Callable[[Sequence[Point]], Array], start: Point, limits: Array) -> Point:
-    """The point of the highest score from `start` on, by ever shorter steps of the numbers' logarithms."""
-    moves = np.array([move for move in product((-1.0, 0.0, 1.0), repeat=len(limits)) if any(move)])
-    here, step = np.log(start), STEP_FIRST
-    best = float(score([start])[0])
-    while step > STEP_LAST:
-        near = np.clip(here + step * moves, *np.log(limits).T)
-        values = score([tuple(one) for one in np.exp(near).tolist()])
-        place = int(np.argmax(values))
-        if values[place] > best + 1e-3:
-            here, best = near[place], float(values[place])
-        else:
-            step /= 2.0
-    return tuple(np.exp(here).tolist())
 
 
 def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
@@ -358,8 +337,15 @@ def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterio
     """Draws over coefficients, the filter's numbers, and the drift: every near one, and its parameters."""
     structure = one.structure
     drifts = _drifts(state, one.columns, one.fit)
-    points, steps = _nodes(state, drive, one, drifts)
-    blocks = [drive.columns(structure, tuple(point)) for point in np.exp(points).tolist()]
+    far = [max(drifts, key=lambda node: node[3]), max(drifts, key=lambda node: node[2])]
+
+    def scores(some: Array) -> Array:
+        each = drive.each(structure, some)
+        return np.array([state.scores(each, replace(fit, theta=theta)) for fit, theta, _, _ in far])
+
+    # At the likeliest drift, and at the largest, which leaves most possible.
+    points, steps = nodes(scores, one.point, drive.limits(structure))
+    blocks = drive.each(structure, np.exp(points))
     k = len(one.columns)
     ln_weight, means, roots, places = [], [], [], []
     for fit, theta, ln_share, _ in drifts:
@@ -381,59 +367,6 @@ def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterio
     return Posterior(structure, c[:, : len(structure.keys)], shape)
 
 
-def _nodes(
-    state: State, drive: Drive, one: Tried, drifts: Sequence[tuple[Fit, Array, float, float]]
-) -> tuple[Array, Array]:
-    """Logarithms of the filter's numbers that the record leaves possible [points, m], on a lattice about the best with
-    the steps [m, m], its columns. At the likeliest drift, and at the largest, which leaves most possible."""
-    limits = np.log(drive.limits(one.structure))
-    if not limits.size:
-        return np.empty((1, 0)), np.empty((0, 0))
-    far = [max(drifts, key=lambda node: node[3]), max(drifts, key=lambda node: node[2])]
-
-    def scores(some: Array) -> Array:
-        blocks = [drive.columns(one.structure, tuple(x)) for x in np.exp(some).tolist()]
-        return np.array([state.scores(blocks, replace(fit, theta=theta)) for fit, theta, _, _ in far])
-
-    middle, m = np.log(one.point), len(limits)
-    top = scores(middle[None])
-    reach = np.full(m, REACH_FIRST)
-    for _ in range(REACHES):
-        values = scores(np.clip(middle + np.vstack([np.diag(reach), -np.diag(reach)]), *limits.T))[0]
-        fall = top[0, 0] - values.reshape(2, m).max(axis=0)
-        if np.all(fall > 0.3):
-            break
-        reach = np.where(fall > 0.3, reach, 1.6 * reach)
-    stencil = np.array(list(product((-1.0, 0.0, 1.0), repeat=m)))
-    values = scores(np.clip(middle + stencil * reach, *limits.T))[0]
-    # A parabola through the stencil.
-    pairs = [(i, j) for i in range(m) for j in range(i, m)]
-    products = [stencil[:, i] * stencil[:, j] for i, j in pairs]
-    design = np.column_stack([np.ones(len(stencil)), stencil, *products])
-    bend = np.linalg.lstsq(design, values, rcond=None)[0][1 + m :]
-    curvature = np.zeros((m, m))
-    for (i, j), value in zip(pairs, bend, strict=True):
-        curvature[i, j] -= value
-        curvature[j, i] -= value
-    sizes, ways = np.linalg.eigh(curvature)
-    steps = NODE * (reach[:, None] * ways) / np.sqrt(np.maximum(sizes, 0.1))
-    found: dict[tuple[int, ...], Array] = {}
-    seen = waiting = {(0,) * m}
-    most = top[:, 0]
-    while waiting and len(found) < NODES_MOST:
-        inside = [at for at in waiting if np.all(np.abs(np.clip(x := middle + steps @ at, *limits.T) - x) < 1e-9)]
-        if not inside:
-            break
-        values = scores(np.array([middle + steps @ at for at in inside])).T
-        most = np.maximum(most, values.max(axis=0))
-        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > most - POSSIBLE)}
-        found |= near
-        moves = [(j, way) for j in range(m) for way in (1, -1)]
-        waiting = {tuple(x + way * (i == j) for i, x in enumerate(at)) for at in near for j, way in moves} - seen
-        seen = seen | waiting
-    return np.array([middle + steps @ at for at in found]), steps
-
-
 def _ln_weight(sums: Sums) -> float:
     """ln likelihood with every coefficient integrated out. At its maximum, columns like a drift would leave too little
     of the drift."""
@@ -450,7 +383,7 @@ def _drifts(state: State, block: Array, known: Fit) -> list[tuple[Fit, Array, fl
     fits = [state.fitted_with(terms, block) for terms in state.bases()]
     fits = fits if known.terms in state.bases() else [known]
     walk = max(one.ln_likelihood for one in fits if one.terms.walk)
-    nodes: list[tuple[Fit, Array, float, float]] = []
+    kept: list[tuple[Fit, Array, float, float]] = []
     for fit in fits:
         terms = fit.terms
         if not terms.walk and fit.ln_likelihood < walk + ALIKE:
@@ -475,9 +408,9 @@ def _drifts(state: State, block: Array, known: Fit) -> list[tuple[Fit, Array, fl
         for place, value in found.items():
             if value > most - POSSIBLE:
                 theta = fit.theta + steps * place
-                nodes.append((fit, theta, volume + float(theta[is_size].sum()), volume + value))
-    most = max(node[3] for node in nodes)
-    return [node for node in nodes if node[3] > most - WEIGHTY]
+                kept.append((fit, theta, volume + float(theta[is_size].sum()), volume + value))
+    most = max(node[3] for node in kept)
+    return [node for node in kept if node[3] > most - WEIGHTY]
 
 
 def held_out(state: State, one: Tried) -> float:
@@ -510,12 +443,10 @@ def left_over(state: State, drive: Drive, one: Tried) -> float:
     uneven = behind(np.abs(drive.u - v), drive.dt, number)[0]
     own = one.columns[: len(one.structure.keys)]
     foreign = np.array([drive.u, v**2, v**3, own[0] * np.linspace(-1.0, 1.0, v.size), uneven])
-    w, columns, q = whitened(replace(state, fits=(one.fit,)), np.vstack([own, foreign]), one.columns)
-    w -= q @ (q.T @ w)
+    w, *others = left(state.series.beside(one.columns), one.fit, foreign).T
     found = []
-    for k, column in enumerate(columns):
-        u = column if k < len(own) else column - q @ (q.T @ column)
-        if float(u @ u) > 1e-6 * float(column @ column):
+    for u in (*left(state.series, one.fit, own).T[1:], *others):
+        if float(u @ u) > 0.0:
             chi, bands = agreement(u, w, any_phase=True)
             found += [net(0.5 * chi, 2 * bands), net(0.5 * float(u @ w) ** 2 / float(u @ u) / float(np.var(w)))]
     return max(found) - math.log(len(found))

@@ -24,8 +24,6 @@ from selfcal.likelihood.state import NET_LEAST, Look, State
 
 #: Pictures of the checks of `identify`, by the beginning of their names.
 SHOWN = (("innovation_mean", "innovation_means"), ("innovation_ln_variance", "noise_level"))
-#: ln of the number of looks at an axis.
-LN_TWICE = math.log(2.0)
 #: Probability that the statistics call an axis of a fitting record inadequate, and that a channel's coherence does.
 P_FAMILY, P_COHERENCE = 2e-3, 5e-4
 #: Drift within a block of means over its white noise from which on the means alone show nothing: sqrt(6), less a tenth.
@@ -83,7 +81,7 @@ def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted:
     if not strongest.look.changes and moves_within(looks[0].state, means.state.dt):
         return looks[0]
     least = NET_LEAST if strongest.look.changes else -math.log(P_FAMILY)
-    return means if strongest.look.net >= least + LN_TWICE else looks[0]
+    return means if strongest.look.net >= least + math.log(len(looks)) else looks[0]
 
 
 def moves_within(state: State, block_s: float) -> bool:

@@ -40,13 +40,13 @@ SMALLER = (1.5, 3.0)
 #: Forms of a family that are fitted: those that rank best. After the first one only forms whose score is within so many
 #: nats, and this share of the best, of what a form needs to be taken, or to be as likely as the best.
 FITTED, FIT_ADDS, COARSE = 3, 3.0, 0.05
-#: Numbers between those of the grid: places on either side of the best, over so many octaves.
-FINER, REACHES = 4, (1.0, 0.25)
+#: Numbers between those of the grid: steps of their logarithms, the first and the last.
+STEP_FIRST, STEP_LAST = 0.35, 0.005
 #: Worth from which on a shape may be named, or be as likely as the one that is, nats.
 NEARLY = NET_LEAST - ALIKE
-#: A number's posterior reaches to where ln likelihood is this much lower, in reaches a factor 2 apart, and has so many
-#: places: of one number, and of each of two.
-LOWER, REACH_LEAST, PLACES = 6.0, 0.002, (17, 11)
+#: A number's posterior is on a lattice of such steps, standard deviations, as far as ln likelihood is this much lower,
+#: with so many nodes at most. How far off the standard deviation is looked for first, and how often.
+NODE, POSSIBLE, NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
 
 
 @dataclass(frozen=True)
@@ -66,20 +66,29 @@ class Shape:
 
     columns     [k, n]: those whose coefficients are the estimate's, `keys` with their units.
     regressors  the same space as columns of the model file.
-    price       ln of the number of independent looks of its search.
+    price       ln of the number of independent looks of its search, or that by the gain.
     free        degrees of freedom of its gain.
     numbers     theta, and `moved`, the shape at other numbers.
+    sharper     the best shape beside a fit, in the place of a search among other numbers.
+    where       when or at which frequency it is, by its fit; `when` of a Look.
     stated      what the estimate says beside.
+    measure     its posterior, of a family that knows more of it than `measured` does.
+
+    Fewer keys than columns: the last one is the norm of the next two coefficients, sine and cosine of a line.
     """
 
     form: str
     columns: Array
     regressors: tuple[Regressor, ...]
     keys: tuple[tuple[str, str], ...]
-    price: float = 0.0
+    price: float | Callable[[float], float] = 0.0
     free: int = 1
     numbers: tuple[Number, ...] = ()
     moved: Callable[[Sequence[float]], Shape] | None = None
+    sharper: Callable[[Fit], Shape] | None = None
+    where: Callable[[Fit], Mapping[str, Any]] = field(default=lambda fit: {})
+    when: tuple[float, float] | None = None
+    measure: Callable[[State], Mapping[str, Any]] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -88,13 +97,17 @@ class Shape:
 
     def worth(self, gain: float) -> float:
         """A gain net of the search."""
-        return net(gain, self.free, self.price)
+        return net(gain, self.free, self.price(gain) if callable(self.price) else self.price)
 
-    def near(self, thetas: Sequence[Sequence[float]]) -> list[Shape]:
-        """The shapes at other numbers, within their limits."""
+    @property
+    def limits(self) -> Array:
+        """Least and most [m, 2] of the numbers."""
+        return np.array([(one.low, one.high) for one in self.numbers])
+
+    def near(self, thetas: Iterable[Array]) -> list[Shape]:
+        """The shapes at other numbers [g, m], within their limits."""
         assert self.moved is not None, self.form
-        low, high = (np.array([getattr(one, key) for one in self.numbers]) for key in ("low", "high"))
-        return [self.moved([float(x) for x in np.clip(theta, low, high)]) for theta in thetas]
+        return [self.moved(np.clip(theta, *self.limits.T).tolist()) for theta in thetas]
 
 
 @dataclass(frozen=True)
@@ -140,26 +153,47 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
         better = max((j for j, one in enumerate(shapes) if one.form == best.shape.form), key=lambda j: gains[j])
         if better != k and gains[better] > best.gain:
             best = fitted(state, shapes[better])
-        best = _between(state, best)
-        if slow:
+        best = between(state, best)
+        if slow and best.net >= 1.0:
             best = replace(best, gain=min(best.gain, state.rich_gain(best.shape.columns)))
         done[best.shape.form] = best
     # A form whose score alone is known is fitted by who takes it: only a finding needs that.
     return {form: done[form] for form in dict.fromkeys(one.form for one in shapes) if form in done}
 
 
-def _between(state: State, best: Tried) -> Tried:
+def between(state: State, best: Tried) -> Tried:
     """The best numbers between those of the grid. Where the price is that of the grid alone, they gain nothing."""
-    paid, grid = best.shape.free > len(best.shape.columns), best.gain
-    for reach in REACHES if best.shape.numbers and best.net > NEARLY else ():
-        moves = np.exp2(reach * np.linspace(-1.0, 1.0, 2 * FINER + 1))
-        shapes = best.shape.near(
-            [[*np.multiply(best.shape.theta, by)] for by in product(moves, repeat=len(best.shape.numbers))]
-        )
-        gains = state.scores([one.columns for one in shapes], best.fit)
-        moved = fitted(state, shapes[int(gains.argmax())]) if gains.max() > best.gain else best
-        best = moved if moved.gain > best.gain else best
-    return best if paid else replace(best, gain=grid)
+    if best.net <= NEARLY:
+        return best
+    if best.shape.sharper is not None:
+        moved = fitted(state, best.shape.sharper(best.fit))
+        return moved if moved.gain > best.gain else best
+    if not best.shape.numbers:
+        return best
+
+    def score(thetas: Array) -> Array:
+        return state.scores([one.columns for one in best.shape.near(thetas)], best.fit)
+
+    moved = fitted(state, *best.shape.near([top(score, best.shape.theta, best.shape.limits)]))
+    if best.shape.free == len(best.shape.columns):
+        moved = replace(moved, gain=best.gain)
+    return moved if moved.gain >= best.gain else best
+
+
+def top(score: Callable[[Array], Array], start: Sequence[float], limits: Array) -> Array:
+    """The numbers [m] of the highest score [g] of [g, m] from `start` on, by ever shorter steps of their logarithms."""
+    moves = np.array([move for move in product((-1.0, 0.0, 1.0), repeat=len(limits)) if any(move)])
+    here, step = np.log(start), STEP_FIRST
+    best = float(score(np.exp(here)[None])[0])
+    while step > STEP_LAST:
+        near = np.clip(here + step * moves, *np.log(limits).T)
+        values = score(np.exp(near))
+        place = int(np.argmax(values))
+        if values[place] > best + 1e-3:
+            here, best = near[place], float(values[place])
+        else:
+            step /= 2.0
+    return np.asarray(np.exp(here))
 
 
 def alike(found: Mapping[str, Tried]) -> list[Tried]:
@@ -170,84 +204,128 @@ def alike(found: Mapping[str, Tried]) -> list[Tried]:
     return sorted(near, key=lambda one: any(number.value > 0.5 * number.high for number in one.shape.numbers))
 
 
-def looks(state: State, cause: str, shapes: Sequence[Shape], dearer: Iterable[Shape] = ()) -> list[Look]:
-    """The look at a slow family, where it is worth one nat. `dearer`: forms that are tried where a first one may be
+def looks(
+    state: State, cause: str, shapes: Sequence[Shape], dearer: Iterable[Shape] = (), *, slow: bool = True
+) -> list[Look]:
+    """The look at a family, where it is worth one nat. `dearer`: forms that are tried where a first one may be
     named."""
-    found = tried(state, shapes, slow=True)
+    found = tried(state, shapes, slow=slow)
     if any(one.net > NEARLY for one in found.values()):
-        found |= tried(state, list(dearer), slow=True)
+        found |= tried(state, list(dearer), slow=slow)
     chosen = alike(found)[0] if found else None
     return [look(state, cause, chosen)] if chosen is not None and chosen.net >= 1.0 else []
 
 
 def located(state: State, cause: str, shape: Shape, known: Mapping[str, Any] | None = None) -> Look:
     """The look at a shape that is known to act: no search is paid for. `known`: posteriors of its numbers."""
-    shape = replace(shape, price=0.0, free=len(shape.columns))
+    shape = replace(shape, price=0.0, free=len(shape.columns), measure=None)
     if known is not None:
         shape = replace(shape, numbers=(), moved=None, stated={**shape.stated, **known})
-    return look(state, cause, fitted(state, shape))
+    found = fitted(state, shape)
+    return look(state, cause, between(state, found) if shape.sharper else found)
 
 
 def look(state: State, cause: str, chosen: Tried) -> Look:
     """The look at the shape that was chosen."""
     changes = {"regressors": (*state.regressors, *chosen.shape.regressors)}
-    measure = partial(measured, chosen.shape)
-    return Look(cause, chosen.gain, chosen.net, _estimate(chosen), changes, measure=measure, shape=chosen.shape)
+    measure = chosen.shape.measure or partial(measured, chosen.shape)
+    when, estimate = chosen.shape.when, _estimate(chosen)
+    return Look(cause, chosen.gain, chosen.net, estimate, changes, when=when, measure=measure, shape=chosen.shape)
 
 
 def _estimate(chosen: Tried) -> dict[str, Any]:
     """As the fit has it: its coefficients, and the best numbers alone."""
     shape, fit = chosen.shape, chosen.fit
-    places = range(fit.c.size - len(shape.keys), fit.c.size)
-    found = {
-        key: interval(float(fit.c[place]), float(fit.sd[place]), unit)
-        for (key, unit), place in zip(shape.keys, places, strict=True)
-    }
-    return {**found, **{one.key: interval(one.value, 0.0, one.unit) for one in shape.numbers}, **shape.stated}
+    k = len(shape.columns)
+    c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
+    found = {key: interval(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
+    numbers = {one.key: interval(one.value, 0.0, one.unit) for one in shape.numbers}
+    return {**shape.where(fit), **found, **numbers, **shape.stated}
+
+
+def _sizes(shape: Shape, c: Array, sd: Array) -> tuple[Array, Array]:
+    """Coefficients [..., columns] and their deviations as the keys have them."""
+    one = len(shape.keys) - 1
+    if one + 1 == len(shape.columns):
+        return c, sd
+    own = slice(one, one + 2)
+    norm, mean = np.linalg.norm(c[..., own], axis=-1, keepdims=True), sd[..., own].mean(axis=-1, keepdims=True)
+    return np.concatenate([c[..., :one], norm], axis=-1), np.concatenate([sd[..., :one], mean], axis=-1)
 
 
 def measured(shape: Shape, state: State) -> dict[str, Any]:
     """Posteriors of the coefficients and the numbers, over the drifts, the spread of their parameters, and each other.
     The prior of a number is flat in its logarithm, that of a coefficient is flat."""
-    grids = grids_of(state, shape)
-    shapes = [shape, *shape.near(list(product(*grids)))] if grids else [shape]
+    points, steps = possible(state, shape)
+    shapes = [shape, *(shape.near(np.exp(points)) if shape.numbers else [])]
     weight, means, sds = state.posterior(*(one.columns for one in shapes))
-    if grids:  # the first one is on the grid as well
+    if shape.numbers:  # the first one is on the lattice as well
         weight, means, sds = weight[1:], means[1:], sds[1:]
+    means, sds = _sizes(shape, means, sds)
     found = {
         key: mixture(weight.ravel(), means[..., j].ravel(), sds[..., j].ravel(), unit)
         for j, (key, unit) in enumerate(shape.keys)
     }
     for k, number in enumerate(shape.numbers):
-        values = np.array([one.theta[k] for one in shapes[1:]])
-        # The deviation within a cell of the grid: its width over the root of 12.
-        width = np.interp(values, grids[k], np.gradient(grids[k])) / math.sqrt(12.0)
-        found[number.key] = mixture(weight.sum(axis=1), values, width, number.unit)
+        # The deviation within a cell of the lattice: its width over the root of 12.
+        values, width = np.exp(points[:, k]), float(np.linalg.norm(steps[k])) / math.sqrt(12.0)
+        found[number.key] = mixture(weight.sum(axis=1), values, values * width, number.unit)
     return found
 
 
-def grids_of(state: State, shape: Shape) -> list[Array]:
-    """Values of each number that hold its posterior, an even step of the logarithm apart."""
+def possible(state: State, shape: Shape) -> tuple[Array, Array]:
+    """As `nodes`, of a shape's numbers beside the drift that is fitted with it."""
     if not shape.numbers:
-        return []
-    best = fitted(state, shape)
-    reach = REACH_LEAST * np.exp2(np.arange(12))
-    count = PLACES[min(len(shape.numbers), len(PLACES)) - 1]
-    grids = []
-    for k, number in enumerate(shape.numbers):
-        moves = np.concatenate([-reach[::-1], reach])
-        thetas = [[x * math.exp(move * (j == k)) for j, x in enumerate(shape.theta)] for move in moves]
-        lower = best.gain - state.scores([one.columns for one in shape.near(thetas)], best.fit)
-        ends = []
-        for side in (lower[: reach.size][::-1], lower[reach.size :]):
-            enough = np.flatnonzero(side > LOWER)
-            ends.append(float(reach[enough[0] if enough.size else -1]))
-        low, high = (
-            max(number.low, number.value * math.exp(-ends[0])),
-            min(number.high, number.value * math.exp(ends[1])),
-        )
-        grids.append(np.geomspace(low, high, count))
-    return grids
+        return np.empty((1, 0)), np.empty((0, 0))
+    fit = fitted(state, shape).fit
+
+    def scores(thetas: Array) -> Array:
+        return state.scores([one.columns for one in shape.near(thetas)], fit)[None]
+
+    return nodes(scores, shape.theta, shape.limits)
+
+
+def nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Array) -> tuple[Array, Array]:
+    """Logarithms of numbers that the record leaves possible [points, m], on a lattice about the best with the steps
+    [m, m], its columns. `scores` [d, points] of [points, m] at some drifts, the likeliest first."""
+    limits, middle, m = np.log(limits), np.log(start), len(limits)
+    if not m:
+        return np.empty((1, 0)), np.empty((0, 0))
+    best = scores(np.exp(middle)[None])[:, 0]
+    reach = np.full(m, REACH_FIRST)
+    for _ in range(REACHES):
+        moved = np.clip(middle + np.vstack([np.diag(reach), -np.diag(reach)]), *limits.T)
+        fall = best[0] - scores(np.exp(moved))[0].reshape(2, m).max(axis=0)
+        if np.all(fall > 0.3):
+            break
+        reach = np.where(fall > 0.3, reach, 1.6 * reach)
+    stencil = np.array(list(product((-1.0, 0.0, 1.0), repeat=m)))
+    values = scores(np.exp(np.clip(middle + stencil * reach, *limits.T)))[0]
+    # A parabola through the stencil.
+    pairs = [(i, j) for i in range(m) for j in range(i, m)]
+    products = [stencil[:, i] * stencil[:, j] for i, j in pairs]
+    design = np.column_stack([np.ones(len(stencil)), stencil, *products])
+    bend = np.linalg.lstsq(design, values, rcond=None)[0][1 + m :]
+    curvature = np.zeros((m, m))
+    for (i, j), value in zip(pairs, bend, strict=True):
+        curvature[i, j] -= value
+        curvature[j, i] -= value
+    sizes, ways = np.linalg.eigh(curvature)
+    steps = NODE * (reach[:, None] * ways) / np.sqrt(np.maximum(sizes, 0.1))
+    found: dict[tuple[int, ...], Array] = {}
+    seen = waiting = {(0,) * m}
+    while waiting and len(found) < NODES_MOST:
+        inside = [at for at in waiting if np.all(np.abs(np.clip(x := middle + steps @ at, *limits.T) - x) < 1e-9)]
+        if not inside:
+            break
+        values = scores(np.exp([middle + steps @ at for at in inside])).T
+        best = np.maximum(best, values.max(axis=0))
+        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > best - POSSIBLE)}
+        found |= near
+        moves = [(j, way) for j in range(m) for way in (1, -1)]
+        waiting = {tuple(x + way * (i == j) for i, x in enumerate(at)) for at in near for j, way in moves} - seen
+        seen = seen | waiting
+    return np.array([middle + steps @ at for at in found]), steps
 
 
 def least(state: State, shape: Shape, key: str) -> dict[str, tuple[float, str]]:

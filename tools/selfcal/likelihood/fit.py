@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import combinations, product
+from itertools import product
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,12 @@ from scipy.special import logsumexp
 
 from selfcal import _likelihood
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Mask, Terms, matrices
+from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Mask, Terms, matrices
 
 #: Columns that the compiled filter takes in one pass (bindings/likelihood.cpp).
 COLUMNS_MOST = 39
+#: Products of matrices that numpy leaves to one thread.
+ONE_THREAD = 200_000
 #: A column of which the others leave less than this share is one of theirs.
 SPENT = 1e-9
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
@@ -159,6 +162,14 @@ class Fit:
         low = np.array(self.terms.limits(self.dt)).reshape(-1, 2)[:, 0]
         return replace(self, theta=np.maximum(self.theta - less, low))
 
+    def of_means(self, block: int, less: float) -> Array:
+        """Its parameters for means of so many samples, sizes of the drift times e to `less`: they are relative to the
+        white noise."""
+        by = {name: 0.5 * math.log(block) for name in DRIFT_SIZES} | {"ln_rho": math.log(block)}
+        low = math.log(SIZE_LIMITS[0])
+        each = zip(self.terms.names, self.theta, strict=True)
+        return np.array([max(value + by[name] + less, low) if name in by else value for name, value in each])
+
     @property
     def N(self) -> float:
         """White noise density, unit/sqrt(Hz)."""
@@ -177,8 +188,8 @@ class Fit:
 
     @property
     def N_of_color(self) -> float:
-        """White noise density at low frequency, of a fit with memory."""
-        m = math.tanh(self.value("color"))
+        """White noise density at low frequency."""
+        m = math.tanh(self.value("color")) if self.terms.color else 0.0
         of_all = (1.0 + m) ** 2 / (1.0 + m * m) if self.terms.color == "ma" else (1.0 + m) / (1.0 - m)
         return self.N * math.sqrt(of_all)
 
@@ -210,43 +221,51 @@ def run(
 def passed(
     series: Series, terms: Terms, theta: Array, marks: Sequence[int] = (), innovations: bool = False
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances."""
+    """The same pass with its sums as arrays: G, D, n and x of each mark, innovations, and their variances. The filter
+    whitens each column by itself: where they are too many for one pass, G is of the whitened ones."""
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
     at = list(marks) or [series.y.size]
+    parts = _parts(series.columns)
 
     def of(columns: Array) -> tuple[Array, ...]:
         work.count(series.y.size, len(columns))
+        whitened = innovations or len(parts) > 1
         found: tuple[Array, ...] = _likelihood.run(
-            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver, at, innovations
+            series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver, at, whitened
         )
         return found
 
-    G, D, n, x, white, s = _whole(series.columns, of, {0: (1, 2), 3: (1,), 4: (1,)})
+    (G, D, n, x, white, s), *more = [of(part) for part in parts]
+    if more:
+        x = np.concatenate([x, *(one[3][:, 1:] for one in more)], axis=1)
+        white = np.concatenate([white, *(one[4][:, 1:] for one in more)], axis=1)
+        pieces = np.split(np.nan_to_num(white), at)[: len(at)]
+        G = np.cumsum([_products(piece) for piece in pieces], axis=0)
     return G, D, n, x, white, s
 
 
-def _whole(
-    columns: Array, of: Callable[[Array], tuple[Array, ...]], by_column: Mapping[int, tuple[int, ...]]
-) -> tuple[Array, ...]:
-    """The arrays of a pass over all columns [p, n]. A pass `of` too many is one of every pair of their parts: the
-    filter whitens each column by itself. `by_column`: array by its place -> its axes of length 1 + p."""
-    if len(columns) <= COLUMNS_MOST:
-        return of(columns)
-    parts = np.array_split(np.arange(len(columns)), math.ceil(len(columns) / (COLUMNS_MOST // 2)))
-    whole: list[Array] = []
-    for pair in combinations(parts, 2):
-        chosen = np.concatenate(pair)
-        found = of(np.ascontiguousarray(columns[chosen]))
-        rows = np.concatenate([[0], 1 + chosen])
-        if not whole:
-            whole = [one.copy() for one in found]
-            for place, axes in by_column.items():
-                shape = [1 + len(columns) if axis in axes else size for axis, size in enumerate(found[place].shape)]
-                whole[place] = np.zeros(shape)
-        for place, axes in by_column.items():
-            at = [rows if axis in axes else np.arange(size) for axis, size in enumerate(whole[place].shape)]
-            whole[place][np.ix_(*at)] = found[place]
-    return tuple(whole)
+def left(series: Series, fit: Fit, more: Array) -> Array:
+    """The record and further columns [n, 1 + k] behind the filter of a fit, less what the series' own columns explain:
+    nothing of one that is theirs, and 0 where the record is missing."""
+    white = np.nan_to_num(run(series.beside(more), fit.terms, fit.theta, innovations=True)[1])
+    k = 1 + len(series.columns)
+    q, rest = np.linalg.qr(white[:, 1:k])[0], np.delete(white, range(1, k), axis=1)
+    size = 1e-6 * (rest**2).sum(axis=0)
+    rest -= q @ (q.T @ rest)
+    rest[:, 1:] *= (rest[:, 1:] ** 2).sum(axis=0) > size[1:]
+    return rest
+
+
+def _products(rows: Array) -> Array:
+    """Sums of the products of columns [n, p], [p, p], in parts too small for threads, which wait for each other."""
+    parts = np.array_split(rows, 1 + rows.size * rows.shape[1] // ONE_THREAD)
+    return np.asarray(sum(part.T @ part for part in parts))
+
+
+def _parts(columns: Array) -> list[Array]:
+    """Columns [p, n] as the filter takes them."""
+    count = math.ceil(len(columns) / COLUMNS_MOST)
+    return [columns] if count == 1 else [np.ascontiguousarray(part) for part in np.array_split(columns, count)]
 
 
 @dataclass(frozen=True)
@@ -265,12 +284,13 @@ def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
     """One pass of the filter, and one backwards over its gains: exact beside gaps, and where the noise changes."""
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
 
-    def of(columns: Array) -> tuple[Array, ...]:
-        found = _likelihood.shifts(series.y, columns, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver)
-        return tuple(np.asarray(one) for one in found)
-
-    G, D, A, B, impulse = _whole(series.columns, of, {0: (0, 1), 3: (1,)})
-    return Shifts(Sums(G, float(D), float(series.n), np.empty(0)), A, B, impulse)
+    parts = _parts(series.columns)
+    each = [_likelihood.shifts(series.y, part, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, m.driver) for part in parts]
+    G, D, A, B, impulse = each[0]
+    if len(parts) > 1:
+        G = run(series, terms, theta)[0][0].G
+        B = np.concatenate([B, *(one[3][:, 1:] for one in each[1:])], axis=1)
+    return Shifts(Sums(G, float(D), float(series.n), np.empty((len(G), 0))), A, B, impulse)
 
 
 def ln_det(covariance: NDArray[np.floating[Any]]) -> float:
@@ -551,8 +571,8 @@ def best(fits: Sequence[Fit]) -> Fit:
     return max(fits, key=lambda one: one.ln_likelihood)
 
 
-def moved(fit_: Fit, terms: Terms) -> Array:
-    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small."""
-    known = dict(zip(fit_.terms.names, fit_.theta, strict=True))
+def moved(fit_: Fit, terms: Terms, own: Mapping[str, float] = MappingProxyType({})) -> Array:
+    """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small, or as `own`."""
+    known = {**dict(zip(fit_.terms.names, fit_.theta, strict=True)), **own}
     fresh = {"ln_rho": -6.0, "ln_markov": -2.5, "ln_alpha": -4.0, "ln_flicker": -3.0, "color": 0.2}
     return np.array([known.get(name, fresh.get(name, 0.0)) for name in terms.names])

@@ -13,6 +13,7 @@ from scipy.special import chdtrc, ndtr
 
 from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
+from selfcal.base.grid import half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Terms
 
@@ -35,6 +36,8 @@ ALIKE = 3.0
 SCREEN = 2.0
 #: Columns that one pass of the filter takes beside the model's.
 ABREAST = 8
+#: Means of a record that are enough for a first search.
+MEANS_MOST = 3000
 
 
 #: No term beside white noise and the drift.
@@ -87,6 +90,17 @@ class State:
         columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
         return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol, self.block)
 
+    def means(self, longest_s: float = math.inf) -> tuple[Series, int]:
+        """Means of blocks of `longest_s` at most, NaN where half of one is missing, and the samples of a block."""
+        n = self.y.size
+        block = max(1, int(min(n // MEANS_MOST, longest_s / self.dt)))
+        mean, used = half_means(self.y, block)
+        r, columns = (
+            rows[..., : n // block * block].reshape(*rows.shape[:-1], n // block, block).mean(axis=-1)
+            for rows in (self.r, self.series.columns)
+        )
+        return Series(mean, self.dt * block, r * block / np.maximum(used, 1), np.ascontiguousarray(columns)), block
+
     @property
     def best(self) -> Fit:
         return best(self.fits)
@@ -138,6 +152,15 @@ class State:
         """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
         fits = [self.fitted_with(terms, more) for terms in self.near()]
         return best(fits).ln_likelihood - self.best.ln_likelihood, best(fits)
+
+    def with_terms(self, own: Mapping[str, float], less: float = 0.0, **terms: Any) -> tuple[float, tuple[Fit, ...]]:
+        """Gain of ln likelihood by further terms of the noise, and the fit of every near drift with them: from the
+        parameters `own` on, and from a drift smaller by exp(-less)."""
+        near, fits = self.near(), []
+        for one in (one for one in self.fits if one.terms in near):
+            more = replace(one.terms, **terms)
+            fits.append(fit(self.series, more, moved(one.shrunk(less), more, own)))
+        return best(fits).ln_likelihood - self.best.ln_likelihood, tuple(fits)
 
     def fitted_with(self, terms: Terms, more: Array) -> Fit:
         """The fit of one drift with further columns [k, n]."""
@@ -226,12 +249,8 @@ class State:
 
     def least(self, column: Array) -> float:
         """The coefficient of a column that gains NET_LEAST at the fitted noise."""
-        series = self.series.beside(column)
-        G = run(series, self.best.terms, self.best.theta)[0][0].G / self.best.sigma**2
-        k = len(G) - 1
-        cross = G[1:k, k]
-        A = G[k, k] - cross @ np.linalg.pinv(G[1:k, 1:k], rcond=1e-12, hermitian=True) @ cross
-        return math.sqrt(2.0 * NET_LEAST / A) if 1e-9 * G[k, k] < A else math.inf
+        (sums,) = self.beside(self.best.terms, self.best.theta, [np.atleast_2d(column)])
+        return self.best.sigma * math.sqrt(2.0 * NET_LEAST / sums.G[1, 1]) if sums.G[1, 1] > 0.0 else math.inf
 
 
 def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, float]]:
@@ -241,11 +260,12 @@ def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, fl
 
 
 def gain_for(worth: Callable[[float], float]) -> float:
-    """The gain that is worth NET_LEAST after its search, over NET_LEAST."""
-    from scipy.optimize import brentq
-
-    gain = brentq(lambda gain: worth(gain) - NET_LEAST, NET_LEAST / 2.0, 10.0 * NET_LEAST)
-    return float(gain) / NET_LEAST
+    """The gain that is worth NET_LEAST after its search, over NET_LEAST: its price hardly changes with it."""
+    gain, lacks = 0.0, NET_LEAST
+    while abs(lacks) > 1e-6:
+        gain += lacks
+        lacks = NET_LEAST - worth(gain)
+    return gain / NET_LEAST
 
 
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
@@ -325,18 +345,20 @@ def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
     }
 
 
+def of_parameter(fit: Fit, name: str, unit_size: float, unit: str) -> dict[str, Any]:
+    """The posterior of a parameter of the noise whose logarithm the fit knows."""
+    sd = float(np.linalg.norm(fit.spread[fit.terms.names.index(name)]))
+    return log_normal(math.log(unit_size) + fit.value(name), sd, unit)
+
+
 def log_normal(ln_median: float, sd: float, unit: str) -> dict[str, Any]:
-    """A posterior whose logarithm is normal with this standard deviation."""
-    mean = math.exp(ln_median + 0.5 * sd**2)
+    """A posterior whose logarithm is normal with this standard deviation. Mean and width of one that is hardly known
+    are those of a deviation of 1."""
+    square = min(sd, 1.0) ** 2
+    mean = math.exp(ln_median + 0.5 * square)
     q05, median, q95 = (math.exp(ln_median + k * HALF_90 * sd) for k in (-1.0, 0.0, 1.0))
-    width = mean * math.sqrt(math.expm1(sd**2))
+    width = mean * math.sqrt(math.expm1(square))
     return {"mean": mean, "median": median, "sd": width, "q05": q05, "q95": q95, "unit": unit}
-
-
-def sizes(column: Array, key: str, unit: str, state: State) -> dict[str, Any]:
-    """The posterior of a column's coefficient in the form of the contract."""
-    weight, means, sds = (of[0] for of in state.posterior(column))
-    return {key: mixture(weight, means[:, 0], sds[:, 0], unit)}
 
 
 def mixture(weight: Array, mean: Array, sd: Array | float, unit: str) -> dict[str, Any]:

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from selfcal.diagnosis.causes import quantization_noise
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import Fit, best, fit, moved
+from selfcal.likelihood.fit import Fit, best
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, interval, net
 from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import Model
@@ -32,16 +32,11 @@ def looks(state: State, record: Record) -> list[Look]:
     if 0.5 * n * float(lags @ lags) < 2.0:
         return []
     found: list[Look] = []
-    colors: tuple[Literal["ma", "ar"], ...] = ("ma", "ar")
-    for color in colors:
-        fits, extras = [], replace(state.extras, color=color)
-        for drift in state.near():
-            terms = replace(drift, color=color)
-            start = moved(next(one for one in state.fits if one.terms == drift), terms)
-            start[terms.names.index("color")] = math.atanh(min(0.9, max(-0.9, float(lags[0]))))
-            fits.append(fit(state.series, terms, start))
+    start = math.atanh(min(0.9, max(-0.9, float(lags[0]))))
+    for color in ("ma", "ar"):
+        extras = replace(state.extras, color=color)
+        gain, fits = state.with_terms({"color": start}, color=color)
         chosen = best(fits)
-        gain = chosen.ln_likelihood - state.best.ln_likelihood
         if chosen.quantized:
             found.append(quantization_noise.look_of(chosen, gain, state, extras))
             continue

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
 from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.model_tree import add_law
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import Fit, best, fit, ln_likelihood, moved, run
-from selfcal.likelihood.state import Look, State, net
+from selfcal.likelihood.fit import Fit, best, fit, moved
+from selfcal.likelihood.state import Look, State, net, of_parameter
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The size of 1/f noise is at its limit of nothing in
 #: most of them: 11 instead of 68 showed 3 nats at the price of one look.
@@ -22,11 +21,8 @@ def looks(state: State, record: Record) -> list[Look]:
     if state.extras.flicker:
         return []
     extras = replace(state.extras, flicker=True)
-    series = state.series
-    fits = [fit(series, extras, moved(state.best, extras))]
-    for drift in (replace(extras, walk=True), replace(extras, markov=True)):
-        fits.append(fit(series, drift, moved(state.best, drift)))
-    chosen = best(fits)
+    drifts = (extras, replace(extras, walk=True), replace(extras, markov=True))
+    chosen = best([fit(state.series, drift, moved(state.best, drift)) for drift in drifts])
     gain = chosen.ln_likelihood - state.best.ln_likelihood
     worth = net(gain, 1, LN_LOOKS)
     if worth < 1.0:
@@ -36,32 +32,7 @@ def looks(state: State, record: Record) -> list[Look]:
 
 
 def _sizes(state: State, chosen: Fit) -> dict[str, Any]:
-    B = chosen.sigma * math.exp(chosen.value("ln_flicker"))
-    return {"B": _log_interval(B, _curvature(state, chosen, "ln_flicker"), state.unit)}
-
-
-def _log_interval(value: float, sd_ln: float, unit: str) -> dict[str, object]:
-    return {
-        "mean": value * math.exp(0.5 * sd_ln**2),
-        "median": value,
-        "sd": value * sd_ln,
-        "q05": value * math.exp(-1.6449 * sd_ln),
-        "q95": value * math.exp(1.6449 * sd_ln),
-        "unit": unit,
-    }
-
-
-def _curvature(state: State, chosen: Fit, name: str) -> float:
-    """Standard deviation of one parameter by the second difference of ln likelihood, the others refitted by none."""
-    k = chosen.terms.names.index(name)
-    h = 0.1
-    values = []
-    for move in (-h, 0.0, h):
-        theta = chosen.theta.copy()
-        theta[k] += move
-        values.append(ln_likelihood(run(state.series, chosen.terms, theta)[0][0]))
-    bend = (2.0 * values[1] - values[0] - values[2]) / h**2
-    return 1.0 / math.sqrt(bend) if bend > 1e-3 else 3.0
+    return {"B": of_parameter(chosen, "ln_flicker", chosen.sigma, state.unit)}
 
 
 def _extend(at: Extension) -> None:

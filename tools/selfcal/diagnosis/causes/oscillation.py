@@ -11,21 +11,20 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import HALF_90
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes import periodic
-from selfcal.diagnosis.causes.pulse import blocks, of_blocks
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import swinging
-from selfcal.likelihood.fit import Fit, Series, best, fit, ln_likelihood, run
-from selfcal.likelihood.state import ALIKE, Look, State, net
-from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array, Terms
+from selfcal.likelihood.fit import Fit, best, ln_likelihood, moved, run
+from selfcal.likelihood.state import ALIKE, Look, State, net, of_parameter
+from selfcal.likelihood.statemodel import DAMPING_LIMITS, PERIOD_LIMITS, SAMPLES_LEAST, Array
 from selfcal.model.file import Model
 from selfcal.model.laws import RATIO_LIMITS, swing
 
@@ -37,8 +36,6 @@ PER_OCTAVE, DAMPING, SWINGS, SIZES = 3.0, 0.15, (0.12, 0.35, 1.0), (0.0, 1.5, 4.
 DAMPINGS, NEAR = (0.02, 0.05, 0.15, 0.4), tuple(float(2.0 ** (k / 12.0)) for k in range(-3, 4))
 #: The prior of the size in the model file, over the size found.
 RATIOS = (0.1, 10.0)
-#: Gains of the search below this are not worth a fit.
-LEAST = 1.0
 #: Price of the search over periods beside three degrees of freedom. At 1.8 more, 3 of 800 clean hours at 1 Hz showed
 #: 3 nats, where 40 were due.
 LN_LOOKS = 1.0
@@ -51,11 +48,7 @@ def looks(state: State, record: Record) -> list[Look]:
     found = _search(state)
     if found is None:
         return []
-    extras = replace(state.extras, oscillation=True)
-    fits = [
-        fit(state.series, replace(one.terms, oscillation=True), start)
-        for one, start in ((one, _start(one, found)) for one in state.fits if one.terms in state.near())
-    ]
+    fits = state.with_terms(found, found.pop("less"), oscillation=True)[1]
     chosen = best(fits)
     # A poor drift model makes some nats of any slow term.
     none = max(state.best.ln_likelihood, 0.0 if state.extras.flicker else state.rich.ln_likelihood)
@@ -69,7 +62,7 @@ def looks(state: State, record: Record) -> list[Look]:
     line = _line(state, record, period, gain) if coherent else []
     if line:
         return line
-    changes, unit = {"extras": extras, "fits": tuple(fits)}, state.unit
+    changes, unit = {"extras": replace(state.extras, oscillation=True), "fits": fits}, state.unit
     sizes = _sizes(chosen, unit)
     return [Look("oscillation", gain, worth, sizes, changes, measure=lambda final: _sizes(final.best, unit))]
 
@@ -79,88 +72,51 @@ def _line(state: State, record: Record, period: float, gain: float) -> list[Look
     damping. Of the band in which oscillations are looked for."""
     width = 1.0 / (state.y.size * state.dt)
     tried = [1.0 / period + move * width for move in np.linspace(-1.0, 1.0, 17)]
-    gains = state.scores([np.array([*periodic.columns(f, record).values()]) for f in tried])
+    gains = state.scores([np.array([*periodic.pair(f, record).values()]) for f in tried])
     found = periodic.at(state, record, (tried[int(np.argmax(gains))],))
     if found.gain < gain - ALIKE:
         return []
     n = round(2.0 * state.y.size * state.dt / PERIOD_LIMITS[0])
-    return [replace(found, net=periodic.worth_of(found.gain, 1.0 / (period * width), n), others=("oscillation",))]
+    price = float(periodic.ln_lines(np.array(1.0 / (period * width)), n, np.array(found.gain)))
+    return [replace(found, net=net(found.gain, 2, price), others=("oscillation",))]
 
 
 def _sizes(chosen: Fit, unit: str) -> dict[str, Any]:
     return {
-        "period_s": _interval(chosen, "ln_period", 1.0, "s"),
-        "damping": _interval(chosen, "ln_damping", 1.0, "1"),
-        "sd": _interval(chosen, "ln_swing", chosen.sigma, unit),
+        "period_s": of_parameter(chosen, "ln_period", 1.0, "s"),
+        "damping": of_parameter(chosen, "ln_damping", 1.0, "1"),
+        "sd": of_parameter(chosen, "ln_swing", chosen.sigma, unit),
     }
 
 
 def _search(state: State) -> dict[str, float] | None:
     """ln of period, damping, and size over the white noise of a sample; `less`: of the drift beside it."""
-    series, block = blocks(state, PERIOD_LIMITS[0] / SAMPLES_LEAST)
+    series, block = state.means(PERIOD_LIMITS[0] / SAMPLES_LEAST)
     low = max(PERIOD_LIMITS[0], SAMPLES_LEAST * series.dt)
     high = min(PERIOD_LIMITS[1], series.duration_s / TURNS_LEAST)
     if high < low:
         return None
-    count = 1 + math.ceil(PER_OCTAVE * math.log2(high / low))
-    periods = np.geomspace(low, high, count)
-    first = [(p, DAMPING, s, less) for p in periods for s in SWINGS for less in SIZES]
-    at, value = _best_of(state, series, block, first)
-    period, _, size, less = at
-    second = [(period * by, damping, size, less) for by in NEAR for damping in DAMPINGS if low <= period * by <= high]
-    at, value = _best_of(state, series, block, second)
-    none = ln_likelihood(run(series, state.best.terms, of_blocks(state.best, block, 0.0))[0][0])
-    if value - none < LEAST:
+    terms = replace(state.best.terms, oscillation=True)
+
+    def value(numbers: tuple[float, ...]) -> float:
+        """ln likelihood of a period, a damping, a size over the white noise of a mean, and a drift smaller by exp."""
+        period, damping, size = map(math.log, numbers[:3])
+        drift = replace(state.best, theta=state.best.of_means(block, -numbers[3]))
+        theta = moved(drift, terms, {"ln_swing": size, "ln_period": period, "ln_damping": damping})
+        return ln_likelihood(run(series, terms, theta)[0][0])
+
+    periods = np.geomspace(low, high, 1 + math.ceil(PER_OCTAVE * math.log2(high / low))).tolist()
+    period, damping, size, less = max(product(periods, (DAMPING,), SWINGS, SIZES), key=value)
+    near = [period * by for by in NEAR if low <= period * by <= high]
+    period, damping, size, less = best_of = max(product(near, DAMPINGS, (size,), (less,)), key=value)
+    none = ln_likelihood(run(series, state.best.terms, state.best.of_means(block, 0.0))[0][0])
+    if value(best_of) - none < 1.0:  # not worth a fit
         return None
-    period, damping, size, less = at
     return {
         "ln_period": math.log(period),
         "ln_damping": math.log(damping),
         "ln_swing": math.log(size) - 0.5 * math.log(block),
         "less": less,
-    }
-
-
-def _best_of(
-    state: State, series: Series, block: int, tried: list[tuple[float, float, float, float]]
-) -> tuple[tuple[float, float, float, float], float]:
-    """The likeliest of period, damping, size and smallness of the drift, and its ln likelihood."""
-    terms = replace(state.best.terms, oscillation=True)
-    drift = {less: of_blocks(state.best, block, -less) for less in {one[3] for one in tried}}
-    values = [
-        ln_likelihood(run(series, terms, _theta(terms, state.best.terms, drift[less], p, d, s))[0][0])
-        for p, d, s, less in tried
-    ]
-    k = int(np.argmax(values))
-    return tried[k], values[k]
-
-
-def _theta(terms: Terms, without: Terms, drift: Array, period: float, damping: float, size: float) -> Array:
-    known = dict(zip(without.names, drift, strict=True))
-    own = {"ln_swing": math.log(size), "ln_period": math.log(period), "ln_damping": math.log(damping)}
-    return np.array([own[name] if name in own else known[name] for name in terms.names])
-
-
-def _start(one: Fit, found: Mapping[str, float]) -> Array:
-    """Where the fit begins, in the order of its parameters."""
-    terms = replace(one.terms, oscillation=True)
-    small = one.shrunk(found["less"])
-    return np.array([found[name] if name in found else small.value(name) for name in terms.names])
-
-
-def _interval(chosen: Fit, name: str, unit_size: float, unit: str) -> dict[str, Any]:
-    """Of a parameter whose logarithm is normal."""
-    k = chosen.terms.names.index(name)
-    sd = float(np.linalg.norm(chosen.spread[k]))
-    median = unit_size * math.exp(float(chosen.theta[k]))
-    mean = median * math.exp(0.5 * min(sd, 1.0) ** 2)
-    return {
-        "mean": mean,
-        "median": median,
-        "sd": mean * math.sqrt(math.expm1(min(sd, 1.0) ** 2)),
-        "q05": median * math.exp(-HALF_90 * sd),
-        "q95": median * math.exp(HALF_90 * sd),
-        "unit": unit,
     }
 
 

@@ -14,9 +14,10 @@ from scipy.ndimage import uniform_filter1d
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, Written
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.columns import LN_SLOW
-from selfcal.likelihood.fit import Fit, finish, fit, moved
-from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, gain_for, interval, mixture, net
+from selfcal.likelihood import columns
+from selfcal.likelihood.columns import LN_SLOW, Shape
+from selfcal.likelihood.fit import Fit, fit, moved
+from selfcal.likelihood.state import Look, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array, Mask
 
 #: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
@@ -62,53 +63,43 @@ def _band(state: State, record: Record) -> list[Look]:
         if width > power.size // 8:
             break
         mean = uniform_filter1d(power, width, mode="reflect")
-        gain = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
-        gain[: max(low + width, NARROW * width)] = 0.0
-        at = int(np.argmax(gain))
-        if best is None or gain[at] > best[0]:
-            best = (float(gain[at]), at, width)
+        gains = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
+        gains[: max(low + width, NARROW * width)] = 0.0
+        at = int(np.argmax(gains))
+        if best is None or gains[at] > best[0]:
+            best = (float(gains[at]), at, width)
     if best is None:
         return []
     ln_places = math.log(max(1.0, 0.5 * count)) + 1.0
     if net(best[0], 2, ln_places) < BAND_LEAST or len(state.extras.bands) >= BANDS_MOST:
         return []
     f, width_hz = best[1] / (n * state.dt), best[2] / (n * state.dt)
+    size, wide = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count)), math.log(max(1.1e-4, 0.3 * width_hz))
     terms = replace(state.best.terms, trial=f)
-    start = moved(state.best, terms)
-    start[terms.names.index("ln_band")] = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count))
-    start[terms.names.index("ln_width")] = math.log(max(1.1e-4, 0.3 * width_hz))
-    chosen = fit(state.series, terms, start)
-    gain_of_fit = chosen.ln_likelihood - state.best.ln_likelihood
-    worth = net(gain_of_fit, 3, ln_places)
+    chosen = fit(state.series, terms, moved(state.best, terms, {"ln_band": size, "ln_width": wide}))
+    gain = chosen.ln_likelihood - state.best.ln_likelihood
+    worth = net(gain, 3, ln_places)
     centre = f * math.exp(chosen.value("shift"))
     half_width = math.exp(chosen.value("ln_width"))
     if worth < 1.0 or half_width * NARROW > centre:
         return []
-    extras = replace(state.extras, bands=(*state.extras.bands, (centre, half_width, chosen.value("ln_band"))))
-    share = math.exp(chosen.value("ln_band"))
-    turns = max(1.0, half_width * n * state.dt)
+    share, sd = math.exp(chosen.value("ln_band")), 1.0 / math.sqrt(max(1.0, half_width * n * state.dt))
 
     def amplitude(sigma: float) -> dict[str, Any]:
-        return interval(math.sqrt(2.0) * sigma * share, sigma * share / math.sqrt(turns), state.unit)
+        return {"amplitude": interval(math.sqrt(2.0) * sigma * share, sigma * share * sd, state.unit)}
 
-    return [
-        Look(
-            "periodic",
-            gain_of_fit,
-            worth,
-            {
-                "frequency_hz": interval(centre, half_width / math.sqrt(turns), "Hz"),
-                "amplitude": amplitude(chosen.sigma),
-                "width_hz": interval(half_width, half_width / math.sqrt(turns), "Hz"),
-            },
-            {"extras": extras},
-            shown_by="band",
-            measure=lambda final: {"amplitude": amplitude(final.best.sigma)},
-        )
-    ]
+    estimate = {
+        "frequency_hz": interval(centre, half_width * sd, "Hz"),
+        **amplitude(chosen.sigma),
+        "width_hz": interval(half_width, half_width * sd, "Hz"),
+    }
+    bands = (*state.extras.bands, (centre, half_width, math.log(share)))
+    changes = {"extras": replace(state.extras, bands=bands)}
+    look = Look("periodic", gain, worth, estimate, changes, shown_by="band")
+    return [replace(look, measure=lambda final: amplitude(final.best.sigma))]
 
 
-def columns(f: float, record: Record) -> dict[str, Array]:
+def pair(f: float, record: Record) -> dict[str, Array]:
     """Sine and cosine of a frequency, each [n], by the ends of their names. At half the rate the sine has no value."""
     turns = 2.0 * math.pi * np.mod(f * record.time_s, 1.0)
     return {**({".sin": np.sin(turns)} if f < 0.5 * record.rate_hz else {}), ".cos": np.cos(turns)}
@@ -125,11 +116,6 @@ def _power(f: float, t: Array, w: Array, there: Mask) -> float:
     return (n * abs(z) ** 2 - (twice.conjugate() * z**2).real) / room
 
 
-def _spread(c: Array, sd: Array, duration_s: float) -> float:
-    """Standard deviation of a line's frequency, Hz: pi^2 n T^2 A^2 / (3 s^2) of information, T the record's length."""
-    return float(np.mean(sd)) / max(math.hypot(*c), 1e-300) * math.sqrt(12.0) / (2.0 * math.pi * duration_s)
-
-
 def ln_lines(turns: Array, n: int, gain: Array) -> Array:
     """ln of the number of independent lines that one of so many `turns` among `n` samples, which gains so much, is the
     best of. The prior of a frequency is flat in its logarithm: a slow line is one of few.
@@ -142,111 +128,75 @@ def ln_lines(turns: Array, n: int, gain: Array) -> Array:
     return np.asarray(places + slow + 0.5 * np.log(np.maximum(1.0, gain)))
 
 
-def worth_of(gain: float, turns: float, n: int, columns: int = 2) -> float:
-    """A line's gain net of the search for it."""
-    return net(gain, columns, float(ln_lines(np.array(turns), n, np.array(gain))))
+def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Sequence[int] = ()) -> Shape:
+    """A line, with multiples of it. The frequency is known to `sd`, else to what the line's amplitude leaves: pi^2 n
+    T^2 A^2 / (3 s^2) of information, T the record's length."""
+    n, half = state.y.size, 0.5 * record.rate_hz
+
+    def waves(f: float) -> Array:
+        return np.array([one for k in (1, *multiples) for one in pair(k * f, record).values()])
+
+    def spread(fit: Fit) -> float:
+        c, of = (values[len(values) - len(known) :][:2] for values in (fit.c, fit.sd))
+        share = float(np.mean(of)) / max(math.hypot(*c), 1e-300)
+        return sd or share * math.sqrt(12.0) / (2.0 * math.pi * n * state.dt)
+
+    def sharper(fit: Fit) -> Shape:
+        """The null's drift has swallowed a part of a line: the likeliest beside the drift that is left beside it."""
+        move = min(0.5 * spread(fit), 0.25 * (half - f))
+        three = state.scores([waves(f + k * move) for k in (-1, 0, 1)], fit)
+        bend = 2.0 * three[1] - three[0] - three[2]
+        if not bend > 0.0:
+            return shape(state, record, f, 0.0, multiples)
+        far = float(np.clip(0.5 * (three[2] - three[0]) / bend, -4.0, 4.0))
+        return shape(state, record, f + move * far, move / math.sqrt(bend), multiples)
+
+    known = waves(f)
+    added = tuple(
+        Regressor(f"line_{k * f:.6g}Hz{end}", "periodic", one, "1", {"kind": "periodic", "frequency_hz": k * f})
+        for k in (1, *multiples)
+        for end, one in pair(k * f, record).items()
+    )
+    return Shape(
+        f"{len(known)}",
+        known,
+        added,
+        (("amplitude", state.unit),),
+        lambda gain: float(ln_lines(np.array(f * n * state.dt), n, np.array(gain))),
+        len(known),
+        stated={"harmonics": list(multiples)} if multiples else {},
+        sharper=sharper if f < half else None,
+        where=lambda fit: {"frequency_hz": interval(f, spread(fit), "Hz")},
+    )
 
 
 def _line(state: State, record: Record) -> list[Look]:
-    """The strongest line, refitted exactly at its best frequency."""
-    n = state.y.size
+    """The strongest line of the periodogram, at its best frequency."""
+    n, half = state.y.size, 0.5 * record.rate_hz
     w, there, t = np.nan_to_num(state.whitened), np.isfinite(state.y), record.time_s
     padded = 2 * next_fast_len(2 * n, real=True)
     power = np.abs(rfft(w, padded)) ** 2 / there.sum()
+    width = 1.0 / (n * state.dt)
     frequency = np.arange(power.size) / (padded * state.dt)
-    low, half = TURNS_LEAST / (n * state.dt), 0.5 * record.rate_hz
-    power[frequency < low] = 0.0
-    beside = frequency > half - low
+    power[frequency < TURNS_LEAST * width] = 0.0
+    beside = frequency > half - TURNS_LEAST * width
     power[beside] = [_power(float(f), t, w, there) for f in frequency[beside]]
     at = int(np.argmax(power - ln_lines(frequency * n * state.dt, n, power)))
-    if worth_of(float(power[at]), float(frequency[at]) * n * state.dt, n) <= 0.0:
+    f = float(frequency[at])
+    if net(float(power[at]), 2, float(ln_lines(np.array(f / width), n, power[at]))) <= 0.0:
         return []
-    width = 1.0 / (n * state.dt)
-
-    from scipy.optimize import minimize_scalar  # a quarter of a second to import: for who has a line alone
-
-    best = float(
-        minimize_scalar(
-            lambda f: -_power(f, t, w, there),
-            bounds=(frequency[at] - 0.5 * width, min(frequency[at] + 0.5 * width, half)),
-            method="bounded",
-            options={"xatol": 1e-4 * width},
-        ).x
-    )
-
-    f, pair, gain, chosen = _fitted(state, record, best)
-    if f > half - low:  # a line at half the rate also fits beside it, with a column and a frequency more than it needs
-        one = _fitted(state, record, half)
-        if net(gain - one[2], 2) < NET_LEAST:
-            f, pair, gain, chosen = one
-    if f < SLOW_TURNS * width:
-        gain = min(gain, state.rich_gain(pair))
-    worth = worth_of(gain, f / width, n, len(pair))
-    return [_look(state, record, f, pair, gain, worth, chosen)] if worth >= 1.0 else []
+    for move in 0.25 ** np.arange(1.0, 5.0):
+        near = np.minimum(f + move * width * np.linspace(-1.0, 1.0, 9), half)
+        f = float(near[int(np.argmax([_power(one, t, w, there) for one in near]))])
+    # A line at half the rate also fits beside it, with a column and a frequency more than it needs.
+    tried = [*([shape(state, record, half)] if f > half - TURNS_LEAST * width else []), shape(state, record, f)]
+    return columns.looks(state, "periodic", tried, slow=f < SLOW_TURNS * width)
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
     """The look at a line of a known frequency, and multiples of it."""
-    multiples = tuple(round(k) for k in theta[1:] if k * theta[0] < 0.5 * record.rate_hz)
-    f, waves, gain, chosen = _fitted(state, record, theta[0], multiples)
-    return _look(state, record, f, waves, gain, net(gain, len(waves)), chosen, multiples)
-
-
-def _waves(f: float, record: Record, multiples: Sequence[int] = ()) -> Array:
-    """Sine and cosine of a line and its multiples [p, n]."""
-    return np.array([one for k in (1, *multiples) for one in columns(k * f, record).values()])
-
-
-def _fitted(state: State, record: Record, f: float, multiples: Sequence[int] = ()) -> tuple[float, Array, float, Fit]:
-    waves = _waves(f, record, multiples)
-    return f, waves, *state.with_columns(waves)
-
-
-def _look(
-    state: State,
-    record: Record,
-    f: float,
-    pair: Array,
-    gain: float,
-    worth: float,
-    chosen: Fit,
-    multiples: Sequence[int] = (),
-) -> Look:
-    n, half = state.y.size, 0.5 * record.rate_hz
-    own = slice(chosen.c.size - len(pair), chosen.c.size - len(pair) + 2)
-    c, sd = chosen.c[own], chosen.sd[own]
-    spread = _spread(c, sd, n * state.dt)
-    if worth >= NET_LEAST and f < half:
-        # The null's drift has swallowed a part of a line: the frequency is the likeliest beside the one that is left.
-        move = min(0.5 * spread, 0.25 * (half - f))
-        three = [_waves(f + k * move, record, multiples) for k in (-1, 0, 1)]
-        gains = [finish(state.series.beside(one), chosen.terms, chosen.theta).ln_likelihood for one in three]
-        bend = 2.0 * gains[1] - gains[0] - gains[2]
-        if bend > 0.0:
-            spread = move / math.sqrt(bend)
-            f += move * min(4.0, max(-4.0, 0.5 * (gains[2] - gains[0]) / bend))
-            pair = _waves(f, record, multiples)
-    amplitude = interval(math.hypot(*c), float(np.mean(sd)), state.unit)
-
-    def measure(state: State) -> dict[str, Any]:
-        weight, means, sds = (of[0] for of in state.posterior(pair))
-        amplitudes = np.linalg.norm(means[:, :2], axis=1)
-        return {"amplitude": mixture(weight, amplitudes, sds[:, :2].mean(axis=1), state.unit)}
-
-    added = [
-        Regressor(f"line_{k * f:.6g}Hz{end}", "periodic", one, "1", {"kind": "periodic", "frequency_hz": k * f})
-        for k in (1, *multiples)
-        for end, one in columns(k * f, record).items()
-    ]
-    harmonics = {"harmonics": list(multiples)} if multiples else {}
-    return Look(
-        "periodic",
-        gain,
-        worth,
-        {"frequency_hz": interval(f, spread, "Hz"), "amplitude": amplitude, **harmonics},
-        {"regressors": (*state.regressors, *added)},
-        measure=measure,
-    )
+    multiples = [round(k) for k in theta[1:] if k * theta[0] < 0.5 * record.rate_hz]
+    return columns.located(state, "periodic", shape(state, record, theta[0], multiples=multiples))
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
@@ -297,12 +247,12 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     if not found:
         return after
     f = float(found[0].estimate["frequency_hz"]["median"])
-    pair = columns(f, record)
+    found_at = pair(f, record)
     known = {one.name for one in before.regressors}
     return replace(
         after,
         regressors=tuple(
-            one if one.name in known else replace(one, values=pair.get(one.name[-4:], np.zeros(before.y.size)))
+            one if one.name in known else replace(one, values=found_at.get(one.name[-4:], np.zeros(before.y.size)))
             for one in after.regressors
         ),
     )
@@ -322,12 +272,9 @@ def _pictures(look: Look) -> Sequence[str]:
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
     """A line half way between the slowest one looked for and the fastest, in octaves."""
-    t = record.time_s
-    n = int(np.isfinite(state.y).sum())
-    frequency = math.sqrt(TURNS_LEAST / t[-1] * 0.5 * record.rate_hz)
-    gain = gain_for(lambda gain: worth_of(gain, frequency * t[-1], n))
-    amplitude = state.least(np.sin(2.0 * math.pi * frequency * t)) * math.sqrt(gain)
-    return {"amplitude": (amplitude, state.unit), "frequency_hz": (frequency, "Hz")}
+    frequency = math.sqrt(TURNS_LEAST / record.time_s[-1] * 0.5 * record.rate_hz)
+    found = columns.least(state, shape(state, record, frequency), "amplitude")
+    return {**found, "frequency_hz": (frequency, "Hz")}
 
 
 def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:

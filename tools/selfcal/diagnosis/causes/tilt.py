@@ -110,9 +110,9 @@ CAUSE = Cause(
     at=step.at,
     of_means=True,
     pictures=shown("means", "evidence"),
-    grouping=Grouping(alike=step.CAUSE.grouping.alike),
+    grouping=Grouping(alike=step.alike),
     score=Scored(once="a turn is an event of its recording"),
-    written=Written(entry=step.CAUSE.written.entry, of_column=step.CAUSE.written.of_column),
+    written=Written(entry=step.entry, of_column=step.of_column),
     simulated=Simulated(
         keys={"time_s": Key(lambda s: s.duration_s / 2.0), "amplitude": Key(lambda s: 2.0 * s.n)}, add=_add
     ),

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -17,17 +17,15 @@ from scipy.special import gammaincinv
 
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
-from selfcal.diagnosis.causes.pulse import blocks, of_blocks
-from selfcal.diagnosis.causes.step import scan
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.columns import LN_SLOW
+from selfcal.likelihood.columns import LN_SLOW, SMALLER
+from selfcal.likelihood.edges import scan
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
 from selfcal.likelihood.statemodel import Array, Mask
 
-#: Tried first: amplitudes over the white noise of a block, dwell times in blocks, ln of the drift over the fitted one.
+#: Tried first: amplitudes over the white noise of a block, dwell times in blocks.
 AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)
 DWELLS = (15.0, 50.0, 150.0, 450.0)
-SIZES = (0.0, -1.5, -3.0)
 #: The drift without levels, so that both are judged by one filter: ln of walk and white noise over the fitted ones.
 WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
 #: Rounds of draws about the best, and draws of each.
@@ -44,24 +42,17 @@ LN_LOOKS = 2.0 + LN_SLOW
 LEAST = 1e-9
 
 
-@dataclass(frozen=True)
-class Filtered:
-    """`ln_likelihood` [g] of each set of parameters; probability of the upper level [n, g] after each block."""
-
-    ln_likelihood: Array
-    upper: Array
-
-
-def switching(y: Array, theta: Array, keep: bool = False) -> Filtered:
-    """The filter over y [n], NaN where missing. theta [g, 5]: ln of amplitude, lower and upper dwell time in blocks,
-    walk of a block over the white noise, white noise. `keep`: with the probabilities."""
+def switching(y: Array, theta: Array) -> tuple[Array, Array]:
+    """The filter over y [n], NaN where missing: ln likelihood [g] of each set of parameters, and the probability of the
+    upper level [n, g] after each block. theta [g, 5]: ln of amplitude, lower and upper dwell time in blocks, walk of a
+    block over the white noise, white noise."""
     A, low, high, rho, sigma = np.exp(theta).T
     R, Q, half = sigma**2, (rho * sigma) ** 2, 0.5 * A
     up, down = -np.expm1(-1.0 / low), -np.expm1(-1.0 / high)
     there = y[np.isfinite(y)]
     x, P = np.full(A.size, there[:30].mean()), 1e4 * R
     w, total = up / (up + down), np.zeros(A.size)
-    kept = np.empty((y.size if keep else 0, A.size))
+    kept = np.empty((y.size, A.size))
     for k, value in enumerate(y):
         P = P + Q
         w = w * (1.0 - down) + (1.0 - w) * up
@@ -78,9 +69,8 @@ def switching(y: Array, theta: Array, keep: bool = False) -> Filtered:
             gain = P / S
             x = x + gain * (e - half * (2.0 * w - 1.0))
             P = P * (1.0 - gain) + (gain * A) ** 2 * w * (1.0 - w)
-        if keep:
-            kept[k] = w
-    return Filtered(total, kept)
+        kept[k] = w
+    return total, kept
 
 
 def looks(state: State, record: Record) -> list[Look]:
@@ -92,21 +82,21 @@ def looks(state: State, record: Record) -> list[Look]:
     # Two levels that jump often have the correlation of a Gauss-Markov drift, which leaves no jump to see.
     if scan(state.series, state.best).gain.max() < SCREEN + 2.0 and _law(state) < SCREEN:
         return []
-    series, block = blocks(state)
+    series, block = state.means()
     y = series.y - state.best.c[1:] @ series.columns[1:]
     walk = next(fit for fit in state.fits if fit.terms.walk)
-    ln_rho = of_blocks(walk, block, 0.0)[walk.terms.names.index("ln_rho")]
+    ln_rho = walk.of_means(block, 0.0)[walk.terms.names.index("ln_rho")]
     ln_sigma = math.log(walk.sigma / math.sqrt(block))
     none = _without(y, ln_rho, ln_sigma) + _law(state)
     tried = np.array(
         [
-            (math.log(a) + ln_sigma, math.log(d), math.log(d), ln_rho + less, ln_sigma)
+            (math.log(a) + ln_sigma, math.log(d), math.log(d), ln_rho - less, ln_sigma)
             for a in AMPLITUDES
             for d in DWELLS
-            for less in SIZES
+            for less in (0.0, *SMALLER)
         ]
     )
-    value = switching(y, tried).ln_likelihood
+    value = switching(y, tried)[0]
     if net(float(value.max()) - none, 3, LN_LOOKS) < 1.0:
         return []
     theta, gain = _best(y, tried[int(value.argmax())])
@@ -117,7 +107,7 @@ def looks(state: State, record: Record) -> list[Look]:
     stays = _stays(upper)
     own = theta.copy()
     own[1:3] = [math.log(time / count) for time, count in stays]
-    now = float(switching(y, own[None, :]).ln_likelihood[0])
+    now = float(switching(y, own[None, :])[0][0])
     theta, gain = (own, now) if now > gain else (theta, gain)
     worth = net(gain - none, 3, LN_LOOKS)
     if worth < 1.0:
@@ -169,7 +159,7 @@ def _without(y: Array, ln_rho: float, ln_sigma: float) -> float:
     walks, whites = (one.ravel() for one in np.meshgrid(WALKS, WHITES))
     none, dwell = np.full(walks.size, math.log(LEAST) + ln_sigma), np.full(walks.size, math.log(100.0))
     theta = np.column_stack([none, dwell, dwell, ln_rho + walks, ln_sigma + whites])
-    return float(switching(y, theta).ln_likelihood.max())
+    return float(switching(y, theta)[0].max())
 
 
 def _law(state: State) -> float:
@@ -182,10 +172,10 @@ def _best(y: Array, theta: Array) -> tuple[Array, float]:
     """The likeliest parameters from `theta` on, and their ln likelihood."""
     random = np.random.default_rng(1)
     spread = np.diag([0.3, 0.8, 0.8, 0.8, 0.03])
-    middle, value = theta, float(switching(y, theta[None, :]).ln_likelihood[0])
+    middle, value = theta, float(switching(y, theta[None, :])[0][0])
     for _ in range(ROUNDS):
         drawn = middle + random.standard_normal((DRAWS, theta.size)) @ spread.T
-        found = switching(y, drawn).ln_likelihood
+        found = switching(y, drawn)[0]
         order = np.argsort(-found)
         if found[order[0]] > value:
             middle, value = drawn[order[0]], float(found[order[0]])
@@ -224,7 +214,7 @@ def _dwell(time: float, count: float, dt: float) -> dict[str, Any]:
 def _smoothed(y: Array, theta: Array) -> Array:
     """[n]: probability of the upper level given the whole record, by a pass backwards over the filter's."""
     up, down = (-math.expm1(-math.exp(-float(one))) for one in theta[1:3])
-    filtered = switching(y, theta[None, :], keep=True).upper[:, 0]
+    filtered = switching(y, theta[None, :])[1][:, 0]
     smooth = filtered.copy()
     for k in range(y.size - 2, -1, -1):
         w, after = filtered[k], smooth[k + 1]

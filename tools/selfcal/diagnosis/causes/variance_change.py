@@ -40,7 +40,7 @@ MOST = 12.0
 #: Steps of the search for a slope, and the largest one in standard deviations of the channel.
 STEPS, FARTHEST = 30, 1.0
 #: Shares of the record that the channel lies below at the quiet and at the loud end of `ratio`.
-ENDS = (5.0, 95.0)
+ENDS = (0.05, 0.95)
 
 
 def ln_changes(n: int, gain: float) -> float:
@@ -175,7 +175,7 @@ def _follows(state: State, level: Level, wide: float) -> Look | None:
         return None
     # The level is the root of the variance.
     size, sd = 0.5 * slope, 0.5 * sd * math.sqrt(wide)
-    span = float(np.diff(np.percentile(level.values[present], ENDS))[0])
+    span = float(np.diff(np.quantile(level.values[present], ENDS))[0])
     ratio = math.exp(abs(size) * span)
     estimate = {
         "channel": level.column,
