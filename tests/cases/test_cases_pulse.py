@@ -6,6 +6,7 @@ Truth: the numbers that each record was drawn with (drifts.py).
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -51,3 +52,19 @@ def test_a_pulse_that_no_drift_can_judge_has_the_fit_as_its_size(monkeypatch: py
     found = edges.posterior((begin, end), state)
     assert found["amplitude"]["mean"] == pytest.approx(fit.c[-1])
     assert found["duration_s"]["mean"] == pytest.approx(end - begin)
+
+
+def test_a_pulse_is_no_curve_of_a_temperature_that_rises() -> None:
+    """Whatever happens once is a curve of that too."""
+    t = np.arange(SECONDS)
+    for seed in range(2, 2 + case_records(1, 20)):
+        random = np.random.default_rng(seed)
+        length = math.exp(random.uniform(math.log(40.0), math.log(400.0)))
+        start = random.uniform(150.0, SECONDS - length - 150.0)
+        shape = 0.3 * random.uniform(0.7, 1.6) * ((t >= start) & (t < start + length))
+        _, record = recorded(noise(random, "walk", t.size, 1.0) + shape, 1.0)
+        warm = 20.0 + 8.0 * t / SECONDS + 0.3 * np.sin(t / 700.0) + 0.005 * random.standard_normal(t.size)
+        record = replace(record, channels={"temperature": warm}, channel_names={"temperature": "temp"})
+        first = diagnose_record(record, ["gx"])["gx"].by_gain[0].look
+        assert first.cause == "pulse"
+        assert abs(first.estimate["time_s"]["median"] - start) < 3.0  # seconds: the readings are a second apart
