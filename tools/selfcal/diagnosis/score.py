@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import gammaln, logsumexp, softmax
 
+from selfcal.base.grid import Rows
 from selfcal.base.units import FLICKER_FLOOR
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
@@ -23,7 +24,6 @@ from selfcal.likelihood.fit import passed, run
 from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
-from selfcal.readings.readings import Rows
 
 #: Predictions of the bias at most.
 PREDICTIONS = 300

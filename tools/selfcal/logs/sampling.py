@@ -32,10 +32,10 @@ _HEAD, _LOST, _LONG, _STEP = 3000, 0.25, 0.05, 1e-4
 _WANDER = 3e-5
 #: Lattice steps between a sample and its stamp: less than one where the interval is a multiple, or a simple fraction,
 #: of the lattice; more where stamps come late.
-_SLACKS = np.array([0.02, 0.52, 0.69, 0.85, 1.0, 1.5]) * 1.0001
+_SLACKS = np.array([0.02, 1.0, 1.5]) * 1.0001
 #: Missing samples a row that a slack must save: none up to a lattice step; beyond, a stamp could be any of 1.5 (0.4 nat
 #: a row, where a missing sample costs some 3), and such a slack would swallow gaps.
-_PRICE = np.array([0.0, 0.0, 0.0, 0.0, 0.0, 0.15])
+_PRICE = np.array([0.0, 0.0, 0.15])
 #: A stamp that fits nowhere weighs as many missing samples.
 _ODD = 10
 #: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
@@ -57,8 +57,8 @@ _FINE, _OTHER_PLACES = 64, 1 << 22
 #: the largest of random times over the power of their noise, e^-10 among a few thousand, which bins about it show.
 _LINE_FIRST, _LINE_LAST, _LINE_CHANCE, _LINE_ABOUT = 0.9, 4.0, 25.0, 64
 #: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
-#: beyond the largest of as many by chance. The slowest waves are the losses' own; a band is a quarter of an octave.
-_ROWS_LEAST, _PLACES, _LINE, _SLOWEST, _BAND = 500, 1 << 20, 20.0, 16, 0.25
+#: beyond the largest of as many by chance. The slowest waves are the losses' own.
+_ROWS_LEAST, _PLACES, _LINE, _SLOWEST = 500, 1 << 20, 20.0, 16
 #: Steps of one lattice step that such a grid has at least, and their share over that of independent losses.
 _ONES, _ONES_SHARE = 20, 0.7
 #: Another dt with this many missing samples more or fewer is as good.
@@ -103,12 +103,7 @@ def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> F
         raise Ambiguous("the stamps fall, and their count is not steady")
     if counted is not None and (steps != 0.0).all():
         return counted
-    try:
-        return _on_even_grid(time, steps, noise_s, rate)
-    except Ambiguous:
-        if counted is None:
-            raise
-        return counted
+    return _on_even_grid(time, steps, noise_s, rate)
 
 
 def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
@@ -127,20 +122,14 @@ def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s
             if rate is None:
                 raise
             return 1.0 / rate, _decode(time, 1.0 / rate, lattice)[0]
-    if rate is not None and thinned_grid(time, 1.0 / rate):
-        return _on_grid(time, 1.0 / rate)
     if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
         return _on_every_step(time, lattice)
     usual = _usual(steps)
     if _in_batches(steps, usual):
         return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
-    for dt in (_shortest(steps), usual):
-        if _even(time, dt):
-            return _on_grid(time, dt)
-    mean = float(time[-1]) / steps.size
-    if np.ptp(time - mean * np.arange(time.size)) < mean:  # a count that is steady has lost no sample
-        return mean, np.zeros(time.size, np.int64)
-    dt = _line(time, typical, lattice)
+    dt = _shortest(steps)
+    if not _even(time, dt):
+        dt = _line(time, typical, lattice)
     return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
 
 
@@ -153,9 +142,7 @@ def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np
     if not 0 < count * _AWAKE < steps.size:
         return np.zeros_like(long)
     closed = np.where(long, usual, steps)
-    even = np.abs(closed - usual) < 1e-3 * usual
-    lattice = common_step(closed, 1e-9 * usual)
-    shows = _even(np.cumsum(closed), usual) if lattice < _COARSE * usual else even.mean() > _RHYTHM
+    shows = np.mean(np.abs(closed - usual) < 1e-3 * usual) > _RHYTHM or _even(np.cumsum(closed), usual)
     return long if shows else np.zeros_like(long)
 
 
@@ -234,10 +221,8 @@ def _slope(index: NDArray[np.int64], time: NDArray[np.float64], cuts: Sequence[i
 
 
 def _usual(steps: NDArray[np.float64]) -> float:
-    """The median of the steps that are no gaps and no repeats."""
-    positive = steps[steps > 0.0]
-    usual = positive < 1.5 * np.median(positive)
-    return float(np.median(positive if usual.all() else positive[usual], overwrite_input=True))
+    """The median of the steps that are no repeats."""
+    return float(np.median(steps[steps > 0.0], overwrite_input=True))
 
 
 def _shortest(steps: NDArray[np.float64]) -> float:
@@ -285,9 +270,7 @@ def _line(time: NDArray[np.float64], typical: float, lattice: float) -> float:
     at = int(np.argmax(np.where(shown, power, 0.0)))
     dt = typical / float(turns[at])
     noise = float(np.median(power[max(0, at - _LINE_ABOUT) : at + _LINE_ABOUT])) / math.log(2.0)
-    # The spectrum is of rounded stamps, and so has images of a quicker line.
-    exact = float(np.abs(np.exp(2j * math.pi * (head - head[0]) / dt).mean()) ** 2)
-    return dt if exact > _LINE_CHANCE * max(noise, 1.0 / head.size) else 0.0
+    return dt if float(power[at]) > _LINE_CHANCE * max(noise, 1.0 / head.size) else 0.0
 
 
 def _mean_grid(steps: NDArray[np.float64]) -> Found:
@@ -542,15 +525,8 @@ def _lossy(steps: NDArray[np.float64]) -> bool:
     taken = np.zeros(int(head[-1]) + 1)
     taken[head] = 1.0
     power = np.abs(rfft(taken - taken.mean())[1:]) ** 2
-    most = math.log(power.size) + _LINE
-    begin = _SLOWEST
-    while begin < power.size:
-        end = begin + max(_SLOWEST, int(_BAND * begin))
-        band = power[begin : end if end + _SLOWEST < power.size else power.size]
-        if float(band.max()) > most * float(np.median(band)) / math.log(2.0):
-            return False
-        begin += band.size
-    return True
+    band = power[_SLOWEST:]
+    return bool(band.max() <= (math.log(power.size) + _LINE) * float(np.median(band)) / math.log(2.0))
 
 
 def _on_every_step(time: NDArray[np.float64], lattice: float) -> Found:
@@ -570,8 +546,6 @@ def _scanned(
     reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
     same = np.abs(grid / grid[best] - 1.0) < reach
     rivals = grid[~same & (each < each[best] + _AS_GOOD)]
-    if each[best] > 0.5 * head.size:
-        raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
     exact = abs(grid[best] / lattice - np.rint(grid[best] / lattice)) < 1e-9
     if rivals.size and not exact:
         raise Ambiguous(
@@ -655,7 +629,7 @@ def _decode(time: NDArray[np.float64], dt: float, slack: float) -> tuple[NDArray
     """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be."""
     missing = np.zeros(time.size, np.int64)
     stamps = time.tolist()
-    lo, hi, odd, last = stamps[0], stamps[0] + slack, 0, 0
+    lo, hi, odd = stamps[0], stamps[0] + slack, 0
     down, up = dt * (1.0 - _WANDER), dt * (1.0 + _WANDER)
     for row in range(1, len(stamps)):
         stamp = stamps[row]
@@ -665,16 +639,10 @@ def _decode(time: NDArray[np.float64], dt: float, slack: float) -> tuple[NDArray
         if stamp > hi:
             gap = math.ceil((stamp - hi) / dt)
             missing[row] = gap
-            last = row
             lo += gap * dt
             hi += gap * dt
-            if lo >= end:  # between two: the nearer
-                odd += 1
-                missing[row] -= lo - end > stamp - hi + dt
-                lo, hi = stamp, end
-        elif lo >= end:  # too early: a late stamp before was taken for a gap
+        if lo >= end:
             odd += 1
-            missing[last] -= min(int(missing[last]), round((lo - end) / dt))
             lo, hi = stamp, end
         lo = max(lo, stamp)
         hi = min(hi, end)

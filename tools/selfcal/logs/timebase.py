@@ -24,7 +24,8 @@ from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm,
 _OWN_SHARE, _OWN_NEAR = 0.6, 0.3
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
-#: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost.
+#: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost. Regular losses
+#: over a smaller share of the record may be another rate.
 _NEARLY = 0.9
 #: Samples in a period of losses, and changes of the rate, that a line tells of, at most.
 _OF_LOSSES, _IN_WORDS = 100, 3
@@ -165,15 +166,17 @@ def remarks(clock: Clock) -> list[str]:
     steps = np.diff(time)
     lattice = common_step(steps, 1e-9 / rate)
     gaps = np.flatnonzero(missing)
-    if in_rhythm(gaps) or in_pattern(np.add(missing, 1.0)):
+    regular = in_rhythm(gaps) or in_pattern(np.add(missing, 1.0))
+    changes = rate_changes(time)
+    if changes and not (regular and np.ptp(gaps) > _NEARLY * time.size):
+        after = ", ".join(f"{1.0 / one.after_s:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
+        return [f"the sampling rate changes: {1.0 / changes[0].before_s:.5g} Hz, {after}"]
+    if regular:
         lost, every, told = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
         other = float(f"{rate - rate * lost / every:.6g}")
         told = f"{told} {'are' if lost > 1 else 'is'} missing, at regular intervals"
         alike = lattice * rate > _NEARLY and np.ptp(time - np.arange(time.size) / other) * other < 1.0
         return [told + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
-    if changes := rate_changes(time):
-        after = ", ".join(f"{1.0 / one.after_s:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
-        return [f"the sampling rate changes: {1.0 / changes[0].before_s:.5g} Hz, {after}"]
     if gaps.size:
         return []
     if 0.0 < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:

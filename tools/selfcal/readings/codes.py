@@ -1,8 +1,8 @@
-"""Codes of a converter that are not alike: some of their readings are read as a neighbour.
+"""Rows of a converter that are not alike: some of their readings are read as a neighbour.
 
 Two kinds are looked for. A dead band shows readings near a value as that value. Of unequal codes every other one is
 narrow and loses a share to both neighbours. Noise is normal about a level that each piece of the record has for itself.
-Codes are judged by the likelihood of their counts in each piece. Readings on no lattice have a dead band alone: the
+Rows are judged by the likelihood of their counts in each piece. Readings on no lattice have a dead band alone: the
 codes are then cells about their commonest value.
 """
 
@@ -13,19 +13,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from selfcal.base.grid import Array, counts_of_pieces
+from selfcal.base.grid import Array, Rows, counts_of_pieces
 from selfcal.readings.budget import nats_of
 from selfcal.readings.lattice import COARSEST, Lattice
 
-Codes = NDArray[np.int64]
-
-#: Codes between the smallest and the largest reading, and readings, at least and at most.
+#: Rows between the smallest and the largest reading, and readings, at least and at most.
 CODES, READINGS_LEAST = (5, 160), 300
-#: Share of the codes that come at least: on a comb they are no neighbours.
-COME = 0.5
 #: Pieces of a record that have a level each, at most, and readings in one at least.
 PIECES, PIECE = 200, 64
 #: Steps of the levels, in codes or in noises if these are more, and factors of the noise that are tried about its best.
@@ -36,10 +31,6 @@ NEAR = (0.97, 0.98, 0.99, 1.01, 1.02, 1.03)
 WIDE = tuple(float(2.0**k) for k in np.linspace(-2.0, 1.6, 13))
 #: Shares that are read as a neighbour, and further codes of a dead band on either side.
 SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
-#: Readings beyond a dead band on either side, at least: a limit has none on one.
-BEYOND = 3
-#: Standard deviations by which the neighbours' counts lack at least.
-LACKING = 4.0
 #: Cells in the noise of readings on no lattice, and readings of one value, and their share, at least.
 CELLS, PILE, PILE_SHARE = 4.0, 20, 0.01
 #: Times that it is commoner than the next one, at least.
@@ -75,15 +66,6 @@ class _Read:
     inner: int
     share: float
 
-    @property
-    def places(self) -> Codes:
-        """Codes that lose readings."""
-        many = np.arange(len(self.to))
-        if self.inner < 0:
-            return many[self.place :: 2]
-        apart = np.abs(many - self.place)
-        return many[(apart > 0) & (apart <= self.inner + 1)]
-
 
 def _band(many: int, place: int, inner: int, share: float) -> _Read:
     """A dead band about a code."""
@@ -114,7 +96,7 @@ class _Fit:
     chance: Array
 
 
-def ln_of(count: Array | Codes, chance: Array) -> Array:
+def ln_of(count: Array | Rows, chance: Array) -> Array:
     """ln likelihood [pieces, levels] of counts [pieces, codes] of what is read with a chance [codes, levels]."""
     return np.asarray(count @ np.log((1.0 - ODD) * chance + ODD / len(chance)))
 
@@ -124,7 +106,7 @@ def _of_pieces(count: Array, to: Array, sigma: float) -> float:
     return float(np.max([_values(count, to, factor * sigma)[0].max(axis=1) for factor in WIDE], axis=0).sum())
 
 
-def _values(count: Array, to: Array, sigma: float) -> tuple[Array, Array]:
+def _values(count: Array | Rows, to: Array, sigma: float) -> tuple[Array, Array]:
     """ln likelihood [pieces, levels], and the chance [codes, levels] of each true code."""
     many = count.shape[1]
     ends = np.arange(many + 1)[:, None] - 0.5 - np.arange(-1.0, many, LEVELS * max(1.0, sigma))
@@ -134,7 +116,7 @@ def _values(count: Array, to: Array, sigma: float) -> tuple[Array, Array]:
     return ln_of(count, to @ true), true
 
 
-def _fit(count: Array, to: Array, sigma: float) -> _Fit:
+def fit_of(count: Array | Rows, to: Array, sigma: float) -> _Fit:
     """The likeliest level of each piece and the likeliest noise near `sigma`, in codes, for counts [pieces, codes]."""
     best = _Fit(-math.inf, sigma, np.empty((0, 0)))
     for factors in (FACTORS, NEAR):
@@ -165,25 +147,20 @@ def uneven_of(values: Array, lattice: Lattice | None) -> Uneven | None:
     many = int(code.max()) + 1
     if not CODES[0] <= many <= CODES[1]:
         return None
-    if np.unique(code).size < COME * many:
-        return None
     piece, whole = counts_of_pieces(code, many, PIECE, PIECES)
     count = whole.astype(np.float64)
     sigma = math.sqrt(max(1.0 / coarseness**2 - 1.0 / 12.0, 0.04))
-    alike = _fit(count, np.eye(many), sigma)
+    alike = fit_of(count, np.eye(many), sigma)
     read = max(_candidates(count, alike), key=lambda one: _gain(count, alike, one.to))
     fit = alike
     for _ in range(TURNS):
-        fit = _fit(count, read.to, fit.sigma)
+        fit = fit_of(count, read.to, fit.sigma)
         read = max(_near(read), key=lambda one: _gain(count, fit, one.to))
-    fit = _fit(count, read.to, fit.sigma)
+    fit = fit_of(count, read.to, fit.sigma)
     nats = fit.value - alike.value - math.log(many * (SHARES.size + WIDTHS))
     if nats < nats_of("quantization"):
         return None
     total, expected = count.sum(axis=0), fit.chance @ count.sum(axis=1)
-    lost = float(expected[read.places].sum()) - float(total[read.places].sum())
-    if lost < LACKING * math.sqrt(float(expected[read.places].sum())):
-        return None  # readings come from everywhere: a word that the logger shows for lost ones
     if _of_all(count, alike, total, read) > fit.value - nats_of("quantization"):
         return None
     # Noise that comes and goes piles up as well: where each piece has its own, it must not.
@@ -191,10 +168,6 @@ def uneven_of(values: Array, lattice: Lattice | None) -> Uneven | None:
     nats -= math.log(many * (SHARES.size + WIDTHS))
     if nats < nats_of("quantization"):
         return None
-    if read.inner >= 0:
-        inside = range(read.place - read.inner - 1, read.place + read.inner + 2)
-        if min(total[: max(inside.start, 0)].sum(), total[inside.stop :].sum()) < BEYOND:
-            return None
     moved = float(expected @ (1.0 - np.diag(read.to))) / y.size
     drawn = values.copy()
     away = _true(code, piece, read.to, fit.chance) - code
@@ -270,14 +243,14 @@ def _of_all(count: Array, alike: _Fit, total: Array, read: _Read) -> float:
         for _ in range(TURNS):
             to = (1.0 - own) * np.eye(total.size)
             to[place] += own
-            fit = _fit(count, to, sigma)
+            fit = fit_of(count, to, sigma)
             found.append(fit.value)
             usual = float((fit.chance @ count.sum(axis=1))[place])
             own, sigma = min(max((float(total[place]) - usual) / (n - usual), 0.0), 0.9), fit.sigma
     return max(found)
 
 
-def _true(code: Codes, piece: Codes, to: Array, chance: Array) -> Codes:
+def _true(code: Rows, piece: Rows, to: Array, chance: Array) -> Rows:
     """Each code [n] as one that it may come from, drawn by chance."""
     random = np.random.default_rng(1)
     found = code.copy()

@@ -170,14 +170,20 @@ def updates(values: Array, at: Rows) -> Rows | None:
 def _of_period(gaps: Rows, part: int) -> tuple[float, float]:
     """Evidence, nats, that gaps [k] are whole multiples of one period: of the short ones, or a part of them."""
     period = float(np.quantile(gaps, 0.05, method="lower")) / part
-    for _ in range(20):
-        times = np.maximum(1, np.rint(gaps / period))
-        few = times <= 3 * part
-        period = float(gaps[few].sum() / times[few].sum())
+    period = _period(gaps, period, 3 * part)
     if period < PERIOD_LEAST:
         return 0.0, period
     off = np.abs(gaps - np.rint(gaps / period) * period)
     return gaps.size * math.log(period / (1.0 + 2.0 * float(np.quantile(off, 0.95)))), period
+
+
+def _period(gaps: Rows, period: float, most: int) -> float:
+    """The period of which gaps [k] are whole multiples, by those of `most` periods or fewer, from one near it."""
+    for _ in range(20):
+        times = np.maximum(1, np.rint(gaps / period))
+        few = times <= most
+        period = float(gaps[few].sum() / times[few].sum())
+    return period
 
 
 def _in_runs(same: Mask, at: Rows) -> Held | None:
@@ -192,14 +198,7 @@ def _in_runs(same: Mask, at: Rows) -> Held | None:
     low, usual = np.quantile(inner, [0.05, 0.5], method="lower")
     if usual < 2 or low <= 0.5 * usual:
         return None
-    ratio = float(inner[inner <= 1.5 * usual].mean())
-    for _ in range(20):
-        times = np.maximum(1, np.rint(inner / ratio))
-        single = times <= 3
-        again = float(inner[single].sum() / times[single].sum())
-        if abs(again - ratio) < 1e-9 * ratio:
-            break
-        ratio = again
+    ratio = _period(inner, float(inner[inner <= 1.5 * usual].mean()), 3)
     times = np.maximum(1, np.rint(lengths / ratio)).astype(np.int64)
     run = np.repeat(np.arange(starts.size), times)
     place = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)

@@ -17,19 +17,17 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
-from selfcal.base.grid import Array, Mask, block_means, equal_runs, noise_of, runs
+from selfcal.base.grid import Array, Mask, Rows, block_means, counts_of_pieces, equal_runs, noise_of, runs
 from selfcal.logs.recording import Column, Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import PIECE, PIECES, Uneven, uneven_of
+from selfcal.readings.codes import CODES, PIECE, PIECES, Uneven, fit_of, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import Recurring, recurring_of
 from selfcal.readings.misread import ABOUT_ZERO, Misread, misread_of, spans_of
-from selfcal.readings.motion import Moved, loud, moves_of
-
-Rows = NDArray[np.int64]
+from selfcal.readings.motion import Moved, moves_of
 
 #: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
 CLOCK_LEAST = 1e-3
@@ -39,8 +37,6 @@ SLOPES, SLOPES_LEAST = 10, 8.0
 KEPT_MOST = 1 << 22
 #: Longest common interval of two rates, s, and how far off it may be.
 COMMON_S, COMMON_OFF = 1.0, 3e-3
-#: Longest gap that motion is looked for across, s.
-GAP_MOST_S = 240.0
 #: ln of the probability, a record, of a run of equal readings that is no chance.
 LN_STUCK = -nats_of("stuck")
 #: Nats of the runs that are counted; times that there are as many as chance makes, at least. Beyond so many steps in
@@ -48,8 +44,9 @@ LN_STUCK = -nats_of("stuck")
 HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 1.5, 0.8
 #: Samples on either side that make the level of one.
 AROUND = 32
-#: On a lattice coarser than the noise: the evidence in nats, and codes at most.
-PILED_LEAST, CODES_MOST = 30.0, 40
+#: Codes beyond either end of the readings that a limit may hide, and the evidence for it in nats. Of clean records with
+#: a noise of 0.25 to 0.5 steps 1 in 120 has 15: levels change within a piece.
+BEYOND_CODES, PILED_LEAST = 4, 30.0
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
 #: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
@@ -241,8 +238,10 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
     folded = misread is not None and misread.undone is None and misread.kind != "range_change"  # ends at zero
     clipped = None if folded else _clipped(sound, lattice)
-    whole = sound if clipped is None else _unclipped(sound, clipped, lattice)[1]
-    moving, moved = _moving(recording, axis, whole, lattice)
+    moved = moves_of(recording).get(axis)
+    time, moving = recording.time_s, none
+    for begin_s, end_s in moved.intervals if moved is not None else ():
+        moving = moving | ((time >= begin_s) & (time < end_s))
     if moving.any():
         sound = np.where(moving, np.nan, sound)
         clipped = None if folded else _clipped(sound, lattice)
@@ -284,33 +283,6 @@ def _intervals(recording: Recording, mask: Mask) -> list[tuple[float, float]]:
     """Start and end of every stretch of a mask [n], s."""
     time, step = recording.time_s, 1.0 / recording.rate_hz
     return [(float(time[a]), float(time[b - 1]) + step) for a, b in runs(mask)]
-
-
-def _moving(recording: Recording, axis: str, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
-    """Rows [n] in which the sensor moved, by the energy of all axes and by the level of `values` [n], NaN where they
-    are none; and the motion of the axis. A gap is no longer than those that matter."""
-    rate = recording.rate_hz
-    place: Rows | None = None
-    even = values
-    if recording.missing_before.any():
-        place = np.arange(values.size) + np.cumsum(np.minimum(recording.missing_before, math.ceil(GAP_MOST_S * rate)))
-        place -= place[0]
-        even = np.full(int(place[-1]) + 1, np.nan)
-        even[place] = values
-    away = loud(even, rate, lattice.step if lattice is not None else 0.0)
-    loudest = moves_of(recording).get(axis)
-    found = [one for one in (away, loudest) if one is not None]
-    if not found:
-        return np.zeros(values.size, bool), None
-    mask = np.zeros(even.size, bool)
-    for begin_s, end_s in away.intervals if away is not None else ():
-        mask[round(begin_s * rate) : round(end_s * rate)] = True
-    mask = mask if place is None else mask[place]
-    time = recording.time_s
-    for begin_s, end_s in loudest.intervals if loudest is not None else ():
-        mask |= (time >= begin_s) & (time < end_s)
-    times = tuple(_intervals(recording, mask))
-    return mask, Moved(times, sum(one.nats for one in found), max(one.net for one in found))
 
 
 # ------------------------------------------------------------------------------------------------------ change of rate
@@ -566,7 +538,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     if lattice is not None and lattice.too_coarse:
         found = {
             sign * edge: (worth, rows[at_edge])
-            for (sign, edge), at_edge, worth in zip(edges, at_edges, _piled(y, lattice.step), strict=True)
+            for (sign, edge), at_edge, worth in zip(edges, at_edges, _piled(y, lattice), strict=True)
             if worth > PILED_LEAST and at_edge.sum() >= 3
         }
         masks = {edge: np.isin(np.arange(values.size), at) for edge, (_, at) in found.items()}
@@ -603,33 +575,22 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     return Clipped(limits, nats) if limits else None
 
 
-def _piled(y: Array, step: float) -> tuple[float, float]:
+def _piled(y: Array, lattice: Lattice) -> tuple[float, float]:
     """Evidence, nats, that the last and the first code of readings [n] on a coarse lattice hold those beyond as well.
 
-    It is the likelihood of codes of rounded normal noise with a limit over that without. Each piece of the readings has
-    its best level, and the record its best noise.
-    """
-    code = np.rint((y - y.min()) / step).astype(np.int64)
-    many = int(code.max()) + 1
-    if not 3 <= many <= CODES_MOST:
+    Each piece of the readings has its best level, and the record its best noise, in codes with others beyond either end
+    that a limit reads as the last one."""
+    code = np.rint((y - y.min()) / lattice.step).astype(np.int64) + BEYOND_CODES
+    many = int(code.max()) + 1 + BEYOND_CODES
+    if not 3 + 2 * BEYOND_CODES <= many <= CODES[1]:
         return 0.0, 0.0
-    length = max(2 * AROUND, -(-y.size // PIECES))
-    pieces = y.size // length
-    place = np.repeat(np.arange(pieces), length) * many + code[: pieces * length]
-    count = np.bincount(place, minlength=pieces * many).reshape(pieces, many).astype(np.float64)
-    level = np.arange(-2.0, many + 1.0, 0.05)
-    ends = np.arange(many + 1)[:, None] - 0.5 - level
-    best = np.full(3, -math.inf)
-    for sigma in np.geomspace(0.1, 2.0, 40):
-        below, above = ndtr(ends / sigma), ndtr(-ends / sigma)
-        # The smaller tail keeps its digits.
-        chance = np.where(ends[:-1] > 0.0, above[:-1] - above[1:], below[1:] - below[:-1])
-        for k, last in enumerate((None, many - 1, 0)):
-            here = chance.copy()
-            if last is not None:
-                here[last] = above[last] if last else below[1]
-            best[k] = max(best[k], float((count @ np.log(here + 1e-12)).max(axis=1).sum()))
-    return float(best[1] - best[0]), float(best[2] - best[0])
+    _, count = counts_of_pieces(code, many, 2 * AROUND, PIECES)
+    of, sigma = np.arange(many), math.sqrt(max(1.0 / lattice.coarseness**2 - 1.0 / 12.0, 0.04))
+    limits = [np.minimum(of, many - 1 - BEYOND_CODES), np.maximum(of, BEYOND_CODES)]
+    noises = [sigma * 2.0**k for k in (0.0, 0.5, 1.0, 1.5, 2.0)]  # a limit hides some of it
+    to = [(of[:, None] == read).astype(np.float64) for read in (of, *limits)]
+    plain, high, low = (max(fit_of(count, one, noise).value for noise in noises) for one in to)
+    return high - plain, low - plain
 
 
 def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:
