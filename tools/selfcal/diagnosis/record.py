@@ -11,6 +11,7 @@ from scipy.ndimage import uniform_filter1d
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Rows
 from selfcal.likelihood.state import Regressor, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
@@ -22,7 +23,6 @@ from selfcal.model.regressors import columns_of, offered
 from selfcal.readings.readings import (
     RateChange,
     Readings,
-    Rows,
     copied,
     evened,
     look,
