@@ -99,6 +99,13 @@ def test_evidence_of_nothing_is_small() -> None:
     assert above[1] <= draws / 50.0
 
 
+def test_an_axis_without_readings_has_no_part() -> None:
+    """A column that lies where the second axis has no readings, and one that lies where none has."""
+    found = act(np.array([[12.0, 0.0]]), np.diag([9.0, 0.0]))
+    assert found.axes == [0]
+    assert act(np.zeros((1, 2)), np.zeros((2, 2))).axes == []
+
+
 def _step(n: int) -> tuple[Array, tuple[float, ...]]:
     return (np.arange(n) >= 0.6 * n).astype(float), (0.6 * n,)
 

@@ -152,6 +152,43 @@ def test_two_inputs_that_go_together_are_told_apart(tmp_path: Path) -> None:
         response(tmp_path / "log.npz", input=["temp", "supply"], output="gx", plot=tmp_path / "r.png")
 
 
+def _steps(path: Path, seed: int, supply_lsb: float, wild: dict[int, float] | None = None) -> Path:
+    """45 min at 1 Hz: a temperature in steps of some 10 min, a supply that follows it, and a gyro that the supply moves
+    by 1.4 deg/s/V. `wild`: readings of the thermometer that are none."""
+    random = np.random.default_rng([seed, 61])
+    temp = 31.0 + np.repeat(random.normal(0.0, 1.5, 5), 540)
+    supply = 5.1 - 0.03 * (temp - 31.0)
+    gyro = 1.4 * supply + 0.025 * random.standard_normal(2700) + 1e-4 * random.standard_normal(2700).cumsum()
+    if supply_lsb:
+        supply = supply_lsb * np.rint((supply + 0.002 * random.standard_normal(2700)) / supply_lsb)
+    for row, value in (wild or {}).items():
+        temp[row] = value
+    columns = {"t[s]": np.arange(2700.0), "gx[deg/s]": gyro, "temp[degC]": temp, "supply[V]": supply}
+    np.savez(path, **columns)
+    return path
+
+
+@pytest.mark.parametrize("names", [("temp", "supply"), ("supply", "temp")])
+@pytest.mark.parametrize("lsb", [0.0, 0.004])
+def test_of_two_inputs_of_one_course_neither_is_sure(names: tuple[str, str], lsb: float, tmp_path: Path) -> None:
+    """Nobody can tell which acts: no gain has an interval, in either order, and of a supply with a noise of its own."""
+    for one in response(_steps(tmp_path / "log.npz", 3, lsb), input=names, output="gx")["inputs"]:
+        assert one["source"]["verdict"] == "no structure"
+        assert "goes together with" in one["source"]["reason"]
+        assert "estimate" not in one
+
+
+def test_a_thermometers_error_value_is_no_reading(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """85 and -127 degC among 31 +- 3: the gain is -1.4 x 0.03 deg/s/degC as without them."""
+    clean, hurt = (
+        response(_steps(tmp_path / "log.npz", 4, 0.0, wild), input="temp", output="gx")["estimate"]["gain"]
+        for wild in ({}, {700: 85.0, 1900: -127.0})
+    )
+    assert "temp: 2 of 2700 readings are far from all others, the first 85" in capfd.readouterr().err
+    assert abs(hurt["median"] - clean["median"]) < 0.2 * clean["sd"]  # two of 2700 readings are bridged
+    assert abs(hurt["median"] + 0.042) < 4.0 * hurt["sd"]
+
+
 @pytest.mark.parametrize("input_", ["temp", "gy"])
 def test_unrelated_columns_show_no_influence(input_: str, tmp_path: Path) -> None:
     """A look has 5e-4 net of its search: one of 100 records at most."""

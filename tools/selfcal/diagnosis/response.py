@@ -15,7 +15,7 @@ from rich.table import Table
 from scipy.stats import binom
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable
+from selfcal.base.errors import UserError, note, printable
 from selfcal.base.output import console_of, plotter, save_picture
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
@@ -40,6 +40,8 @@ STEPS_LEAST, RECORDS = 150, 20
 FREQUENCIES = 60
 #: Several inputs are each looked at beside the others so many times before they are answered.
 ROUNDS = 2
+#: Of so many readings of an input one may be wild on either side.
+WILD = 1000
 #: A misfit is named that chance makes once in so many records.
 MISFIT = 500.0
 #: Quantiles of an interval.
@@ -62,6 +64,23 @@ WORDS = {
     "square": "square coefficient",
     "cube": "cube coefficient",
 }
+
+
+def without_wild(recording: Recording, names: Sequence[str]) -> Recording:
+    """The recording with the wild readings of its inputs bridged: those farther from nearly all others than these are
+    from each other, as a thermometer's error values are."""
+    columns = dict(recording.columns)
+    for name in names:
+        values = columns[name].values
+        there = np.sort(values[np.isfinite(values)])
+        few = max(1, there.size // WILD)
+        low, high = there[min(few, there.size - 1)], there[-1 - min(few, there.size - 1)]
+        wild = (values < 2.0 * low - high) | (values > 2.0 * high - low)
+        if high > low and wild.any():
+            columns[name] = replace(columns[name], values=bridged(np.where(wild, np.nan, values)))
+            said = f"{wild.sum()} of {values.size} readings are far from all others, the first {values[wild][0]:.6g}"
+            note(f"{recording.path}: {name}: {said}: left out")
+    return replace(recording, columns=columns)
 
 
 def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
@@ -105,20 +124,52 @@ def _about(given: Input) -> Input:
 
 
 def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str, tuple[dict[str, Any], Input]]:
-    """The answer to each input, beside the columns that the others act by, and the input as it acts likeliest."""
+    """The answer to each input, beside the columns that the others act by, and the input as it acts likeliest. The one
+    that explains most alone comes first. Those that explain as much, and nothing beside each other, go together: each
+    is answered without the other, and neither is sure."""
+    alone = {name: _best(state, each)[0] for name, each in inputs.items()} if len(inputs) > 1 else {}
+    order = sorted(inputs, key=lambda name: -alone.get(name, 0.0))
     known: dict[str, Array] = {}
+    more: dict[str, float] = {}
 
-    def beside_others(name: str) -> State:
-        columns = [(other, one) for other, block in known.items() if other != name for one in block]
-        more = [Regressor(f"{other}_{k}", "input", one, "1", {}) for k, (other, one) in enumerate(columns)]
-        return state.refit(regressors=(*state.regressors, *more)) if more else state
+    def beside_others(name: str, apart: Sequence[str] = ()) -> State:
+        columns = [(other, one) for other, block in known.items() if other not in (name, *apart) for one in block]
+        added = [Regressor(f"{other}_{k}", "input", one, "1", {}) for k, (other, one) in enumerate(columns)]
+        return state.refit(regressors=(*state.regressors, *added)) if added else state
 
     for _ in range(ROUNDS if len(inputs) > 1 else 0):
-        for name, each in inputs.items():
-            found, _ = _found(beside_others(name), each)
-            best = max(found, key=lambda one: one.score)
-            known[name] = best.columns if best.score > 0.0 else best.columns[:0]
-    return {name: answer_of(beside_others(name), each) for name, each in inputs.items()}
+        for name in order:
+            more[name], columns = _best(beside_others(name), inputs[name])
+            known[name] = columns if more[name] > 0.0 else columns[:0]
+
+    def with_it(name: str) -> list[str]:
+        """The other inputs that it goes together with."""
+        both = [one for one in alone if one != name and min(alone[one], alone[name]) > NET_LEAST]
+        apart = [one for one in both if min(more[one], more[name]) > NET_LEAST]
+        near = [abs(alone[one] - alone[name]) < ALIKE or _copies(inputs[one][0], inputs[name][0]) for one in both]
+        return [one for one, alike in zip(both, near, strict=True) if alike and one not in apart]
+
+    found = {}
+    for name, each in inputs.items():
+        other = with_it(name)
+        said = [f"it goes together with {one}: either explains the record alone" for one in other]
+        found[name] = answer_of(beside_others(name, other), each, said)
+    return found
+
+
+def _copies(one: Input, other: Input) -> bool:
+    """Whether one of two inputs is the other one times a factor, within the noise of its readings."""
+    for a, b in ((one, other), (other, one)):
+        x, y = a.values - a.values.mean(), b.read - b.read.mean()
+        if np.var(y - x * (x @ y) / max(float(x @ x), 1e-300)) <= 2.0 * np.var(b.read - b.values):
+            return True
+    return False
+
+
+def _best(state: State, inputs: Sequence[Input]) -> tuple[float, Array]:
+    """The score and the columns of an input's best structure."""
+    best = max(_found(state, inputs)[0], key=lambda one: one.score)
+    return best.score, best.columns
 
 
 def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
@@ -130,8 +181,9 @@ def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
     return each[place], inputs[place]
 
 
-def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], Input]:
-    """Everything that is found of an axis and an input, as the document has it, and the input as it acts likeliest."""
+def answer_of(state: State, inputs: Sequence[Input], against: Sequence[str] = ()) -> tuple[dict[str, Any], Input]:
+    """Everything that is found of an axis and an input, as the document has it, and the input as it acts likeliest.
+    `against`: what speaks against any answer."""
     dt = state.dt
     found, given = _found(state, inputs)
     drive = Drive(given.values, dt)
@@ -158,7 +210,10 @@ def answer_of(state: State, inputs: Sequence[Input]) -> tuple[dict[str, Any], In
         pooled = Pooled(drawn, weight[alike])
         methods = _methods(state, drive, given.read, chosen, pooled, seen)
         held_out = transfer.held_out(state, chosen)
-        misfits = _misfits(transfer.left_over(state, drive, chosen), held_out * chosen.fit.n / 3.0, methods)
+        misfits = [
+            *against,
+            *_misfits(transfer.left_over(state, drive, chosen), held_out * chosen.fit.n / 3.0, methods),
+        ]
         verdict, reason = transfer.source(state, drive, chosen, drawn[0], misfits, acts_back=acts_back)
         entry |= {
             "structure": chosen.structure.name,

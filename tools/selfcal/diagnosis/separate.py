@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.record import LEAST, Record
 from selfcal.diagnosis.statistics import states_of
 from selfcal.likelihood.columns import Shape, possible
 from selfcal.likelihood.fit import Fit, Series, ln_likelihood, run
@@ -111,6 +111,8 @@ def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any
             white, ln_variance = _drawn(a, b, state, record, drive, swing, period_s)
             for share in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
                 duration_s = share * (period_s if drive else span / 8.0)
+                if duration_s * record.rate_hz < LEAST:
+                    continue
                 if duration_s > LONGEST * span or duration_s >= (plan["duration_s"] or math.inf):
                     break
                 samples = round(SAMPLES * duration_s / span)

@@ -10,6 +10,7 @@ from selfcal.base.units import duration_words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import ROUNDS
 from selfcal.diagnosis.separate import NATS
+from selfcal.logs.recording import SIDE_CHANNELS
 
 
 def verdict(axis: Mapping[str, Any]) -> str:
@@ -233,6 +234,9 @@ def action(finding: Mapping[str, Any]) -> str:
     """What to do. A coefficient that is known well enough is applied, and not measured again."""
     if "readings_hz" in finding["estimate"]:
         return f"Look for what turns or switches at {finding['estimate']['readings_hz']['median']:.3g} Hz."
+    if finding.get("next_record") and finding.get("confirmed_on") is not None:
+        seen = "Apply it: the second recording shows it too. --write-model states it."
+        return seen if finding["confirmed_on"] else "Leave it out of the model: the second recording does not show it."
     known = [one["estimate"].get("coefficient") for one in finding["axes"].values()]
     if not finding.get("next_record") and "source" not in finding["estimate"] and all(map(_sure, known)):
         return f"Apply it: it is known to {100.0 * APPLIED:.0f} %. --write-model states it."
@@ -252,7 +256,9 @@ def planned(record: Mapping[str, Any] | None, else_: str) -> str:
     else:
         swing, period = f"{record['amplitude']:g} {record['unit']}", duration_words(record["period_s"])
         begin = f"Leave it on and cycle the {record['drive']} by {swing} with a period of {period} for {length}."
-    return f"{begin} Then {rivals} differ by {NATS:g} nats."
+    held = [name for name in record["between"] if name in SIDE_CHANNELS and record["drive"] not in (None, name)]
+    still = "".join(f" Hold the {name} still." for name in held)
+    return f"{begin}{still} Then {rivals} differ by {NATS:g} nats."
 
 
 def _sure(coefficient: Mapping[str, Any] | None) -> bool:

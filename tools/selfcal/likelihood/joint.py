@@ -418,7 +418,9 @@ def act(score: Array, known: Array) -> Act:
     axis is what its own readings say: before the record it is a half, whatever the others do."""
     p, m = score.shape
     known = np.broadcast_to(known, (p, m, m))
-    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(known, axis1=1, axis2=2), 1e-300))
+    own = np.diagonal(known, axis1=1, axis2=2)
+    shown = own > 1e-12 * np.maximum(own.max(), 1e-300)  # of an axis without a reading where the column is, nothing
+    scale = shown / np.sqrt(np.where(shown, own, 1.0))
     z, R = score * scale, known * scale[:, :, None] * scale[:, None, :]
     widths = np.array(WIDTHS)
     values, members, priors = [], [], []
@@ -438,7 +440,7 @@ def act(score: Array, known: Array) -> Act:
     ln_bf = np.concatenate(values)
     total = float(logsumexp(ln_bf + np.concatenate(priors)))
     probability = softmax(ln_bf) @ np.vstack(members)
-    held = np.flatnonzero(probability >= 0.5)
+    held = np.flatnonzero((probability >= 0.5) & shown.all(axis=0))
     size, sd = np.zeros((p, m)), np.full(m, math.inf)
     if held.size:
         inverse = np.linalg.inv(known[:, held[:, None], held])
