@@ -39,7 +39,7 @@ from selfcal.likelihood.joint import (
     refitted,
     without_lines,
 )
-from selfcal.likelihood.state import EVIDENT, NET_LEAST, P_MODULE, State
+from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, P_MODULE, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.model.forms import formed, slope
 
@@ -409,7 +409,11 @@ def transients(seen: Seen) -> Iterator[Candidate]:
     shapes: list[Shape] = [("ramp", (), t - t.mean(), LN_SLOW)]
     shapes += [("turn_on", (float(one),), np.exp(-(t + seen.since_s) / one), LN_LOOKS + LN_SLOW) for one in tau]
     scored = _scored(seen, shapes)
-    for one in _weighed(seen, shapes, scored):
+    found = list(_weighed(seen, shapes, scored))
+    ramp = max((one.evidence for one in found if not one.theta), default=-math.inf)
+    for one in found:
+        if one.theta and one.evidence < ramp + ALIKE:  # of what is as likely the simpler one is meant
+            continue
         if one.theta:
             near = np.abs(ln_tau - math.log(one.theta[0])) < NEAR_TAU
             weight = softmax(full(scored[1], scored[2])[1:][near])

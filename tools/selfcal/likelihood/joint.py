@@ -46,6 +46,9 @@ FASTEST_S = 10.0
 PRIOR_SD = 3.0
 #: Widths of the size of a column, in its own standard deviations.
 WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
+#: ln of the odds that an axis has a column which another one has, before its own readings: of axes without it, 1 in 100
+#: are then taken for one with it, 1 in 20 at even odds.
+LN_ODDS = math.log(0.25)
 #: Numbers of an axis' own drift: ln of white noise, walk a step, Gauss-Markov deviation, rate a sample.
 OWN = 4
 
@@ -415,7 +418,7 @@ def act(score: Array, known: Array) -> Act:
 
     The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. Sizes are
     normal about 0 with one width for all axes of a set, in standard deviations of each axis' own. The probability of an
-    axis is what its own readings say: before the record it is a half, whatever the others do."""
+    axis is what its own readings say, whatever the others do."""
     p, m = score.shape
     known = np.broadcast_to(known, (p, m, m))
     own = np.diagonal(known, axis1=1, axis2=2)
@@ -439,7 +442,8 @@ def act(score: Array, known: Array) -> Act:
         members.append(one)
     ln_bf = np.concatenate(values)
     total = float(logsumexp(ln_bf + np.concatenate(priors)))
-    probability = softmax(ln_bf) @ np.vstack(members)
+    member = np.vstack(members)
+    probability = softmax(ln_bf + LN_ODDS * member.sum(axis=1)) @ member
     held = np.flatnonzero((probability >= 0.5) & shown.all(axis=0))
     size, sd = np.zeros((p, m)), np.full(m, math.inf)
     if held.size:

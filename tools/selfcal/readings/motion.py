@@ -4,8 +4,8 @@ Energy is that of second differences of the readings and of short means, about a
 none. A window is compared with its louder side, at its own length. So noise that grows, breathes or stays loud is no
 motion. At rest the mean of n squares exceeds r times its expectation with a probability below
 exp(-n (r - 1 - ln r) / 2) (Chernoff). Axes are independent at rest: the sensor moves where those but the loudest are
-louder together, or where one is so loud that no other window of its record is. A hand that pushes shows in means, on
-another level by far more than a bias jumps.
+louder together, or where one is so loud that no other window of its record is. A hand that turns slowly, or pushes,
+shows in the level (`away`).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from scipy.ndimage import median_filter
-from scipy.special import fdtrc, gammaincinv
+from scipy.ndimage import maximum_filter1d, median_filter
+from scipy.special import bdtrc, fdtrc, gammaincinv
 
-from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means, noise_of
-from selfcal.logs.recording import SIDE_CHANNELS, Recording
+from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means, runs
+from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.readings.budget import SHARES
 
 Interval = tuple[int, int]
@@ -29,13 +29,12 @@ Time = TypeVar("Time", int, float)
 
 #: Length of a piece, s, and pieces at most.
 PIECE_S, PIECES_MOST = 0.1, 40_000
-#: Lengths of the means that are taken beside the readings, s, and readings in one at least: a knock is short, and a
-#: hand that turns slowly, or pushes, shows in long ones alone.
-BANDS_S, BAND_LEAST = (0.1, 0.5, 2.5), 5
+#: Lengths of the means whose differences are taken beside the readings', and of the blocks that hands are looked for
+#: in, s: a knock is short, and a hand that turns slowly shows in long ones alone. Readings in one at least: with fewer
+#: each sample is a block, as no median leaves one out.
+BANDS_S, BAND_LEAST = (0.1, 0.5), 5
 #: Standard deviations of the median about a wild reading at most, and of itself at least.
-WILD = (5.0, 8.0)
-#: Standard deviations by which a hand pushes readings or means at least: no bias jumps so far in its means.
-PUSHED = 30.0
+WILD = (3.0, 8.0)
 #: Readings whose median is the level of the middle one: ramps, jumps and slow waves have no part in what is apart from
 #: it. Squares of white noise about it in one degree of freedom.
 LEVEL, SQUARES = 9, 1.29
@@ -61,12 +60,31 @@ SHARED = 0.05
 #: Standard deviations of a correlation by chance from which on axes depend on each other, and that of a copy.
 CORRELATED, COPY = 5.0, 0.999
 
+#: The minutes about a block that its level and its noise are compared with, s. What lasts longer than half is no motion
+#: but the record's own. At either end of the record they lie on one side.
+AROUND_S = 240.0
+#: A block is loud from so many times the usual deviation of its level on: of 10^6 normal blocks none is. Or from so
+#: many times the usual noise within it on, in a longer stretch of more: noise changes by itself.
+LOUD, LOUD_WITHIN, LOUD_LASTING = 8.0, 7.0, 12.0
 #: The usual deviation is at least this share of the record's own, so that a still stretch makes no other one loud.
 STILL = 0.5
-#: A stretch begins and ends so much beyond its loud pieces, s.
-MARGIN_S = 0.5
+#: Loud blocks closer than this are one stretch, s; it begins and ends so much beyond them, s.
+APART_S, MARGIN_S = 2.0, 0.5
 #: A stretch this close to an end of the record reaches it, s: hands began before it, or ended after.
 EDGE_S = 5.0
+#: A stretch holds so many loud samples at least, and in this share of its blocks the level leaps or the spread is loud:
+#: two jumps of the bias are still between. In a stretch this short, s, two such blocks are enough: in, and out.
+SAMPLES_LEAST, ROUGH_LEAST, ROUGH_COUNT, SHORT_S = 3, 0.2, 4, 5.0
+#: Of the leaps of a stretch so much goes back at least: a jump and a transient go one way.
+BACK_LEAST = 0.1
+#: So many stretches on one level, alike to this share of it, or a long one, are a bias with two levels.
+ALIKE_LEAST, ALIKE = 2, 0.2
+#: Probability, a record, that samples which are loud by chance make a stretch.
+CHANCE = 1e-5
+#: More than this share of a record is no exception.
+SHARE_MOST = 0.25
+#: Deviations beyond this count no more: the evidence of a stretch is certain long before. No bias has such two levels.
+DEVIATION_MOST = 100.0
 
 
 @dataclass(frozen=True)
@@ -121,27 +139,15 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
             for k in np.flatnonzero(one.axes).tolist():
                 found[names[k]].append(one)
         for k, name in enumerate(names):
-            times = joined([_times(energy, one, recording, name) for one in found[name]])
+            times = joined([_times(energy, one, recording) for one in found[name]])
             nats = sum(float(one.nats[k]) for one in found[name])
             seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]))
     return {name: one for name, one in seen.items() if one.intervals}
 
 
-def _times(energy: Energy, one: Stretch, recording: Recording, name: str) -> tuple[float, float]:
-    """Begin and end of a stretch on an axis, s, a margin more on either side. Near either is the first, or last,
-    reading that is wild beside the level outside."""
-    clock, values, length_s = recording.clock_of(name), recording.columns[name].values, recording.duration_s
-    there = np.isfinite(values)
-    y, time, reach = values[there], clock.time_s[there], max(BANDS_S[-1], LEVEL / clock.rate_hz)
-    ends = []
-    for at, outside in ((one.begin * energy.piece_s, -1), (one.end * energy.piece_s, 1)):
-        first, last = np.searchsorted(time, (at - reach, at + reach)).tolist()
-        beside = y[last : last + 5 * LEVEL] if outside > 0 else y[max(0, first - 5 * LEVEL) : first]
-        level = np.median(beside) if beside.size else math.nan
-        wild = first + np.flatnonzero(np.abs(y[first:last] - level) > WILD[1] * noise_of(y))
-        edge = wild[-(outside > 0)] if wild.size else -1
-        ends.append(at if edge < 0 else float(time[edge]) + (outside > 0) / clock.rate_hz)
-    begin, end = ends
+def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, float]:
+    """Begin and end of a stretch, s, a margin more on either side."""
+    begin, end, length_s = one.begin * energy.piece_s, one.end * energy.piece_s, recording.duration_s
     return begin - MARGIN_S if begin > EDGE_S else 0.0, end + MARGIN_S if end < length_s - EDGE_S else length_s
 
 
@@ -153,23 +159,19 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     count = math.ceil(length_s / piece_s - 1e-6)
     sums, counts = np.zeros((2, len(names), 1 + len(BANDS_S), count))
     there = [np.isfinite(recording.columns[name].values) for name in names]
-    tame = [_tame(recording.columns[name].values[each], BAND_LEAST) for name, each in zip(names, there, strict=True)]
+    tame = [_tame(recording.columns[name].values[each]) for name, each in zip(names, there, strict=True)]
     scaled_rows = [_scaled(own) for own, _ in tame]
     rows = _apart_from_each_other([own for own, _ in tame], scaled_rows)
     readings = []
     for k, (clock, own) in enumerate(zip(clocks, rows, strict=True)):
         time = clock.time_s[there[k]]
-        smooth = _tame(own, LEVEL)[0]
-        sizes = [1, *(max(BAND_LEAST, round(band_s * clock.rate_hz)) for band_s in BANDS_S)]
-        for band, size in enumerate(sizes):
-            if size in sizes[:band] or size > max(1, own.size // SIDE_SQUARES):
+        for band, size in enumerate([1, *(round(band_s * clock.rate_hz) for band_s in BANDS_S)]):
+            if band and not BAND_LEAST <= size <= own.size // SIDE_SQUARES:
                 continue
-            means, at = block_means(smooth if band else own, size), block_means(time, size)
+            means, at = block_means(own, size), block_means(time, size)
             scaled = _scaled(means)
             piece = np.minimum((at[: scaled.size] / piece_s + 1e-6).astype(np.int64), count - 1)
-            pushed = (np.abs(scaled) > PUSHED) & ((smooth == own)[: scaled.size] if size == 1 else True)
-            most = tame[k][1] * np.where(pushed, 0.5 * tame[k][1], 1.0)
-            sums[k, band] = np.bincount(piece, np.minimum(scaled**2, most), minlength=count)
+            sums[k, band] = np.bincount(piece, np.minimum(scaled**2, tame[k][1]), minlength=count)
             counts[k, band] = np.bincount(piece, minlength=count)
             if not band:
                 readings.append((scaled_rows[k], piece))
@@ -179,9 +181,8 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
 def _scaled(y: Array) -> Array:
     """Values [n] about their level over their noise; empty where most are alike: below the lattice, or bridged."""
     apart = y - _level(y)
-    if not apart.size or not np.median(np.abs(apart)) > 0.0:
-        return np.zeros(0)
-    return apart / float(np.median(np.abs(apart[np.diff(y, prepend=np.nan) != 0.0]))) * MEDIAN_SD
+    noise = float(np.median(np.abs(apart))) / MEDIAN_SD if apart.size else 0.0
+    return apart / noise if noise > 0.0 else np.zeros(0)
 
 
 def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> list[Array]:
@@ -216,13 +217,14 @@ def _level(y: Array) -> Array:
     return found
 
 
-def _tame(y: Array, around: int) -> tuple[Array, float]:
-    """Readings [n] with those at their level that are wild, fewer than half of the `around` about them; and the square
-    that is as rare as a wild one, in variances."""
+def _tame(y: Array) -> tuple[Array, float]:
+    """Readings [n] with those at their level that are wild by themselves; and the square that is as rare as a wild one,
+    in variances."""
     level = _level(y)
-    apart = np.abs(y - level)
-    noise = float(np.median(apart)) / MEDIAN_SD
-    wild = (apart > WILD[1] * noise) & (median_filter(apart, around, mode="nearest") < WILD[0] * noise)
+    apart = y - level
+    noise = float(np.median(np.abs(apart))) / MEDIAN_SD
+    middle = median_filter(apart, BAND_LEAST, mode="nearest")
+    wild = (np.abs(apart) > WILD[1] * noise) & (np.abs(middle) < WILD[0] * noise)
     return np.where(wild, level, y), 2.0 * math.log(y.size / (1.0 + float(wild.sum())))
 
 
@@ -231,7 +233,7 @@ def stretches(energy: Energy) -> list[Stretch]:
     found: list[Stretch] = []
     while more := _loud_windows(energy, found):
         sums, counts = energy.sums.copy(), energy.counts.copy()
-        margin = math.ceil(BANDS_S[-1] / energy.piece_s)  # means reach so far beyond it
+        margin = math.ceil(MARGIN_S / energy.piece_s)
         for one in more:
             gone = slice(max(0, one.begin - margin), one.end + margin)
             sums[..., gone] = counts[..., gone] = 0.0
@@ -278,8 +280,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
             more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else TOGETHER))
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
-            margin = math.ceil(BANDS_S[-1] / energy.piece_s)
-            taken[max(0, a - margin) : b + margin] = True
+            taken[a:b] = True
     sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others
     together = sum(one.net for one in [*known, *apart] if one.axes.sum() > 1 and one.net <= sure)
     return [one for one in apart if max(one.net, together * (one.axes.sum() > 1)) > sure]
@@ -330,7 +331,7 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
     nats = 0.5 * own_free * (ratio - 1.0 - np.log(ratio))
     near = nats > 1.0
     nats[near] = -np.log(np.maximum(fdtrc(own_free[near], side_free[near], ratio[near]), TINY))
-    return nats, (there[0] & there[1])[:, 0] | ((own > PUSHED) & (n >= BAND_LEAST)).any(axis=1), wide
+    return nats, (there[0] & there[1]).any(axis=1), wide
 
 
 def _spread(means: Array, counts: Array, known: Mask) -> float:
@@ -363,16 +364,13 @@ def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
     ratio, level = _ratio(energy, begin, end)
     r = ratio[axes][..., None]
     own = energy.sums[axes] / level[axes][..., None] * (1.0 - 1.0 / r) - energy.counts[axes] * np.log(r)
-    gain = 0.5 / SQUARES * own.sum(axis=0)
-    worth = gain[:, begin:end].sum(axis=1)
-    gain = gain[int(np.argmax(worth >= min(-math.log(SHARE), float(worth.max()))))]  # the finest that shows it
+    gain = 0.5 / SQUARES * own.sum(axis=(0, 1))
     middle = begin + int(np.argmax(gain[begin:end]))
     reach = []
     for part in (gain[middle:], gain[middle::-1]):
         sums = np.cumsum(part)
         over = np.flatnonzero(sums < np.maximum.accumulate(sums) + math.log(SHARE))
-        sums = sums[: over[0] if over.size else sums.size]
-        reach.append(int(np.argmax(sums > sums.max() - TOGETHER)))
+        reach.append(int(np.argmax(sums[: over[0] if over.size else sums.size])))
     return middle - reach[1], middle + reach[0] + 1
 
 
@@ -392,6 +390,151 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
     mean = np.maximum(np.linalg.eigvalsh(loud_ones @ loud_ones.T) / np.count_nonzero(inside), 1.0)
     nats = 0.5 * np.count_nonzero(inside) / SQUARES * (mean - 1.0 - np.log(mean))
     return float(nats[:-1].sum()) < -math.log(SHARE)
+
+
+def loud(y: Array, rate_hz: float, lsb: float = 0.0) -> Moved | None:
+    """The stretches in which readings [n] on an even grid, NaN where missing, are far louder than in the minutes about
+    them. `lsb`: their lattice. O(n)."""
+    block = round(BANDS_S[0] * rate_hz)
+    block = block if block >= BAND_LEAST else 1
+    level, noise = _blocks(y, block)
+    found = _loud_blocks(y, rate_hz, lsb, block, level, noise)
+    share = round(BANDS_S[1] * rate_hz / block)
+    if share >= BAND_LEAST:
+        found += _loud_blocks(y, rate_hz, lsb, block * share, *_blocks(level, share), knocks=False)
+    intervals = joined([interval for interval, _ in found])
+    if not found or sum(b - a for a, b in intervals) > SHARE_MOST * y.size:
+        return None
+    most = max(1, round(EDGE_S * rate_hz))
+    intervals = [(a if a > most else 0, b if b < y.size - most else y.size) for a, b in intervals]
+    # Blocks of several lengths show the same stretch: it counts once.
+    nats = sum(max(nats for (a, b), nats in found if first <= a and b <= end) for first, end in intervals)
+    times = tuple((a / rate_hz, b / rate_hz) for a, b in intervals)
+    return Moved(times, nats, nats - len(intervals) * math.log(y.size))
+
+
+def _loud_blocks(
+    y: Array, rate_hz: float, lsb: float, block: int, level: Array, noise: Array, *, knocks: bool = True
+) -> list[tuple[Interval, float]]:
+    """Stretches and their nats by blocks of one length, which have a level and a noise. `knocks`: short ones too."""
+    known = np.isfinite(level)
+    around = min(max(9, round(AROUND_S * rate_hz / block)), level.size // 3) | 1
+    if known.sum() < 3 * around // 2:
+        return []
+    level = bridged(level)
+    leap = np.diff(level, prepend=level[0])
+    sizes = [np.abs(level - _middle(level, around))]
+    leaps = _over(np.abs(leap), around, lsb) > LOUD * math.sqrt(0.5)
+    away = _over(sizes[0], around, lsb)
+    rough = leaps
+    if block > 1:
+        sizes.append(bridged(noise))
+        noise = _over(sizes[1], around, lsb) / MEDIAN_SD
+        rough, away = leaps | (noise > LOUD_WITHIN), np.maximum(away, LOUD / LOUD_WITHIN * noise)
+    apart = max(2, round(APART_S * rate_hz / block))
+    # Still blocks on another level, before a jump or behind it, are no part of a stretch.
+    far = known & (away > LOUD) & maximum_filter1d(rough, 2 * apart + 1)
+    parts = runs(far, apart - 1)
+    if not parts:
+        return []
+    wild = away > LOUD if block == 1 else _wild(y, level, sizes[1], around, block, lsb) if knocks else far
+    begins = np.diff(wild, prepend=False) & wild
+    margin = max(1, round(MARGIN_S * rate_hz))
+    found: list[tuple[Interval, float]] = []
+    moving = np.zeros(level.size, bool)
+    for a, b in parts:
+        knock = (b - a) * block <= SHORT_S * rate_hz
+        if knock:
+            own = slice(a * block, b * block)
+            others = max(1, int(begins.sum()) - int(begins[own].sum()))
+            rare = knocks and _rare(int(wild[own].sum()), (b - a) * block, others, y.size)
+        else:
+            rare = _rare(int(far[a:b].sum()), b - a, len(parts), level.size)
+            rare = rare and not _alike(sizes[0][a:b][far[a:b]])
+        within, least = (LOUD_WITHIN, 2.0) if knock else (LOUD_LASTING, max(ROUGH_COUNT, ROUGH_LEAST * (b - a)))
+        inside = np.arange(a, b)[far[a:b]] if knock else np.arange(a, b)
+        moved = leap[a : b + 1][leaps[a : b + 1]]
+        back = min(moved.clip(min=0.0).sum(), -moved.clip(max=0.0).sum()) > BACK_LEAST * np.abs(moved).sum()
+        shaken = (back or (noise[a:b] > within).sum() >= 2) and rough[a : b + 1].sum() >= least
+        against = (LOUD / MEDIAN_SD if knock else LOUD_LASTING, within)
+        if rare and shaken and far[a:b].sum() >= 2 and _louder(sizes, against, inside, around // 2):
+            moving[a:b] = far[a:b]
+            square = np.minimum(away[a:b][far[a:b]], DEVIATION_MOST) ** 2
+            nats = 0.5 * float((square - 1.0 - np.log(square)).sum())
+            found.append(((max(0, a * block - margin), min(y.size, b * block + margin)), nats))
+    two_levels = len(found) >= ALIKE_LEAST and _alike(sizes[0][moving])
+    return [] if two_levels and float(np.median(away[moving])) < DEVIATION_MOST else found
+
+
+def _alike(levels: Array) -> bool:
+    """Whether all the loud levels are as far away: a bias with two levels makes such stretches."""
+    middle = float(np.median(levels))
+    return float(np.median(np.abs(levels - middle))) < ALIKE * middle
+
+
+def _rare(count: int, of: int, stretches: int, n: int) -> bool:
+    """Whether `count` loud ones of `of` are no chance where `stretches` of them lie scattered among n."""
+    return count >= SAMPLES_LEAST and n * float(bdtrc(count - 1, of, stretches / n)) < CHANCE
+
+
+def _wild(y: Array, level: Array, spread: Array, around: int, block: int, lsb: float) -> Mask:
+    """Samples [n] that are loud each by itself, against the level and the noise of the blocks about them."""
+    usual = np.maximum(_middle(bridged(spread), around) / MEDIAN_SD, lsb)
+    rows = y[: level.size * block].reshape(-1, block)
+    wild = np.abs(rows - _middle(level, around)[:, None]) > LOUD_WITHIN * usual[:, None]
+    return np.append(wild.ravel(), np.zeros(y.size - wild.size, bool))
+
+
+def _louder(sizes: list[Array], leasts: tuple[float, float], inside: Rows, around: int) -> bool:
+    """Whether the blocks `inside` are loud against the time before and the time after them, by one measure."""
+    a, b = int(inside[0]), int(inside[-1]) + 1
+    sides = [slice(max(0, a - around), a), slice(b, b + around)]
+    return any(
+        all(
+            float(np.median(size[inside])) > least * float(np.median(size[side]))
+            for side in sides
+            if size[side].size > around // 24
+        )
+        for size, least in zip(sizes, leasts, strict=False)
+    )
+
+
+def _blocks(values: Array, share: int) -> tuple[Array, Array]:
+    """Median of each block of `share` values, and their noise: the median of their steps over sqrt(2). A jump or a
+    slope within a block is no noise. NaN where half of a block is missing; no noise of single values."""
+    if share == 1:
+        return values, np.full(values.size, np.nan)
+    n = values.size // share * share
+    steps = np.abs(np.diff(values[:n], prepend=values[0]))
+    level, noise = _medians(values[:n], share), math.sqrt(0.5) * _medians(steps, share)
+    return np.where(np.isfinite(noise), level, np.nan), np.where(np.isfinite(level), noise, np.nan)
+
+
+def _medians(values: Array, share: int) -> Array:
+    """Middle of each `share` values, the upper one of two; NaN where half of them are."""
+    rows = values.reshape(-1, share)
+    missing = np.isnan(rows)
+    if not missing.any():
+        return np.ascontiguousarray(np.partition(rows, share // 2, axis=1)[:, share // 2])
+    # Missing ones lie to either side in turn: they move no median.
+    beyond = np.where(np.cumsum(missing, axis=1) % 2 == 0, np.inf, -np.inf)
+    middle = np.partition(np.where(missing, beyond, rows), share // 2, axis=1)[:, share // 2]
+    return np.where(2 * missing.sum(axis=1) >= share, np.nan, middle)
+
+
+def _middle(values: Array, around: int) -> Array:
+    """Running median over `around` values; at the ends that of the first and the last so many."""
+    half = around // 2
+    middle: Array = median_filter(values, 2 * half + 1, mode="nearest")
+    middle[:half], middle[values.size - half :] = middle[half], middle[values.size - half - 1]
+    return middle
+
+
+def _over(values: Array, around: int, lsb: float) -> Array:
+    """Deviations over the usual ones about them, as of a normal's."""
+    usual = _middle(values, around) / MEDIAN_SD
+    own = float(np.median(values[values > 0.0])) / MEDIAN_SD if (values > 0.0).any() else 0.0
+    return values / np.maximum(np.maximum(usual, STILL * own), max(lsb, 1e-300))
 
 
 def joined(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:
