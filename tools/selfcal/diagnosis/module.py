@@ -557,7 +557,10 @@ class Search:
         one's own."""
         vain: list[Candidate] = []
         for _ in range(MOST - len(self.several) - len(self.single)):
-            left = {name: [one for one in each if one not in vain] for name, each in self.known.items()}
+            left = {
+                name: [one for one in each if not any(one is other for other in vain)]
+                for name, each in self.known.items()
+            }
             found = _best_of(one for each in left.values() for one in each)
             last = found is None or found.evidence < least
             if last:
