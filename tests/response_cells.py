@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from effects import play
 from influences import FINE, Array, K, N, late, wander
 from scipy.signal import bilinear, lfilter
 
@@ -73,14 +74,6 @@ def swinging(u: Array, period_s: float, damping: float, step_s: float) -> Array:
     return np.asarray(u[0] + lfilter(b, a, u - u[0]))
 
 
-def played(u: Array, width: float) -> Array:
-    out, at = np.empty(u.size), float(u[0])
-    for i, one in enumerate(u.tolist()):
-        at = max(one - width / 2.0, min(one + width / 2.0, at))
-        out[i] = at
-    return out
-
-
 Truth = tuple[Array, dict[str, float]]
 
 
@@ -113,7 +106,7 @@ def late_square(r: Record) -> Truth:
 
 def hysteresis(r: Record) -> Truth:
     width = r.random.uniform(1.5, 3.0)
-    return GAIN * played(r.u, width), {"gain": GAIN, "width": width}
+    return GAIN * play(r.u, width), {"gain": GAIN, "width": width}
 
 
 def two_lags(r: Record) -> Truth:

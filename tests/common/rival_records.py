@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from effects import play
 from influences import FINE, Array, K, N, late, wander
 from scipy.special import logsumexp
 
@@ -52,7 +53,7 @@ class Part:
         if self.true == "rate":
             return self.size * 0.03 * self.tau_s * np.gradient(values["temp"], step)
         if self.true == "play":
-            return self.size * 0.08 * played(values["temp"], self.width)
+            return self.size * 0.08 * play(values["temp"], self.width)
         coefficient = {"temperature, ramp": 0.06, "static, play": 0.08}.get(self.pair, 0.03)
         return self.size * coefficient * values["temp"]
 
@@ -100,15 +101,6 @@ class Part:
         return readings
 
 
-def played(u: Array, width: float) -> Array:
-    """Hysteresis: it follows half a width behind."""
-    out, at = np.empty(u.size), float(u[0])
-    for i, one in enumerate(u.tolist()):
-        at = max(one - width / 2.0, min(one + width / 2.0, at))
-        out[i] = at
-    return out
-
-
 def means(values: Array) -> Array:
     n = values.size // MEAN_S
     return values[: n * MEAN_S].reshape(n, MEAN_S).mean(axis=1)
@@ -128,7 +120,7 @@ def columns(rival: str, readings: Mapping[str, Array], begin_s: float) -> Array:
         sums = np.cumsum(np.concatenate([np.full(60, temp[:30].mean()), temp, np.full(60, temp[-30:].mean())]))
         return means((sums[120:] - 2.0 * sums[60:-60] + sums[:-120]) / 3600.0)[None]
     if rival == "play":
-        return np.array([played(means(temp), width) for width in np.geomspace(0.1, 6.0, 15)])
+        return np.array([play(means(temp), width) for width in np.geomspace(0.1, 6.0, 15)])
     return means(temp)[None]
 
 
