@@ -282,7 +282,9 @@ def _entry(event: Event) -> dict[str, Any]:
         }
         counted = list(pairs.values()) if CAUSES[event.cause].grouping.pairs else event.members
         gain = sum(member.finding.look.gain for member in counted)
-        longest = max(rows, key=lambda row: (row["next_record"] or {"duration_s": 0.0})["duration_s"] or math.inf)
+        plans = [row["next_record"] for row in rows]
+        lengths = [0.0 if plan is None else plan["duration_s"] or math.inf for plan in plans]
+        longest = rows[int(np.argmax(lengths))]
         entry = {
             "cause": event.cause,
             "estimate": _common([row["estimate"] for row in rows]),

@@ -246,16 +246,14 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     found = looks(before.first(split), part)
     if not found:
         return after
-    f = float(found[0].estimate["frequency_hz"]["median"])
-    found_at = pair(f, record)
+    f, own = (float(one.estimate["frequency_hz"]["median"]) for one in (found[0], look))
     known = {one.name for one in before.regressors}
-    return replace(
-        after,
-        regressors=tuple(
-            one if one.name in known else replace(one, values=found_at.get(one.name[-4:], np.zeros(before.y.size)))
-            for one in after.regressors
-        ),
-    )
+
+    def at_f(one: Regressor) -> Regressor:
+        multiple = max(1, round(float(one.entry["frequency_hz"]) / own))
+        return replace(one, values=pair(multiple * f, record).get(one.name[-4:], np.zeros(before.y.size)))
+
+    return replace(after, regressors=tuple(one if one.name in known else at_f(one) for one in after.regressors))
 
 
 def _alike(a: Look, b: Look) -> bool:
