@@ -69,6 +69,8 @@ PLACES = 4
 FAST_LINES = 6
 #: Multiples of a line that are looked at with it, if it is no slow one, and ln of the number of kinds of lines.
 MULTIPLES, LN_ALONE = 5, math.log(2.0)
+#: ln of the ways in which the phases of a line on the axes may go together.
+LN_PHASES = math.log(2.0)
 #: Samples at each end in which no step is looked for, and of a pulse at least.
 EDGE, SHORTEST = 4, 4
 #: Share of the information of a step far from the ends, from which on two of them are taken as there.
@@ -329,11 +331,24 @@ def lines(seen: Seen) -> Iterator[Candidate]:
             tried += [(kinds, f, waves[: 2 * count]) for count in range(2, len(multiples) + 1)]
         found = []
         for kinds, f, parts in tried:
-            acts = act(parts @ weights, np.repeat(there[: len(parts) // 2], 2, axis=0))
-            cost = kinds + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
             theta = (f / seen.dt, *map(float, multiples[1 : len(parts) // 2]))
-            found.append(Candidate("periodic", theta, acts, cost, parts))
+            for acts, price, columns in _phased(parts, parts @ weights, there[: len(parts) // 2]):
+                cost = kinds + price + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
+                found.append(Candidate("periodic", theta, acts, cost, columns))
         yield _ranked(found)[0]
+
+
+def _phased(waves: Array, score: Array, known: Array) -> Iterator[tuple[Act, float, Array]]:
+    """Cosines and sines `waves` [2 k, n] by their scores [2 k, m] and information [k, m, m]: with a phase on each axis,
+    and with one for all, as a single source has it. Of each what it acts on, its price and its columns."""
+    yield act(score, np.repeat(known, 2, axis=0)), LN_PHASES, waves
+    pairs = score.reshape(len(known), 2, -1)
+    sizes, ways = np.linalg.eigh(pairs @ np.linalg.solve(known, np.swapaxes(pairs, 1, 2)))
+    turn = ways[:, None, :, 1]
+    # Phases that differ: half a turn over the width of the likelihood of one, 1 / sqrt(the fall of the square).
+    apart = np.maximum(0.5 * math.pi * (sizes[:, 1] - sizes[:, 0]), 1.0)
+    price = LN_PHASES + 0.5 * float(np.log(apart).sum())
+    yield act((turn @ pairs)[:, 0], known), price, (turn @ waves.reshape(len(known), 2, -1))[:, 0]
 
 
 def _waves(f: float, n: int, multiples: Sequence[int]) -> Array:
@@ -379,8 +394,9 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
         turn = (at + 0.5 * (left - right) / min(left + right - 2.0 * top, -1e-9)) / padded
         wave = np.exp(2j * math.pi * np.mod(turn * np.arange(n), 1.0))
         score = (w @ wave / np.sqrt(own[:, at])) @ inverse
-        one = act(np.array([score.real, score.imag]), 0.5 * n * inverse)
-        evidence = one.evidence - float(ln_lines(np.array(turn * n), n, np.array(one.evidence)))
+        tried = _phased(np.empty((2, 0)), np.array([score.real, score.imag]), 0.5 * n * inverse[None])
+        one, price = max(((acts, price) for acts, price, _ in tried), key=lambda each: each[0].evidence - each[1])
+        evidence = one.evidence - price - float(ln_lines(np.array(turn * n), n, np.array(one.evidence)))
         if evidence >= EVIDENT and len(one.axes) > 1:
             found.append(Event(tuple(names[k] for k in one.axes), "periodic", (turn / dt,), evidence))
         gain[max(0, at - 8) : at + 9] = 0.0
