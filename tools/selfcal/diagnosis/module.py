@@ -609,12 +609,13 @@ class Search:
         return one.cause in OF_TIME and one.share_of(self.model.loading) > PATTERN
 
     def weigh(self, model: Joint) -> None:
-        """Take a model with the quantity. Events with its pattern are its own."""
-        self.model = model
+        """Take a model with the quantity. What goes like it over the axes is its own, or a channel that is looked for
+        again beside it: its wandering may go like a channel for a while."""
+        alike = [one for one in self.several if one.share_of(model.loading) > PATTERN]
+        self.rest = self.rest + sum(one.effect for one in alike)
+        self.several = [one for one in self.several if not any(one is each for each in alike)]
+        self.model = refitted(model, self.rest, self.dt) if alike else model
         self._changed()
-        for one in filter(self._is_own, self.several):
-            self.rest = self.rest + one.effect
-        self.several = [one for one in self.several if not self._is_own(one)]
 
 
 def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s: float = 0.0) -> Module | None:
