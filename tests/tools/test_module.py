@@ -179,6 +179,31 @@ def test_a_recorded_temperature_comes_before_a_hidden_quantity() -> None:
     assert found.events[0].act.axes == [0, 1, 2, 3, 4]
 
 
+def test_a_line_of_one_source_has_one_phase() -> None:
+    """Seven nats on each of six axes, of either sign, without noise. With one phase 6 of the 12 sizes are 0: each costs
+    the ln of its width over that of its likelihood, 3.7, about a nat. With a phase on each axis two are no fewer."""
+    level, waves = np.eye(6)[None], np.empty((2, 0))
+    size = math.sqrt(14.0) * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
+    for phases, gains in ((np.full(6, 0.7), (2.0, 6.0)), (0.7 + 0.5 * math.pi * np.arange(6), (-math.inf, 0.0))):
+        scores = size * np.array([np.cos(phases), np.sin(phases)])
+        free, common = (found.evidence - price for found, price, _ in module._phased(waves, scores, level))
+        assert gains[0] < common - free < gains[1]
+
+
+@pytest.mark.parametrize("turns", [0.13, 0.2])
+def test_a_slow_quantity_is_no_lagged_temperature(turns: float) -> None:
+    """A part of a day's turn and a weak walk on six axes, beside a temperature that warms up and does nothing. Late
+    enough it goes like the quantity, 2 to 3 nats beyond its search; so does any slow curve."""
+    n, random = 6000, np.random.default_rng(9)
+    t = np.arange(n)
+    temperature = 24.0 + 4.0 * (1.0 - np.exp(-t / 1500.0)) + 0.02 * random.normal(size=n)
+    wave = np.sin(2.0 * math.pi * (turns * t / n + 0.1))
+    quantity = 2.0 * (wave - wave.mean()) / wave.std() + 0.02 * np.cumsum(random.normal(size=n))
+    found = seen(drawn(7, n) + np.outer([1.0, 0.8, -0.9, 1.1, 0.6, 1.0], quantity), temperature=temperature)
+    assert found.hidden is not None
+    assert not found.events
+
+
 def test_a_column_that_an_axis_has_is_no_event_again() -> None:
     """A noisy thermometer is two events: means of 1 s and of 30 s show it. The second one is the column of the first
     one, and ended in a traceback."""

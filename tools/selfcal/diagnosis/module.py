@@ -87,6 +87,8 @@ PATTERN = 0.7
 JUMPS = ("step", "pulse")
 #: Causes that the quantity may be, with that pattern: its course has any shape.
 OF_TIME = (*JUMPS, "ramp", "turn_on")
+#: Slow curves that a quantity may go along, cosines of so many half turns and fewer.
+CURVES = 4
 #: Logarithm of a factor about a time constant within which others are as possible as their likelihood says.
 NEAR_TAU = 1.5
 #: The shortest lag of a channel, means.
@@ -174,6 +176,13 @@ class Seen:
     @cached_property
     def course(self) -> Course:
         return course(self.model, self.y, smooth=True)
+
+    @cached_property
+    def wandering(self) -> float:
+        """Evidence of the best of some slow curves, nats: what wanders goes like one, whatever channel does too."""
+        curves = np.cos(math.pi * np.outer(np.arange(1, CURVES + 1), (np.arange(self.n) + 0.5) / self.n))
+        each = zip(curves @ self.course.weights, information(self.model, self.y, curves), strict=True)
+        return max(act(score[None], known).evidence for score, known in each) - math.log(CURVES)
 
     @property
     def edge(self) -> int:
@@ -606,7 +615,9 @@ class Search:
 
     def _is_own(self, one: Candidate) -> bool:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
-        return one.cause in OF_TIME and one.share_of(self.model.loading) > PATTERN
+        if one.share_of(self.model.loading) <= PATTERN:
+            return False
+        return one.cause in OF_TIME or (one.cause in self.channels and one.evidence < self.seen.wandering + ALIKE)
 
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. What goes like it over the axes is its own, or a channel that is looked for
