@@ -164,8 +164,8 @@ def test_a_module_that_begins_with_the_batch_knows_more(tmp_path: Path) -> None:
 
 
 def test_the_printed_example(tmp_path: Path) -> None:
-    """The README's batch, by its own code: the command prints the lines that stand there, long ones wrapped."""
-    text = (ROOT / "tools" / "README.md").read_text().partition("### The population")[2]
+    """The batch of tools/pages/fleet.md, by its own code: the command prints the lines of the page, wrapped."""
+    text = (ROOT / "tools" / "pages" / "fleet.md").read_text(encoding="utf-8").partition("## The population")[2]
     made, command, printed = (text.split("```python\n")[1].split("```")[0], *text.split("\n\n    ")[1:3])
     if not case_records(0, 1):
         pytest.skip("SLOW: make cases")

@@ -43,7 +43,7 @@ def assert_same_answer(log: Path, again: Path) -> None:
 
 @pytest.mark.parametrize("name", logs.WRITERS)
 def test_a_log_of_any_form_is_converted_without_loss(name: str, tmp_path: Path) -> None:
-    """Every form of LOGS.md, by either form of a plain recording."""
+    """Every form of tools/pages/logs.md, by either form of a plain recording."""
     log = logs.WRITERS[name](logs.Drawn(seconds=12.0, seed=7), tmp_path)
     again = tmp_path / ("again.csv.gz" if len(name) % 2 else "again.npz")
     convert(log, again)

@@ -476,7 +476,7 @@ def test_a_library_that_is_absent(drawn: logs.Drawn, tmp_path: Path, monkeypatch
 
 def test_the_page_your_log(tmp_path: Path) -> None:
     """Every line of the page runs as printed on such a log. In `make test` one of them runs; each has its log."""
-    page = (ROOT / "tools" / "LOGS.md").read_text(encoding="utf-8")
+    page = (ROOT / "tools" / "pages" / "logs.md").read_text(encoding="utf-8")
     printed = [shlex.split(one) for one in re.findall(r"`selfcal (identify [^`]*)`", page)]
     short = logs.Drawn(seconds=1200.0 if case_records(0, 1) else 30.0)
     written: dict[str, Path] = {}

@@ -217,7 +217,7 @@ def test_bad_recordings(tmp_path: Path, verb: str, text: str, expected: str) -> 
 
 @pytest.mark.parametrize("verb", ["identify", "diagnose", "compare", "convert", "replay", "monitor", "rivals", "worth"])
 def test_keywords_differ_from_options_by_the_rules_of_the_readme(verb: str) -> None:
-    """Truth: the table in tools/README.md. A monitor's `start` is its `--from`."""
+    """Truth: the table in tools/pages/python.md. A monitor's `start` is its `--from`."""
     named = {"start": "start_s", "end": "end_s", "since_power_on": "since_power_on_s", "axis": "axes"}
     named |= {"column": "columns", "unit": "units", "source": "sources", "from": "start", "no_suspicion": "suspicion"}
     function = getattr(import_module(f"selfcal.verbs.{verb}"), verb)

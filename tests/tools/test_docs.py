@@ -1,7 +1,7 @@
 """What the documents say that is made from a source elsewhere.
 
-`.venv/bin/python tests/tools/test_docs.py` writes the outputs in README.md and tools/README.md anew. Every command of a
-document is run by a test, or UNTRIED says why not; all are parsed.
+`.venv/bin/python tests/tools/test_docs.py [PAGE ...]` writes the outputs of PRINTED anew, or those of some pages. Every
+command of a document is run by a test, or UNTRIED says why not; all are parsed.
 """
 
 from __future__ import annotations
@@ -33,14 +33,26 @@ sys.path.insert(0, str(ROOT / "tests"))  # where this is run as a program
 from conftest import CASE_RECORDS, SHARED_DATA  # noqa: E402
 from conftest import COMMAND as PROGRAM  # noqa: E402
 
+PAGES = ROOT / "tools" / "pages"
 DOCUMENTS = (
     *("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "host_sim/README.md", "port/README.md", "tests/README.md"),
-    *("tests/ACCURACY.md", "tests/COST.md"),
+    *("tests/ACCURACY.md", "tests/COST.md", "SECURITY.md", "tools/README.md"),
     *("lib/README.md", "lib/DESIGN.md", "lib/WIRE.md", "lib/EVALUATION.md"),
-    *("tools/README.md", "tools/MODEL.md", "tools/TUMBLE.md", "tools/LOGS.md", "tools/OTHERS.md"),
+    *sorted(str(page.relative_to(ROOT)) for page in PAGES.glob("*.md")),
 )
-WALKTHROUGH = ROOT / "tools" / "README.md"
-TOUR = ROOT / "README.md"
+#: Pages whose examples run from top to bottom, each in a folder of its own.
+PRINTED = (
+    *("README.md", "tools/README.md"),
+    *(
+        f"tools/pages/{name}.md"
+        for name in (
+            *("better_model", "causes", "chamber", "compare", "diagnose", "identify"),
+            *("metres", "production", "real_part", "response"),
+        )
+    ),
+)
+#: Lines of a page, to be read in one go.
+LONGEST = 250
 #: Beginnings of commands that no test runs as printed, and why.
 UNTRIED = {
     "identify path/to/log.csv": "a place of the reader's own",
@@ -96,10 +108,10 @@ def excused(command: str) -> bool:
 def executed(text: str, folder: Path) -> str:
     """A document whose indented commands are run in `folder`, one after the other, each with its output below it, long
     lines wrapped. A command that has no output in the document gets none. `cp`, `cut` and Python are run as well. A
-    program of the document, whose first line is `# NAME.py`, is there from the start."""
+    file of the document, a block whose first line is `# NAME.py` or `# NAME.yaml`, is there from the start."""
     checkout(folder)
-    for name, program in re.findall(r"^```python\n# (\w+\.py)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
-        (folder / name).write_text(program, encoding="utf-8")
+    for name, content in re.findall(r"^```\w+\n# (\w+\.(?:py|yaml))\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        (folder / name).write_text(content, encoding="utf-8")
     lines, found, at = text.splitlines(), list[str](), 0
     while at < len(lines):
         found.append(lines[at])
@@ -157,27 +169,25 @@ def assert_alike(said: str, printed: str) -> None:
         assert math.isclose(float(a), float(b), rel_tol=0.02, abs_tol=2e-4), (a, b)
 
 
-def test_the_walkthrough_is_as_printed(tmp_path: Path) -> None:
-    """The text's own figure of the JSON, too."""
-    text = WALKTHROUGH.read_text(encoding="utf-8")
-    assert_alike(text, executed(text, tmp_path))
-    best = [
-        max(json.loads((tmp_path / name).read_text(encoding="utf-8"))["axes"]["gx"]["log_evidence"].values())
-        for name in ("before.json", "after.json")
-    ]
-    told = re.search(r"has gained ([0-9.]+) nats", text)
-    assert told is not None and math.isclose(float(told[1]), best[1] - best[0], rel_tol=0.01)
-
-
-def test_the_tour_is_as_printed(tmp_path: Path) -> None:
-    """README.md from top to bottom: its recordings, diagnosis and counts."""
+@pytest.mark.parametrize("name", PRINTED)
+def test_a_page_is_as_printed(name: str, tmp_path: Path) -> None:
+    """Its recordings, its commands and their outputs; two pages have more to hold."""
     folder = tmp_path / "checkout"
     folder.mkdir()
-    text = TOUR.read_text(encoding="utf-8")
+    text = (ROOT / name).read_text(encoding="utf-8")
     assert_alike(text, executed(text, folder))
-    assert (folder / "report.html").exists() and (folder / "my_tables" / "selfcal_model.c").exists()
-    found = json.loads((folder / "my.json").read_text(encoding="utf-8"))["axes"]
-    assert all("error" not in axis for axis in found.values())
+    if name == "README.md":
+        assert (folder / "report.html").exists() and (folder / "my_tables" / "selfcal_model.c").exists()
+        found = json.loads((folder / "my.json").read_text(encoding="utf-8"))["axes"]
+        assert all("error" not in axis for axis in found.values())
+    gained = re.search(r"has gained ([0-9.]+) nats", text)
+    assert (gained is not None) == (name == "tools/pages/better_model.md")
+    if gained is not None:
+        best = [
+            max(json.loads((folder / file).read_text(encoding="utf-8"))["axes"]["gx"]["log_evidence"].values())
+            for file in ("before.json", "after.json")
+        ]
+        assert math.isclose(float(gained[1]), best[1] - best[0], rel_tol=0.01)
 
 
 @pytest.fixture(scope="module")
@@ -197,7 +207,7 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_every_command_of_the_documents_runs(name: str, request: pytest.FixtureRequest) -> None:
     """Where its output is compared, or here in `make cases`, or UNTRIED says why not; all are parsed."""
     text = (ROOT / name).read_text(encoding="utf-8")
-    ran = commands_of(text, "    ") if (ROOT / name) in (TOUR, WALKTHROUGH) else []
+    ran = commands_of(text, "    ") if name in PRINTED else []
     if name == "lib/README.md":
         ran = commands_of("".join(blocks(ROOT / name, "sh")[:3]))
     parser = typer.main.get_command(app)
@@ -236,7 +246,7 @@ def test_the_python_example_runs(tmp_path: Path) -> None:
     """As printed, with the number that stands behind its `print`."""
     (tmp_path / "tests").symlink_to(ROOT / "tests")
     shutil.copy(ROOT / "tools" / "selfcal" / "model" / "models" / "default.yaml", tmp_path / "my.yaml")
-    example = blocks(ROOT / "tools" / "README.md", "python")[-1]
+    example = blocks(PAGES / "python.md", "python")[0]
     done = subprocess.run([sys.executable, "-c", example], cwd=tmp_path, capture_output=True, text=True, check=True)
     told = re.search(r"^print.*# ([0-9.]+)$", example, re.MULTILINE)
     assert told is not None and math.isclose(float(done.stdout), float(told[1]), rel_tol=0.02)
@@ -359,9 +369,17 @@ def test_lines_of_the_documents_fit() -> None:
             assert len(line) <= WIDTH, f"{name}:{number}: {len(line)} columns"
 
 
+def test_pages_are_short_and_found() -> None:
+    """Each is to be read in one go, and the table of tools/README.md has it."""
+    door = (ROOT / "tools" / "README.md").read_text(encoding="utf-8")
+    for page in PAGES.glob("*.md"):
+        assert page.read_text(encoding="utf-8").count("\n") <= LONGEST, page.name
+        assert f"](pages/{page.name}" in door, page.name
+
+
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as name:
-        for number, document in enumerate((WALKTHROUGH, TOUR)):
-            folder = Path(name) / str(number) / "checkout"
-            folder.mkdir(parents=True)
+    for page in sys.argv[1:] or PRINTED:
+        with tempfile.TemporaryDirectory() as name:
+            folder, document = Path(name) / "checkout", ROOT / page
+            folder.mkdir()
             document.write_text(executed(document.read_text(encoding="utf-8"), folder), encoding="utf-8")

@@ -835,12 +835,12 @@ def assert_alike(said: list[str], printed: list[str]) -> None:
 
 
 def test_the_page_is_as_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """tools/TUMBLE.md: its log is this one, and so are the numbers that the text calls its truth."""
+    """tools/pages/tumble.md: its log is this one, and so are the numbers that the text calls its truth."""
     random = np.random.default_rng(620)
     part = draw_part(random)
     more = {"rest_s": 45.0, "turn_s": 3.0, "rate_hz": 50.0, "gravity": gravity_at(47.0, 400.0), "latitude_deg": 47.0}
     recording, _ = tumbled(part, random, TWELVE, **more, name="desk.csv")
-    page = (ROOT / "tools" / "TUMBLE.md").read_text(encoding="utf-8")
+    page = (ROOT / "tools" / "pages" / "tumble.md").read_text(encoding="utf-8")
     show(selfcal.tumble(recording, latitude=47.0, height=400.0))
     assert_alike(printed_in(page, "tumble desk.csv"), words_of(capsys.readouterr().out))
     truth = [1e6 * (part.scale[0] - 1.0), 1e3 * part.angles[1], math.degrees(part.G[2, 0]), 1e3 * part.gyro_angles[5]]

@@ -36,7 +36,7 @@ OWN = {cause.looks for cause in CAUSES.values() if cause.looks and cause.groupin
 READ = (integrity.misread, integrity.held_samples, integrity.stuck, integrity.recurring)
 #: Why an axis is not done.
 INTERRUPTED = "interrupted before it was done"
-SPENT = "its work was bounded (tools/README.md): there may be more causes"
+SPENT = "its work was bounded (tools/pages/diagnose.md): there may be more causes"
 #: A look that predicts held-out time worse is no cause. From this worth on it is no chance either.
 UNLASTING = 2.0 * NET_LEAST
 #: Means that hold a jump: the one in which it lies, and the one beside it that may be that.

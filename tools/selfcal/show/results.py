@@ -1,6 +1,6 @@
 """The results of `identify`, `replay`, `diagnose` and `compare`: their JSON objects, with the keys as attributes.
 
-Each is a dict with the keys that tools/README.md lists under "JSON". `found["axes"]["gx"]["bias_now"]` and
+Each is a dict with the keys that tools/pages list under "JSON". `found["axes"]["gx"]["bias_now"]` and
 `found.axes["gx"].bias_now` are the same. An attribute whose annotation has None is None where the key is absent; any
 other absent key raises AttributeError, with the reason of an axis that has no result.
 """
