@@ -132,7 +132,7 @@ def test_a_number_must_move_by_more_than_half_its_interval(
 
 def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
     told = words.inflation_sentence({"N": 1.2345, "K": math.inf, "B": 296.23})
-    assert "N 1.2 times" in told and "K not identified without it" in told and "B 300 times" in told
+    assert "N 23 % too large" in told and "K not identified" in told and "B 300 times too large" in told
     estimate = {
         "coefficient": interval(0.031100000000000003, 0.0, "deg/s/degC"),
         "intervals": [[1199.5, 1200.8], [1300.0, 1302.25]],
@@ -169,6 +169,17 @@ def test_a_line_in_means_is_looked_up_in_the_readings(hz: float, shown: float, t
     assert seen is not None
     assert seen[0] == pytest.approx(hz, abs=1.0 / 1800.0) and seen[1] == pytest.approx(0.3, rel=0.1)
     assert of_readings(load(tmp_path / "log.npz"), "gx", 0.17, 5e-4, 1.0) is None
+
+
+def test_what_is_recorded_already_is_not_advised(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line of means whose true frequency the readings show: the list and the axis alike say where to look for it."""
+    entry = {"estimate": dict(line(0.29)), "axes": {"gx": {"estimate": {}}}, "cause": "periodic", "record_next": ""}
+    monkeypatch.setattr(events, "of_readings", lambda *_: (3.29, 0.3))
+    recording = SimpleNamespace(rate_hz=40.0, duration_s=1800.0, columns={"gx": SimpleNamespace(unit="deg/s")})
+    found = {"gx": SimpleNamespace(record=SimpleNamespace(rate_hz=1.0))}
+    assert events._add_readings(entry, cast(Any, recording), cast(Any, found))
+    assert words.action(entry) == "Look for what turns or switches at 3.29 Hz."
+    assert "amplitude in the readings 0.3 deg/s" in entry["words"]
 
 
 TEMPERATURE = {"gx": 0.0045, "gy": -0.0038, "ax": 0.0013, "az": -0.0011}

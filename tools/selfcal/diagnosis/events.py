@@ -143,9 +143,10 @@ def add_findings(
             member.entry["of"] = event.id
             member.entry["shared_with"] = [axis for axis in event.axes if axis != member.axis]
     document["findings"] = [_entry(event) for event in events]
-    for entry in document["findings"]:
-        if "frequency_hz" in entry["estimate"]:
-            _add_readings(entry, recording, found)
+    for entry, event in zip(document["findings"], events, strict=True):
+        if "frequency_hz" in entry["estimate"] and _add_readings(entry, recording, found):
+            for one in (entry, *(member.entry for member in event.members)):
+                one["record_next"] = words.action(entry)
     for name, one in found.items():
         axis = document["axes"][name]
         own = [event for event in events if name in event.changes]
@@ -310,8 +311,9 @@ def _worth(members: Sequence[Member]) -> float:
     return sum(together.values()) + sum(one.finding.look.net for one in members if not one.finding.event)
 
 
-def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> None:
-    """What a line in means is in the readings: its frequency there, and its amplitude on each axis."""
+def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> bool:
+    """What a line in means is in the readings: its frequency there, and its amplitude on each axis. Whether it is
+    another one there."""
     told = []
     for axis, one in entry["axes"].items():
         line, rate_hz = entry["estimate"]["frequency_hz"], found[axis].record.rate_hz
@@ -326,6 +328,7 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
         sd = 1.0 / recording.duration_s
         entry["estimate"]["readings_hz"] = interval(float(np.median(told)), sd, "Hz")
         entry["words"] = words.event(entry)
+    return bool(told)
 
 
 def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -130,7 +130,8 @@ def _size(key: str, value: Any) -> str:
         half = math.nan if low is None or high is None else 0.5 * (high - low)
         unit = "" if unit == "1" else f" {unit}"
         spread = f" ± {ratio(half)}" if half > 0.0 and math.isfinite(half) else ""
-        return f"{label} {rounded(value['median'], half)}{spread}{unit}"
+        size = rounded(value["median"], half) if "q05" in value else f"{value['median']:.3g}"
+        return f"{label} {size}{spread}{unit}"
     match key:
         case "intervals":
             return intervals(value)
@@ -344,13 +345,11 @@ def navigation(document: Mapping[str, Any]) -> list[str]:
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
     told = [
-        f"{name} {ratio(factor)} times the value with it"
-        if math.isfinite(factor)
-        else f"{name} not identified without it"
+        f"{name} {_off([factor])}" if math.isfinite(factor) else f"{name} not identified"
         for name, factor in inflation.items()
         if not 0.95 < factor < 1.05
     ]
-    return f"Without it, plain white noise and random walk come out wrong: {', '.join(told)}." if told else ""
+    return f"Without it, the numbers of plain white noise and random walk are wrong: {', '.join(told)}." if told else ""
 
 
 def plausibility(coefficient: float) -> str:
