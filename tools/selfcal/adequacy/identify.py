@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
-from selfcal.adequacy.checks import against, coefficients_of, judge, with_drift, with_rate, with_readings
+from selfcal.adequacy.checks import against, coefficients_of, judge, with_rate, with_readings
 from selfcal.adequacy.counted import weigh_counted
 from selfcal.adequacy.document import Identified
 from selfcal.adequacy.one_over_f import weigh, with_white
@@ -93,8 +93,8 @@ def identify_axis(
         known = scored.result
     result, mask = results[best], mask_of(fed.regressors, fed.choices[best])
     used = _used(mask)
-    judged = judge(fed.blocks, tables, group, result, used)
-    judged = with_drift(judged, fed.blocks, tables, result, fed.recording, may_act(model, fed.recording, name), used)
+    others = may_act(model, fed.recording, name)
+    judged = judge(fed.blocks, tables, group, result, fed.recording, others, used)
     if "drift_in_average" in against(judged.checks):
         step = 0.0 if readings.lattice is None else readings.lattice.step
         judged = with_rate(judged, fed.used, fed.recording.missing_before, step, tables, result)

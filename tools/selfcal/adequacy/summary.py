@@ -28,8 +28,8 @@ from selfcal.model.file import Group
 
 _Floats = NDArray[np.float64]
 
-#: The parameter of coloured noise.
-COLOURED = "spectral_ratio"
+#: The parameter of coloured noise, and the sizes of drifts.
+COLOURED, _SIZES = "spectral_ratio", ("K", "sigma_m", "B")
 #: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
 _DRAWS, _PER_OCTAVE = 256, 16
 #: Times the record that a longer rest is looked at, and halvings of its logarithm: to 2 %.
@@ -74,46 +74,52 @@ def summarize(
         return {}
     more = 0.0 if beside is None else beside.probability
     left = 1.0 if counted is None else 1.0 - counted.probability
-    own = [
-        _draws(law, probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, own=True)
+    laws = [
+        Beside(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
         if probability >= _LEAST  # of the model's, whatever stands beside them
     ]
-    rows = own + [
-        _draws(one.law, probability, one.estimates, one.group, one.dt_s, one.n, one.block)
-        for one, probability in ((beside, more * left), (counted, 1.0 - left))
-        if one is not None and probability >= _LEAST
+    of_model = len(laws)
+    others = ((beside, more * left), (counted, 1.0 - left))
+    laws += [replace(one, probability=share) for one, share in others if one is not None and share >= _LEAST]
+    known = [
+        (one, k < of_model)
+        for k, one in enumerate(laws)
+        if all(math.isfinite(e.median) for e in one.estimates.values())
     ]
-    laws = [one for one in rows if one is not None]
-    if not laws:
+    if not known:
         return {}
-    of = {name: np.concatenate([getattr(one, name) for one in laws]) for name in _DRAWN}
-    w = np.concatenate([np.full(_DRAWS, one.probability / _DRAWS) for one in laws])
-    w, k, q, place = w / w.sum(), of["walk"], of["remainder"], of["place"]
-    w_walk = w * np.repeat([one.own for one in laws], _DRAWS)
-    w_walk = w_walk / w_walk.sum() if w_walk.any() else w
+    white, walk, q, floor, place = (
+        np.concatenate(rows) for rows in zip(*(_draws(one) for one, _ in known), strict=True)
+    )
+    w, own = np.repeat([[one.probability, float(mine)] for one, mine in known], _DRAWS, axis=0).T
+    w = w / w.sum()
+    w_walk = w * own / max(float(w @ own), 1e-300) if (w * own).any() else w
     found = {
-        "arw": _number(of["white"], w),
-        "rrw": _number(k, w_walk),
-        "bias_instability": _number(of["floor"] / units.FLICKER_FLOOR, w),
+        "arw": _number(white, w),
+        "rrw": _number(walk, w_walk),
+        "bias_instability": _number(floor / units.FLICKER_FLOOR, w),
     }
     if float(w[q > 0.0].sum()) >= _SURE:
-        known_Q = sum(one.probability for one in laws if one.knows_Q) > 0.5 * sum(one.probability for one in laws)
-        found["quantization_noise"] = _number(q, w) if known_Q else _without(_number(q, w), WIDE)
-    drifts = sum(one.probability for one in laws if one.sizes)
-    left_open = sum(one.probability for one in laws if one.sizes and not any(one.sizes)) > 0.5 * drifts
+        of_Q = sum(one.probability for one in laws if COLOURED in one.estimates and one.estimates[COLOURED].identified)
+        Q = _number(q, w)
+        found["quantization_noise"] = Q if of_Q > 0.5 * sum(one.probability for one in laws) else _without(Q, WIDE)
+    # Laws with a drift: whether each size of it is identified.
+    sizes = [(one.probability, [e.identified for key, e in one.estimates.items() if key in _SIZES]) for one, _ in known]
+    drifts = sum(share for share, each in sizes if each)
+    left_open = sum(share for share, each in sizes if each and not any(each)) > 0.5 * drifts
     rrw, why = found["rrw"].estimate, ""
     if more >= SURE:
         why = ONE_OVER_F
-    elif float(w_walk[k > 0.0].sum()) < _SURE:
+    elif float(w_walk[walk > 0.0].sum()) < _SURE:
         why = NO_WALK if max(result.probability.values()) >= _SURE else NOT_DECIDED
     elif left_open or math.log(rrw.q95 / rrw.q05) > HALF_90 * group.priors["K"].ln_sd:  # half the prior's sd
         why = WIDE
     if why:
         # Its limit holds if there is a walk, however little a law with one counts.
         most = [one["K"].q95 for one in result.parameters.values() if "K" in one and math.isfinite(one["K"].q95)]
-        if (w_walk * k > 0.0).any():
-            most.append(_number(k, np.where(k > 0.0, w_walk, 0.0) / w_walk[k > 0.0].sum()).estimate.q95)
+        if (w_walk * walk > 0.0).any():
+            most.append(_number(walk, np.where(walk > 0.0, w_walk, 0.0) / w_walk[walk > 0.0].sum()).estimate.q95)
         found["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
     if float(w[place == 0].sum()) < _SURE:
         reason = BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
@@ -123,43 +129,13 @@ def summarize(
     return found
 
 
-@dataclass(frozen=True)
-class _Drawn:
-    """Draws of one law: white noise, walk (0: none), Q, the minimum of the Allan deviation and where it is, each [k].
-    `sizes`: whether each size of its drift is identified. `own`: of the model's."""
-
-    probability: float
-    white: _Floats
-    walk: _Floats
-    remainder: _Floats
-    floor: _Floats
-    place: _Floats
-    sizes: tuple[bool, ...]
-    knows_Q: bool
-    own: bool
-
-
-#: The draws of a law that are numbers.
-_DRAWN = ("white", "walk", "remainder", "floor", "place")
-
-
-def _draws(
-    law: str,
-    probability: float,
-    estimates: Mapping[str, Estimate],
-    group: Group,
-    dt_s: float,
-    n: int,
-    block: int,
-    *,
-    own: bool = False,
-) -> _Drawn | None:
-    """Draws of a law's posterior; None where it has none."""
-    medians = {name: estimate.median for name, estimate in estimates.items()}
-    if not all(math.isfinite(value) for value in medians.values()):
-        return None
+def _draws(one: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
+    """Draws of a law's posterior [k] each: white noise, walk (0: none), Q, the first minimum of the Allan deviation,
+    and where it is."""
+    law, group, dt_s, n, block = one.law, one.group, one.dt_s, one.n, one.block
+    medians = {name: estimate.median for name, estimate in one.estimates.items()}
     m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
-    draws = posterior_draws(estimates, fit_of(law, medians, group, dt_s, n, m, block=block).covariance, _DRAWS)
+    draws = posterior_draws(one.estimates, fit_of(law, medians, group, dt_s, n, m, block=block).covariance, _DRAWS)
     if law == FLICKER:
         white, floor = white_of(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
         place = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
@@ -168,11 +144,7 @@ def _draws(
         lowest = [_minimum(terms_of(group.laws[law], row, dt_s, block), m) for row in rows]
         white, (floor, place) = draws["N"], np.array(lowest, dtype=float).T
     walk = _walk(draws)
-    walk = np.where(np.isnan(walk), 0.0, walk)
-    sizes = tuple(estimates[name].identified for name in ("K", "sigma_m", "B") if name in estimates)
-    knows_Q = COLOURED in estimates and estimates[COLOURED].identified
-    remainder = _quantization(draws, dt_s)
-    return _Drawn(probability, white, walk, remainder, floor, place, sizes, knows_Q, own)
+    return white, np.where(np.isnan(walk), 0.0, walk), _quantization(draws, dt_s), floor, place
 
 
 def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
