@@ -24,13 +24,13 @@ from selfcal.readings.misread import MISREAD
 from selfcal.readings.rest import MOST_LISTED
 
 Reason = TypeVar("Reason", str, tuple[str, str])
+#: A check, its axes, and their outcomes.
+_Event = tuple[str, list[str], list[Mapping[str, Any]]]
 
 #: Least probability of a law that is named if the grid is too coarse for it.
 TOLD_OF = 0.01
 #: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
-#: Checks of stretches of time that are left out.
-LEFT_OUT = ("motion", "stuck")
 #: Largest distance of jumps of one event, s.
 ONE_EVENT_S = 30.0
 
@@ -275,22 +275,30 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
     return [*kept, *_unidentified(axes), *noisier(N), *_ahead(axes), *failed]
 
 
-def _events(axes: Mapping[str, Any], *, passed: bool) -> list[tuple[str, list[str], list[Mapping[str, Any]]]]:
+def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
     """Checks that name an event or source, with the axes and their outcomes: those that speak against the laws, or the
-    stretches of time that are left out and `passed`."""
-    events: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
+    stretches of time that are left out and `passed`. Each stretch is an event, those of the same axes are one again."""
+    events: list[_Event] = []
     for name, axis in axes.items():
         for check, outcome in axis["checks"].items():
-            if outcome["passed"] is not passed or check.startswith(STATISTICS) or (passed and check not in LEFT_OUT):
+            if outcome["passed"] is not passed or check.startswith(STATISTICS) or passed > ("intervals" in outcome):
                 continue
-            for one in _each(check, outcome):
+            for one in [{**outcome, "intervals": [each]} for each in outcome.get("intervals", ())] or [outcome]:
                 known = next((event for event in events if event[0] == check and _same(check, event[2][0], one)), None)
                 if known is None:
-                    events.append((check, [name], [one]))
-                else:
-                    known[1].append(name)
-                    known[2].append(one)
-    return _stretches(events)
+                    events.append(known := (check, [], []))
+                known[1].extend([name] if name not in known[1] else [])
+                known[2].append(one)
+    found: dict[Any, _Event] = {}
+    for k, (check, names, outcomes) in enumerate(events):
+        event = found.setdefault((check, *names) if "intervals" in outcomes[0] else k, (check, names, []))
+        if "intervals" not in outcomes[0]:
+            event[2].extend(outcomes)
+            continue
+        begins, ends = zip(*(one["intervals"][0] for one in outcomes), strict=True)
+        before = event[2][0]["intervals"] if event[2] else []
+        event[2][:] = [{**outcomes[0], "intervals": [*before, [min(begins), max(ends)]]}]
+    return list(found.values())
 
 
 def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
@@ -342,29 +350,6 @@ def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
             (begin, end), (other, last) = a["intervals"][0], b["intervals"][0]
             return bool(begin <= last and other <= end)
     return False
-
-
-def _each(check: str, outcome: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """A failed check, each stretch of time of several by itself."""
-    if check not in LEFT_OUT:
-        return [outcome]
-    return [{**outcome, "intervals": [one]} for one in outcome["intervals"]]
-
-
-def _stretches(
-    events: Sequence[tuple[str, list[str], list[Mapping[str, Any]]]],
-) -> list[tuple[str, list[str], list[Mapping[str, Any]]]]:
-    """The events, stretches of time of the same axes in one."""
-    found: dict[Any, tuple[str, list[str], list[Mapping[str, Any]]]] = {}
-    for k, (check, names, outcomes) in enumerate(events):
-        if check not in LEFT_OUT:
-            found[k] = (check, names, outcomes)
-            continue
-        of = list(dict.fromkeys(names))
-        ends = [one["intervals"][0] for one in outcomes]
-        known = found.setdefault((check, *of), (check, of, [{**outcomes[0], "intervals": []}]))
-        known[2][0]["intervals"].append([min(begin for begin, _ in ends), max(end for _, end in ends)])
-    return list(found.values())
 
 
 def _ahead(axes: Mapping[str, Any]) -> list[str]:
