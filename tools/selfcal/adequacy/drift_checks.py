@@ -20,7 +20,7 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, Shape
-from selfcal.likelihood.fit import ROUGH_FTOL
+from selfcal.likelihood.fit import ROUGH_FTOL, finish
 from selfcal.likelihood.state import MEANS_MOST, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
@@ -77,7 +77,7 @@ def _check(
     state: State, shapes: Sequence[Shape], told: Callable[[Shape], dict[str, Any]], *, drift: bool = True
 ) -> dict[str, Any]:
     """The best of some shapes: what it is worth net of the search, and what is `told` of it. It is worth nothing if it
-    explains no `drift`: a smaller one beside it must be clearly likelier."""
+    explains no `drift`: one must be clearly likelier than none, and beside it a smaller one."""
     found = columns.tried(state, shapes, slow=True).values()
     best = max(found, key=lambda one: one.net, default=None)
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)
@@ -85,7 +85,9 @@ def _check(
         full, *smaller = (
             max(float(state.scores([shape.columns], one.shrunk(by))[0]) for one in state.fits) for by in SIZES
         )
-        worth = worth if max(smaller) > full + CLEARLY else 0.0
+        none = finish(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
+        drifts = state.best.ln_likelihood > none.ln_likelihood + CLEARLY
+        worth = worth if drifts and max(smaller) > full + CLEARLY else 0.0
     passed = {"value": worth, "limit": LEAST, "passed": worth <= LEAST, "deviations": math.sqrt(2.0 * worth)}
     return {**passed, **told(shape)}
 
