@@ -24,7 +24,7 @@ from selfcal.base import ending
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis import diagnose as diagnose_module
-from selfcal.diagnosis import integrity, loop
+from selfcal.diagnosis import integrity, loop, suspicion
 from selfcal.diagnosis.record import of_recording
 from selfcal.likelihood import fit, work
 from selfcal.logs.recording import Column, Recording, load, save
@@ -606,10 +606,12 @@ def test_the_suspicion_is_bounded_and_can_be_left_out(tmp_path: Path, monkeypatc
     monkeypatch.setattr(
         fit, "run", lambda series, *more, **kw: (longest.append(series.y.size), run_filter(series, *more, **kw))[1]
     )
+    second_look = suspicion.suspicions
+    monkeypatch.setattr(suspicion, "suspicions", lambda *of: (longest.clear(), second_look(*of))[1])
     for decimate in (None, 5.0):
         axis = identify(tmp_path / "log.npz", decimate=decimate)["axes"]["gx"]
         assert axis["suspicion"] == "periodic" and not axis["adequate"]
-    assert max(longest) <= 600
+        assert max(longest) <= 600
     assert "suspicion" not in identify(tmp_path / "log.npz", suspicion=False)["axes"]["gx"]
 
 

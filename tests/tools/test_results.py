@@ -69,3 +69,29 @@ def test_findings_and_changes() -> None:
         "quantity": ["N", "", "N"],
         "error": ["", "too short", ""],
     }
+
+
+def test_a_frame_has_each_number_of_each_finding() -> None:
+    """Value, deviation, unit and evidence; what acts on all axes together has no finding of an axis."""
+    pytest.importorskip("pandas")
+    size = {"median": -0.4, "sd": 0.02, "unit": "deg/s"}
+    own = {"cause": "step", "of": "step", "evidence_gain_nats": 31.0, "net_nats": 22.5}
+    axis = {"verdict": "inadequate", "findings": [{**own, "estimate": {"amplitude": size, "form": "static"}}]}
+    events = [
+        {"id": "step", "material": True, "axes": {"gx": {}}},
+        {
+            **{"id": "hidden_input", "cause": "hidden_input", "material": False, "evidence_nats": 70.0},
+            **{"net_nats": 60.0, "estimate": {"time_constant_s": 44.0}},
+            "axes": {"gx": {"estimate": {"loading": size}}},
+        },
+    ]
+    frame = Diagnosis({"axes": {"gx": axis, "gy": {"error": "too short"}}, "findings": events}).to_frame()
+    columns = ["axis", "of", "material", "evidence_gain_nats", "net_nats", "key", "median", "sd", "unit", "value"]
+    step, hidden = ("gx", "step", True, 31.0, 22.5), ("gx", "hidden_input", False, 70.0, 60.0)
+    assert frame[columns].astype(object).where(frame[columns].notna(), None).to_numpy().tolist() == [
+        [*step, "amplitude", -0.4, 0.02, "deg/s", None],
+        [*step, "form", None, None, None, "static"],
+        [*hidden, "time_constant_s", 44.0, None, None, None],
+        [*hidden, "loading", -0.4, 0.02, "deg/s", None],
+        ["gy", *[None] * 9],
+    ]

@@ -49,16 +49,29 @@ class Judged:
     curve: Curve | None
 
 
-def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used: Sequence[int] = ()) -> Judged:
-    """What in the record speaks against the most probable law, with the columns `used`."""
+def judge(
+    blocks: Blocks,
+    tables: Tables,
+    group: Group,
+    result: AxisResult,
+    recording: Recording,
+    others: Sequence[str],
+    used: Sequence[int] = (),
+) -> Judged:
+    """What in the record speaks against the most probable law, with the columns `used`. `others`: the recording's
+    columns that may act on the axis."""
+    from selfcal.adequacy.drift_checks import drift_checks
+
     law = result.best
     medians = {name: estimate.median for name, estimate in result.parameters[law].items()}
     if blocks.mean.size > MOST_DENSE or not all(math.isfinite(value) for value in medians.values()):
         return Judged({}, None)
     if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
         return Judged({}, None)
+    z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
+    left = replace(blocks, mean=blocks.mean - z @ coefficients_of(result)) if used else blocks
     curve = curve_of(
-        _unexplained(blocks, tables, result, used),
+        left.mean,
         tables.dt_s,
         law,
         result.parameters[law],
@@ -67,39 +80,11 @@ def judge(blocks: Blocks, tables: Tables, group: Group, result: AxisResult, used
         half_life_s=tables.half_life_s,
         block=tables.block,
     )
-    hidden = drift_check(tables, group, result)
-    if not all(one["passed"] for one in hidden.values()):
-        return Judged(hidden, curve)  # the other checks would show the same
-    checks = innovation_checks(blocks, tables, group, result, list(used))
-    unlike = batch_check(tables, group, result)
-    return Judged({**hidden, **unlike, **checks, **(allan_checks(curve) if curve else {})}, curve)
-
-
-def _unexplained(blocks: Blocks, tables: Tables, result: AxisResult, used: Sequence[int]) -> NDArray[np.float64]:
-    """The blocks' means [m] less what the columns `used` explain."""
-    if not used:
-        return blocks.mean
-    z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
-    return np.asarray(blocks.mean - z @ coefficients_of(result))
-
-
-def with_drift(
-    judged: Judged,
-    blocks: Blocks,
-    tables: Tables,
-    result: AxisResult,
-    recording: Recording,
-    others: Sequence[str],
-    used: Sequence[int] = (),
-) -> Judged:
-    """The same with the checks of the drift, where the others are made: `channel`, `turn_on`, `jump` (drift_checks.py).
-    `others`: the recording's columns that may act on the axis; `used`: the model's columns in use."""
-    if not judged.checks or blocks.mean.size > MOST_DENSE:
-        return judged
-    from selfcal.adequacy.drift_checks import drift_checks
-
-    blocks = replace(blocks, mean=_unexplained(blocks, tables, result, used))
-    return replace(judged, checks={**judged.checks, **drift_checks(blocks, tables, result, recording, others)})
+    checks = drift_check(tables, group, result)
+    if all(one["passed"] for one in checks.values()):  # else the others would show the same
+        checks |= batch_check(tables, group, result) | innovation_checks(blocks, tables, group, result, list(used))
+        checks |= allan_checks(curve) if curve else {}
+    return Judged(checks | drift_checks(left, tables, result, recording, others), curve)
 
 
 def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:

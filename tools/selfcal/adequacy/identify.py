@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
-from selfcal.adequacy.checks import against, coefficients_of, judge, with_drift, with_rate, with_readings
+from selfcal.adequacy.checks import against, coefficients_of, judge, with_rate, with_readings
 from selfcal.adequacy.counted import weigh_counted
 from selfcal.adequacy.document import Identified
 from selfcal.adequacy.one_over_f import weigh, with_white
@@ -22,11 +21,11 @@ from selfcal.bank.result import AxisResult, in_unit
 from selfcal.bank.subsets import combine
 from selfcal.base.errors import OutsidePriors, UserError
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float
-from selfcal.model.file import Model
+from selfcal.model.file import Group, Model, Regressor
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
-from selfcal.model.tables import make_tables
+from selfcal.model.tables import Tables, make_tables
 from selfcal.readings.gate import gated
-from selfcal.readings.readings import copied, look, mostly_beyond
+from selfcal.readings.readings import Readings, copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
 
 #: Spacing of float32 in the noise of a reading from which on a nominal offset is taken off before.
@@ -76,8 +75,84 @@ def identify_axis(
     is too coarse. Readings that are none are left out (`readings.py`). With regressors every subset of them is scored;
     `advance` is called after each. `draw`: with the Allan deviation of the samples."""
     recording = recording.along(name)
-    group, unit = model.group_of(name), recording.columns[name].unit
-    regressors = offered(model, name)
+    fed = _fed(recording, name, model, decimate)
+    if engine == "reference":
+        results = _by_reference(fed, model, advance)
+    else:
+        results = _by_library(fed, engine == "fixed", advance)
+    group, tables, readings = fed.group, fed.tables, fed.readings
+    unit, at = recording.columns[name].unit, (tables.dt_s, fed.blocks.mean.size, tables.block)
+    told = [in_unit(with_white(result, group, *at), group.unit, unit) for result in results]
+    best, inside, scored, known = 0, results[0], None, told[0]
+    if fed.regressors:
+        if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
+            raise OutsidePriors
+        combined = combine(fed.choices, results, model.hypotheses, group.unit)
+        best, inside = combined.best, combined.result
+        scored = combine(fed.choices, told, model.hypotheses, unit)
+        known = scored.result
+    result, mask = results[best], mask_of(fed.regressors, fed.choices[best])
+    used = _used(mask)
+    others = may_act(model, fed.recording, name)
+    judged = judge(fed.blocks, tables, group, result, fed.recording, others, used)
+    if "drift_in_average" in against(judged.checks):
+        step = 0.0 if readings.lattice is None else readings.lattice.step
+        judged = with_rate(judged, fed.used, fed.recording.missing_before, step, tables, result)
+    judged = with_readings(judged, readings, group, unit, tables.dt_s)
+    explained = fed.columns[:, used].astype(np.float64) @ coefficients_of(result) if used else 0.0
+    missing, columns = fed.recording.missing_before, fed.columns if fed.regressors else None
+    again = tables, group, fed.samples, missing, columns, mask, fed.offset
+    beside, counted = weigh(*again), weigh_counted(readings.lattice, result, *again)
+    more_laws = [one.laws(known.probability) for one in (beside, counted) if one is not None]
+    return Identified(
+        unit,
+        group.unit,
+        known,
+        judged,
+        kept_out_of(fed.blocks, fed.recording, int(readings.moving.sum())),
+        scored,
+        fed.curve(explained) if draw else None,
+        summarize(inside, group, *at, beside, counted),
+        halved_after(inside, group, *at),
+        next(filter(None, more_laws), {}),
+    )
+
+
+@dataclass(frozen=True)
+class _Fed:
+    """What an engine gets of an axis: its `samples` [n] less `offset` and `columns` [n, p] of the `regressors`, both as
+    float32; and the `blocks` of the bank. `recording`: of the rows that `readings` have."""
+
+    recording: Recording
+    readings: Readings
+    group: Group
+    tables: Tables
+    regressors: tuple[Regressor, ...]
+    samples: NDArray[np.float32]
+    offset: float
+    columns: NDArray[np.float32]
+    blocks: Blocks
+
+    @property
+    def choices(self) -> list[tuple[Regressor, ...]]:
+        """Every subset of the regressors that is scored."""
+        return choices_of(self.regressors)
+
+    @property
+    def used(self) -> NDArray[np.float64]:
+        """The samples [n], NaN where the engine takes none."""
+        return np.where(np.logical_or.reduce(list(kept_out(self.samples, self.group).values())), np.nan, self.samples)
+
+    def curve(self, explained: NDArray[np.float64] | float) -> Sampled:
+        """The Allan deviation of the samples less what is `explained` [n] of them."""
+        values = self.used
+        at = sample_lengths(int(np.isfinite(values).sum()), self.tables.block)
+        return sampled(values - explained, self.recording.missing_before, self.recording.rate_hz, at)
+
+
+def _fed(recording: Recording, name: str, model: Model, decimate: float | None) -> _Fed:
+    """The samples of an axis without readings that are none. Raises UserError where it has no result."""
+    group, regressors = model.group_of(name), offered(model, name)
     if most := mostly_beyond(recording.in_unit(name, group.unit), group):
         raise UserError(most)
     before = [one for one in model.axes[: model.axes.index(name)] if one in recording.columns]
@@ -95,97 +170,51 @@ def identify_axis(
         tables = replace(tables, axes=(replace(tables.axes[0], range=0.0),))
     if readings.coarse > SPACING_LEAST:
         offset = float(np.float32(np.nanmedian(values)))
-    samples = as_float(values - offset)
-    columns = as_float(columns_of(regressors, recording))
+    samples, columns = as_float(values - offset), as_float(columns_of(regressors, recording))
     for name_of, column in zip([column.name for column in tables.regressors], columns.T, strict=True):
         beyond = np.abs(column) >= _library32.SAMPLE_MAX
         if beyond.any():
             raise UserError(f"the regressor {name_of} is {column[beyond][0]:g} at {int(beyond.sum())} samples")
     blocks = usable_blocks(samples, recording.missing_before, tables, group, columns, readings.counted)
     blocks = replace(blocks, mean=blocks.mean + offset)
-    ahead_s = blocks.after / recording.rate_hz
-    if engine == "reference" and model.half_life_s:
+    return _Fed(recording, readings, group, tables, regressors, samples, offset, columns, blocks)
+
+
+def _by_library(fed: _Fed, fixed: bool, advance: Callable[[], object]) -> list[AxisResult]:
+    """The result of each choice of regressors by the C code."""
+    from selfcal.bank.library import Bank
+
+    bank = Bank(fed.tables, fixed=fixed, offset=fed.offset)
+    bank.push(fed.samples[:, None], fed.recording.missing_before, fed.columns if fed.regressors else None)
+    results = []
+    for choice in fed.choices:
+        results.append(bank.report(0, mask_of(fed.regressors, choice), fed.blocks.after / fed.recording.rate_hz))
+        advance()
+    return results
+
+
+def _by_reference(fed: _Fed, model: Model, advance: Callable[[], object]) -> list[AxisResult]:
+    """The result of each choice of regressors by the textbook bank in double."""
+    from selfcal.bank import reference
+
+    if model.half_life_s:
         raise UserError("the reference bank forgets nothing: take --engine library, or a model without half_life_s")
-    if engine == "reference" and model.handling.outlier_sd:
+    if model.handling.outlier_sd:
         raise UserError("the reference bank takes outliers: take --engine library, or leave handle.outlier_sd out")
-
-    def curve_of_samples(values: NDArray[np.floating[Any]]) -> Sampled:
-        unused = np.logical_or.reduce(list(kept_out(samples, group).values()))
-        at = sample_lengths(int((~unused).sum()), tables.block)
-        return sampled(np.where(unused, np.nan, values), recording.missing_before, recording.rate_hz, at)
-
-    choices = choices_of(regressors)
-    results: list[AxisResult] = []
+    blocks, tables = fed.blocks, fed.tables
+    if blocks.mean.size > MOST_DENSE:
+        raise UserError(f"{blocks.mean.size} bank intervals, gaps included, are too many for the reference")
     z = blocks.z - np.array([column.reference for column in tables.regressors])
     sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
-    if engine in ("library", "fixed"):
-        from selfcal.bank.library import Bank
-
-        bank = Bank(tables, fixed=engine == "fixed", offset=offset)
-        bank.push(samples[:, None], recording.missing_before, columns if regressors else None)
-        for choice in choices:
-            results.append(bank.report(0, mask_of(regressors, choice), ahead_s))
-            advance()
-    else:
-        from selfcal.bank import reference
-
-        if blocks.mean.size > MOST_DENSE:
-            raise UserError(f"{blocks.mean.size} bank intervals, gaps included, are too many for the reference")
-        for choice in choices:
-            used = _used(mask_of(regressors, choice))
-            beside, coefficient_sd = (z[:, used] if used else None), sd[used].tolist()
-            results.append(
-                reference.identify_axis(
-                    blocks.mean,
-                    tables.dt_s,
-                    group,
-                    model.hypotheses,
-                    blocks.r,
-                    beside,
-                    coefficient_sd,
-                    tables.block,
-                    ahead_s,
-                )
-            )
-            advance()
-    kept = kept_out_of(blocks, recording, int(readings.moving.sum()))
-    at = tables.dt_s, blocks.mean.size, tables.block
-    told = [in_unit(with_white(result, group, *at), group.unit, unit) for result in results]
-    if not regressors:
-        best, inside, scored, known = 0, results[0], None, told[0]
-    else:
-        if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
-            raise OutsidePriors
-        combined = combine(choices, results, model.hypotheses, group.unit)
-        best, inside = combined.best, combined.result
-        scored = combine(choices, told, model.hypotheses, unit)
-        known = scored.result
-    mask = mask_of(regressors, choices[best])
-    used = _used(mask)
-    judged = judge(blocks, tables, group, results[best], used)
-    judged = with_drift(judged, blocks, tables, results[best], recording, may_act(model, recording, name), used)
-    if "drift_in_average" in against(judged.checks):
-        used_readings = np.where(np.logical_or.reduce(list(kept_out(samples, group).values())), np.nan, values)
-        step = 0.0 if readings.lattice is None else readings.lattice.step
-        judged = with_rate(judged, used_readings, recording.missing_before, step, tables, results[best])
-    judged = with_readings(judged, readings, group, unit, tables.dt_s)
-    explained = columns[:, used].astype(np.float64) @ coefficients_of(results[best]) if used else 0.0
-    curve = curve_of_samples(samples - explained) if draw else None
-    fed = tables, group, samples, recording.missing_before, columns if regressors else None, mask, offset
-    beside, counted = weigh(*fed), weigh_counted(readings.lattice, results[best], *fed)
-    more_laws = [one.laws(known.probability) for one in (beside, counted) if one is not None]
-    return Identified(
-        unit,
-        group.unit,
-        known,
-        judged,
-        kept,
-        scored,
-        curve,
-        summarize(inside, group, *at, beside, counted),
-        halved_after(inside, group, *at),
-        next(filter(None, more_laws), {}),
-    )
+    results = []
+    for choice in fed.choices:
+        used = _used(mask_of(fed.regressors, choice))
+        beside, law_sd = (z[:, used] if used else None), sd[used].tolist()
+        ahead_s = blocks.after / fed.recording.rate_hz
+        own = blocks.mean, tables.dt_s, fed.group, model.hypotheses, blocks.r
+        results.append(reference.identify_axis(*own, beside, law_sd, tables.block, ahead_s))
+        advance()
+    return results
 
 
 def may_act(model: Model, recording: Recording, name: str) -> list[str]:

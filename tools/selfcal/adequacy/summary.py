@@ -28,8 +28,8 @@ from selfcal.model.file import Group
 
 _Floats = NDArray[np.float64]
 
-#: The parameter of coloured noise.
-COLOURED = "spectral_ratio"
+#: The parameter of coloured noise, and the sizes of drifts.
+COLOURED, _SIZES = "spectral_ratio", ("K", "sigma_m", "B")
 #: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
 _DRAWS, _PER_OCTAVE = 256, 16
 #: Times the record that a longer rest is looked at, and halvings of its logarithm: to 2 %.
@@ -74,82 +74,77 @@ def summarize(
         return {}
     more = 0.0 if beside is None else beside.probability
     left = 1.0 if counted is None else 1.0 - counted.probability
-    laws: list[tuple[str, float, Mapping[str, Estimate], Group, float, int, int]] = [
-        (law, probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block)
+    laws = [
+        Beside(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
         if probability >= _LEAST  # of the model's, whatever stands beside them
     ]
     of_model = len(laws)
-    for one, probability in ((beside, more * left), (counted, 1.0 - left)):
-        if one is not None and probability >= _LEAST:
-            laws.append((one.law, probability, one.estimates, one.group, one.dt_s, one.n, one.block))
-    white, walk, remainder, floor, reached, weight, own = [], [], [], [], [], [], []
-    # Probability of the laws with a drift, of those that leave its size open, and of those that know their Q.
-    drifts, open_drifts, of_Q = 0.0, 0.0, 0.0
-    for number, (law, probability, estimates, of, every_s, length, samples) in enumerate(laws):
-        medians = {name: estimate.median for name, estimate in estimates.items()}
-        if not all(math.isfinite(value) for value in medians.values()):
-            continue
-        m = np.geomspace(1.0, length / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(length / 2.0)))
-        fit = fit_of(law, medians, of, every_s, length, m, block=samples)
-        draws = posterior_draws(estimates, fit.covariance, _DRAWS)
-        sizes = [estimates[name].identified for name in ("K", "sigma_m", "B") if name in estimates]
-        of_Q += probability * (COLOURED in estimates and estimates[COLOURED].identified)
-        drifts += probability * bool(sizes)
-        open_drifts += probability * (bool(sizes) and not any(sizes))
-        walk.append(_walk(draws))
-        remainder.append(_quantization(draws, every_s))
-        weight.append(np.full(_DRAWS, probability / _DRAWS))
-        own.append(np.full(_DRAWS, number < of_model))
-        if law == FLICKER:
-            white.append(white_of(draws, every_s, samples))
-            floor.append(draws["B"] * units.FLICKER_FLOOR)
-            hidden = white[-1] ** 2 / (0.5 * length * every_s) > floor[-1] ** 2  # below the white noise everywhere
-            reached.append(hidden.astype(float))
-            continue
-        white.append(draws["N"])
-        rows = (dict(zip(draws, map(float, row), strict=True)) for row in zip(*draws.values(), strict=True))
-        lowest = [_minimum(terms_of(of.laws[law], row, every_s, samples), m) for row in rows]
-        floor.append(np.array([value for value, _ in lowest]))
-        reached.append(np.array([place for _, place in lowest]))
-    if not weight:
+    others = ((beside, more * left), (counted, 1.0 - left))
+    laws += [replace(one, probability=share) for one, share in others if one is not None and share >= _LEAST]
+    known = [
+        (one, k < of_model)
+        for k, one in enumerate(laws)
+        if all(math.isfinite(e.median) for e in one.estimates.values())
+    ]
+    if not known:
         return {}
-    w = np.concatenate(weight) / np.concatenate(weight).sum()
-    k, q, place = np.concatenate(walk), np.concatenate(remainder), np.concatenate(reached)
-    w_walk = w * np.concatenate(own)
-    w_walk = w_walk / w_walk.sum() if w_walk.any() else w
-    has_walk, has_floor = float(w_walk[k > 0.0].sum()), float(w[place == 0].sum())
+    white, walk, q, floor, place = (
+        np.concatenate(rows) for rows in zip(*(_draws(one) for one, _ in known), strict=True)
+    )
+    w, own = np.repeat([[one.probability, float(mine)] for one, mine in known], _DRAWS, axis=0).T
+    w = w / w.sum()
+    w_walk = w * own / max(float(w @ own), 1e-300) if (w * own).any() else w
     found = {
-        "arw": _number(np.concatenate(white), w),
-        "rrw": _number(np.where(np.isnan(k), 0.0, k), w_walk),
-        "bias_instability": _number(np.concatenate(floor) / units.FLICKER_FLOOR, w),
+        "arw": _number(white, w),
+        "rrw": _number(walk, w_walk),
+        "bias_instability": _number(floor / units.FLICKER_FLOOR, w),
     }
     if float(w[q > 0.0].sum()) >= _SURE:
+        of_Q = sum(one.probability for one in laws if COLOURED in one.estimates and one.estimates[COLOURED].identified)
         Q = _number(q, w)
-        found["quantization_noise"] = Q if of_Q > 0.5 * sum(law[1] for law in laws) else _without(Q, WIDE)
-    widest = HALF_90 * group.priors["K"].ln_sd  # of ln(q95 / q05): half the prior's sd
-    left_open = open_drifts > 0.5 * drifts
-    rrw = found["rrw"].estimate
-    why = ""
+        found["quantization_noise"] = Q if of_Q > 0.5 * sum(one.probability for one in laws) else _without(Q, WIDE)
+    # Laws with a drift: whether each size of it is identified.
+    sizes = [(one.probability, [e.identified for key, e in one.estimates.items() if key in _SIZES]) for one, _ in known]
+    drifts = sum(share for share, each in sizes if each)
+    left_open = sum(share for share, each in sizes if each and not any(each)) > 0.5 * drifts
+    rrw, why = found["rrw"].estimate, ""
     if more >= SURE:
         why = ONE_OVER_F
-    elif has_walk < _SURE:
+    elif float(w_walk[walk > 0.0].sum()) < _SURE:
         why = NO_WALK if max(result.probability.values()) >= _SURE else NOT_DECIDED
-    elif left_open or math.log(rrw.q95 / rrw.q05) > widest:
+    elif left_open or math.log(rrw.q95 / rrw.q05) > HALF_90 * group.priors["K"].ln_sd:  # half the prior's sd
         why = WIDE
     if why:
         # Its limit holds if there is a walk, however little a law with one counts.
         most = [one["K"].q95 for one in result.parameters.values() if "K" in one and math.isfinite(one["K"].q95)]
-        if (w_walk * k > 0.0).any():
-            most.append(_number(k, np.where(k > 0.0, w_walk, 0.0) / w_walk[k > 0.0].sum()).estimate.q95)
+        if (w_walk * walk > 0.0).any():
+            most.append(_number(walk, np.where(walk > 0.0, w_walk, 0.0) / w_walk[walk > 0.0].sum()).estimate.q95)
         found["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
-    if has_floor < _SURE:
-        found["bias_instability"] = _without(
-            found["bias_instability"], BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
-        )
+    if float(w[place == 0].sum()) < _SURE:
+        reason = BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
+        found["bias_instability"] = _without(found["bias_instability"], reason)
     elif left_open:  # then the prior of the drift makes the minimum
         found["bias_instability"] = _without(found["bias_instability"], WIDE)
     return found
+
+
+def _draws(one: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
+    """Draws of a law's posterior [k] each: white noise, walk (0: none), Q, the first minimum of the Allan deviation,
+    and where it is."""
+    law, group, dt_s, n, block = one.law, one.group, one.dt_s, one.n, one.block
+    medians = {name: estimate.median for name, estimate in one.estimates.items()}
+    m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
+    draws = posterior_draws(one.estimates, fit_of(law, medians, group, dt_s, n, m, block=block).covariance, _DRAWS)
+    if law == FLICKER:
+        white, floor = white_of(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
+        place = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
+    else:
+        rows = (dict(zip(draws, map(float, row), strict=True)) for row in zip(*draws.values(), strict=True))
+        lowest = [_minimum(terms_of(group.laws[law], row, dt_s, block), m) for row in rows]
+        white, (floor, place) = draws["N"], np.array(lowest, dtype=float).T
+    walk = _walk(draws)
+    return white, np.where(np.isnan(walk), 0.0, walk), _quantization(draws, dt_s), floor, place
 
 
 def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:

@@ -24,10 +24,10 @@ from selfcal.diagnosis import hidden, words
 from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.causes.variance_change import ENDS
-from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood.heldout import HARM_SD, in_sd
-from selfcal.likelihood.state import interval, log_normal
+from selfcal.likelihood.state import interval, log_normal, mixture
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.readings.motion import joined
@@ -36,11 +36,11 @@ from selfcal.readings.motion import joined
 LEAST = 0.05
 #: The numbers, and their names in a summary.
 SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}
-#: What has no name.
-UNEXPLAINED = "unexplained"
+#: The key of what a slow change of a channel does.
+COEFFICIENT = "coefficient"
 #: Units of what several axes have in common; all else is a size on an axis. Probability of axes that differ as much by
 #: chance, below which they disagree.
-OF_ALL, DISAGREE = ("s", "Hz"), 1e-3
+OF_ALL, DISAGREE = ("s", "Hz", "deg"), 1e-3
 
 
 @dataclass(frozen=True)
@@ -143,9 +143,10 @@ def add_findings(
             member.entry["of"] = event.id
             member.entry["shared_with"] = [axis for axis in event.axes if axis != member.axis]
     document["findings"] = [_entry(event) for event in events]
-    for entry in document["findings"]:
-        if "frequency_hz" in entry["estimate"]:
-            _add_readings(entry, recording, found)
+    for entry, event in zip(document["findings"], events, strict=True):
+        if "frequency_hz" in entry["estimate"] and _add_readings(entry, recording, found):
+            for one in (entry, *(member.entry for member in event.members)):
+                one["record_next"] = words.action(entry)
     for name, one in found.items():
         axis = document["axes"][name]
         own = [event for event in events if name in event.changes]
@@ -310,8 +311,9 @@ def _worth(members: Sequence[Member]) -> float:
     return sum(together.values()) + sum(one.finding.look.net for one in members if not one.finding.event)
 
 
-def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> None:
-    """What a line in means is in the readings: its frequency there, and its amplitude on each axis."""
+def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> bool:
+    """What a line in means is in the readings: its frequency there, and its amplitude on each axis. Whether it is
+    another one there."""
     told = []
     for axis, one in entry["axes"].items():
         line, rate_hz = entry["estimate"]["frequency_hz"], found[axis].record.rate_hz
@@ -326,6 +328,7 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
         sd = 1.0 / recording.duration_s
         entry["estimate"]["readings_hz"] = interval(float(np.median(told)), sd, "Hz")
         entry["words"] = words.event(entry)
+    return bool(told)
 
 
 def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -365,7 +368,29 @@ def _on(event: Event, axis: str) -> dict[str, Any]:
         for key, value in member.entry["estimate"].items()
         if isinstance(value, Mapping) and value["unit"] not in OF_ALL
     }
+    sizes |= _sum_of_forms(own)
     return {"estimate": sizes, "probability": float(expit(max(member.finding.look.net for member in own)))}
+
+
+def _sum_of_forms(own: Sequence[Member]) -> dict[str, Any]:
+    """The coefficient of one channel on an axis that several findings share, each in a form of its own: what a slow
+    change of the channel does is their sum, beside the model with all of them. Empty where one form has it all."""
+    last = max(own, key=lambda member: member.finding.round)
+    shapes = [member.finding.look.shape for member in own]
+    keyed = [one for one in shapes if one is not None and [key for key, _ in one.keys].count(COEFFICIENT) == 1]
+    units_of = {unit for one in keyed for key, unit in one.keys if key == COEFFICIENT}
+    there = {one.name for one in last.finding.after.regressors}
+    names = {column.name for one in keyed for column in one.regressors}
+    if len(keyed) < 2 or len(units_of) > 1 or not names <= there:
+        return {}
+    # The sum is the coefficient of the first column where the others are differences from it.
+    keys = [key for one in keyed for key, _ in one.keys]
+    rows = np.vstack([one.columns for one in keyed])
+    first, *others = [k for k, key in enumerate(keys) if key == COEFFICIENT]
+    rows[others] -= rows[first]
+    weight, means, sds = (each[0] for each in last.finding.after.without(names).posterior(rows))
+    found = mixture(weight, means[:, first], sds[:, first], units_of.pop())
+    return {COEFFICIENT: {key: value if key == "unit" else value * last.factor for key, value in found.items()}}
 
 
 def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
@@ -403,9 +428,11 @@ def parted(findings: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any
     return told, small
 
 
-def times_of(finding: Mapping[str, Any]) -> list[float]:
-    """When an event happens, s of the recording; empty where it acts all the time."""
+def times_of(finding: Mapping[str, Any]) -> list[tuple[float, float]]:
+    """From when to when an event lasts, s of the recording; empty where it acts all the time."""
     estimate = finding["estimate"]
     times = [estimate["time_s"]["median"]] if "time_s" in estimate else []
-    times += [jump["time_s"] for jump in estimate.get("jumps", ())]
-    return [*times, *(begin for begin, _ in estimate.get("intervals", ()))]
+    length_s = estimate["duration_s"]["median"] if "duration_s" in estimate else 0.0
+    found = [(time, time + length_s) for time in times]
+    found += [(jump["time_s"], jump["time_s"]) for jump in estimate.get("jumps", ())]
+    return [*found, *((begin, end) for begin, end in estimate.get("intervals", ()))]

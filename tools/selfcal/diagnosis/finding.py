@@ -12,6 +12,8 @@ from selfcal.likelihood.state import Look, Regressor, State
 
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
+#: What has no name.
+UNEXPLAINED = "unexplained"
 
 
 @dataclass(frozen=True)

@@ -14,6 +14,7 @@ from selfcal.adequacy.document import to_document
 from selfcal.adequacy.identify import identify_axis
 from selfcal.bank.priors import add_sources, for_record
 from selfcal.base.errors import UserError
+from selfcal.diagnosis.finding import UNEXPLAINED
 from selfcal.diagnosis.integrity import masked
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import of_recording
@@ -44,9 +45,9 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
             continue
         state = record.axes[name]
         state = (masked(state, record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
-        best = max((look for cause in LOOKS for look in cause(state, record)), key=lambda look: look.net, default=None)
-        if best is not None and best.net >= NET_LEAST:
-            found[name] = best
+        shown = [look for cause in LOOKS for look in cause(state, record) if look.net >= NET_LEAST]
+        if shown:  # what has no name is the suspicion where nothing has
+            found[name] = max(shown, key=lambda look: (look.cause != UNEXPLAINED, look.net))
     return found
 
 

@@ -41,6 +41,8 @@ LABELS = {
     "width": "width of the play",
     "misread": "share read as a neighbour",
     "value": "a dead band about",
+    "lag1": "correlation of neighbours",
+    "ratio": "times the noise",
 }
 #: What a form adds to the sentence; the static one is what the sentence says by itself.
 FORMS = {
@@ -127,8 +129,9 @@ def _size(key: str, value: Any) -> str:
         low, high = value.get("q05"), value.get("q95")
         half = math.nan if low is None or high is None else 0.5 * (high - low)
         unit = "" if unit == "1" else f" {unit}"
-        spread = f" ± {half:.2g}" if half > 0.0 and math.isfinite(half) else ""
-        return f"{label} {rounded(value['median'], half)}{spread}{unit}"
+        spread = f" ± {ratio(half)}" if half > 0.0 and math.isfinite(half) else ""
+        size = rounded(value["median"], half) if "q05" in value else f"{value['median']:.3g}"
+        return f"{label} {size}{spread}{unit}"
     match key:
         case "intervals":
             return intervals(value)
@@ -143,6 +146,8 @@ def _size(key: str, value: Any) -> str:
             return f"jumps at {times} s" if times else ""
         case "statistic":
             return statistic(str(value))
+        case "share":
+            return f"share of the drift {value:.2g}"
         case "input" | "source" | "measured" | "law" | "knots":
             return ""
     if isinstance(value, list | tuple):
@@ -177,14 +182,15 @@ def what(finding: Mapping[str, Any]) -> str:
 
 
 def how_much(finding: Mapping[str, Any]) -> str:
-    """Its leading size on each axis."""
+    """Its leading size on each axis; one without a unit by its name."""
     found = []
     for axis, one in finding["axes"].items():
-        value = next((value for value in one["estimate"].values() if isinstance(value, Mapping)), None)
+        key, value = next(((k, v) for k, v in one["estimate"].items() if isinstance(v, Mapping)), ("", None))
         if "share" in one["estimate"] and not isinstance(one["estimate"]["share"], Mapping):
             found.append((axis, one["estimate"]["share"], "of the drift"))
         elif value is not None and value["median"] is not None:
-            found.append((axis, value["median"], value["unit"]))
+            of = value["unit"] if value["unit"] != "1" else f"({LABELS.get(key, key.replace('_', ' '))})"
+            found.append((axis, value["median"], of))
     return _by_unit(found)
 
 
@@ -194,16 +200,31 @@ def _by_unit(values: Sequence[tuple[str, float, str]]) -> str:
     for unit in dict.fromkeys(unit for _, _, unit in values):
         own = [(axis, value) for axis, value, of in values if of == unit]
         if len(own) > 2:
-            ends = [ratio(end(abs(value) for _, value in own)) for end in (min, max)]
-            text = " to ".join(dict.fromkeys(ends))
+            text = _range([abs(value) for _, value in own])
         else:
             text = ", ".join(f"{axis} {ratio(value)}" for axis, value in own)
-        told.append(text if unit == "1" else f"{text} {unit}")
+        told.append(f"{text} {unit}")
     return "; ".join(told)
 
 
+def _range(values: Sequence[float]) -> str:
+    """The least and the largest of some values."""
+    return " to ".join(dict.fromkeys(ratio(end(values)) for end in (min, max)))
+
+
+def _off(factors: Sequence[float]) -> str:
+    """How far a number is off, by its values without a cause over those with it: in percent up to twice or half."""
+    told = []
+    for word, own in (("large", [f for f in factors if f > 1.0]), ("small", [1.0 / f for f in factors if f < 1.0])):
+        if own:
+            percent = [100.0 * (f - 1.0) if word == "large" else 100.0 * (1.0 - 1.0 / f) for f in own]
+            told.append(f"{_range(percent)} % too {word}" if max(own) < 2.0 else f"{_range(own)} times too {word}")
+    return " or ".join(told)
+
+
 def effects(finding: Mapping[str, Any]) -> str:
-    """What it changes by as much as matters, and whether time that the fit did not see confirms it."""
+    """How far numbers are off without it, where by as much as matters, and whether time that the fit did not see
+    confirms it."""
     told = []
     changes = finding["changes"]
     for name in ("N", "K", "B"):
@@ -211,19 +232,18 @@ def effects(finding: Mapping[str, Any]) -> str:
         own = [one for one in changes.values() if name in one["material"]]
         own = [one for one in own if name != "B" or "K" not in one["material"]]
         factors = [math.inf if one[name] is None else one[name] for one in own]
-        known = sorted(float(ratio(one)) for one in factors if 0.0 < one < math.inf)
-        parts = [f"× {' to '.join(dict.fromkeys(f'{end:g}' for end in (known[0], known[-1])))}"] if known else []
-        parts += ["not identified without it"] if math.inf in factors else []
-        parts += ["hidden without it"] if 0.0 in factors else []
-        told += [f"{name} {' or '.join(parts)}"] if parts else []
+        parts = [_off([one for one in factors if 0.0 < one < math.inf])]
+        parts += ["not identified"] if math.inf in factors else []
+        parts += ["hidden"] if 0.0 in factors else []
+        told += [f"{name} {' or '.join(filter(None, parts))}"] if any(parts) else []
     moved = [(axis, abs(one["bias"]), one["unit"]) for axis, one in changes.items() if "bias" in one["material"]]
     if moved:
-        told.append(f"bias by {_by_unit(moved)}")
+        told.append(f"bias off by {_by_unit(moved)}")
     rows = [one["bias_error"] for one in changes.values() if "bias_error" in one["material"]]
-    less = [(1.0 - row["after"] / row["before"], horizon) for one in rows for horizon, row in one.items()]
-    if less:
-        most, horizon = max(less)
-        told.append(f"bias {horizon} s ahead known {100.0 * most:.0f} % better")
+    more = [(row["before"] / row["after"] - 1.0, horizon) for one in rows for horizon, row in one.items()]
+    if more:
+        most, horizon = max(more)
+        told.append(f"bias error {horizon} s ahead {100.0 * most:.0f} % larger")
     seen = ["not confirmed on held-out time"] if finding["confirmed"] is False else []
     if finding.get("confirmed_on") is not None:
         seen.append("holds on the second recording" if finding["confirmed_on"] else "not seen on the second recording")
@@ -237,10 +257,14 @@ def action(finding: Mapping[str, Any]) -> str:
     if finding.get("next_record") and finding.get("confirmed_on") is not None:
         seen = "Apply it: the second recording shows it too. --write-model states it."
         return seen if finding["confirmed_on"] else "Leave it out of the model: the second recording does not show it."
-    known = [one["estimate"].get("coefficient") for one in finding["axes"].values()]
-    if not finding.get("next_record") and "source" not in finding["estimate"] and all(map(_sure, known)):
-        return f"Apply it: it is known to {100.0 * APPLIED:.0f} %. --write-model states it."
-    return str(finding["record_next"])
+    sure = [axis for axis, one in finding["axes"].items() if _sure(one["estimate"].get("coefficient"))]
+    if finding.get("next_record") or "source" in finding["estimate"] or not sure:
+        return str(finding["record_next"])
+    applied = f"known to {100.0 * APPLIED:.0f} %. --write-model states it."
+    if len(sure) == len(finding["axes"]):
+        return f"Apply it: it is {applied}"
+    rest = " ".join(axis for axis in finding["axes"] if axis not in sure)
+    return f"Apply it on {' '.join(sure)}: {applied} For {rest}: {finding['record_next']}"
 
 
 def planned(record: Mapping[str, Any] | None, else_: str) -> str:
@@ -271,9 +295,12 @@ def small(findings: Sequence[Mapping[str, Any]]) -> str:
     """One line on the findings that matter little: they move no number by more than it is known."""
     several = len(findings) > 1
     count = f"{len(findings)} small findings" if several else "1 small finding"
-    causes = ", ".join(dict.fromkeys(str(one["cause"]).replace("_", " ") for one in findings))
+    causes: dict[str, list[str]] = {}
+    for one in findings:
+        causes.setdefault(str(one["cause"]).replace("_", " "), []).extend(one["axes"])
+    each = "; ".join(f"{cause} on {' '.join(dict.fromkeys(axes))}" for cause, axes in causes.items())
     none = "none moves" if several else "it moves none of"
-    return f"{count} ({causes}): {none} N, K, B or the bias by more than half of its interval"
+    return f"{count} ({each}): {none} N, K, B or the bias by more than half of its interval"
 
 
 def ratio(value: float) -> str:
@@ -318,13 +345,11 @@ def navigation(document: Mapping[str, Any]) -> list[str]:
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
     told = [
-        f"{name} {ratio(factor)} times the value with it"
-        if math.isfinite(factor)
-        else f"{name} not identified without it"
+        f"{name} {_off([factor])}" if math.isfinite(factor) else f"{name} not identified"
         for name, factor in inflation.items()
         if not 0.95 < factor < 1.05
     ]
-    return f"Without it, plain white noise and random walk come out wrong: {', '.join(told)}." if told else ""
+    return f"Without it, the numbers of plain white noise and random walk are wrong: {', '.join(told)}." if told else ""
 
 
 def plausibility(coefficient: float) -> str:

@@ -45,13 +45,14 @@ class Curve:
 
 @dataclass(frozen=True)
 class Band:
-    """The area from `low` to `high` [n] over `x` [n]. `kind` sets its look: `simulated` with dashed edges, `spread`."""
+    """The area from `low` to `high` [n] over `x` [n]. `kind` sets its look: `simulated` with dashed edges, `spread`,
+    `moving`."""
 
     label: str
     x: Array
     low: Array
     high: Array
-    kind: Literal["simulated", "spread"] = "simulated"
+    kind: Literal["simulated", "spread", "moving"] = "simulated"
 
 
 @dataclass(frozen=True)
@@ -240,9 +241,9 @@ def draw(figure: Figure) -> Markup:
     )
 
 
-def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
-    """The figure in HTML with its panels one below the other over one x, each on its own scale; `marks`: places with
-    the text that stands above them."""
+def strips(figure: Figure, marks: Sequence[tuple[float, float, str]]) -> Markup:
+    """The figure in HTML with its panels one below the other over one x, each on its own scale; `marks`: begin and end
+    of events with the text that stands above them."""
     right, bottom = STRIP_WIDTH - RIGHT, TOP + STRIP * len(figure.panels)
     x = _Scale(*_x_limits(figure), False, STRIP_LEFT, right - STRIP_LEFT)
     rows = []
@@ -255,7 +256,7 @@ def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
         ]
         rows.append((replace(panel, curves=curves, bands=bands), y))
     above: dict[float, list[str]] = {}  # a text that has no room of its own goes to its left neighbour
-    for value, text in sorted(marks):
+    for value, _, text in sorted(marks):
         place = x.place(value)
         above.setdefault(next((other for other in above if place - other < 14.0), place), []).append(text)
     return render(
@@ -272,7 +273,8 @@ def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
 
 def _usual(panel: Panel) -> tuple[float, float]:
     """Limits that all but a few points of a panel keep: a shock must not hide a step."""
-    values = [curve.y for curve in panel.curves] + [edge for band in panel.bands for edge in (band.low, band.high)]
+    bands = [band for band in panel.bands if band.kind != "moving"]
+    values = [curve.y for curve in panel.curves] + [edge for band in bands for edge in (band.low, band.high)]
     usual = [np.nanquantile(ys, (USUAL, 1.0 - USUAL)) for ys in values if np.isfinite(ys).any()]
     return _limits(usual, False, 0.06)
 

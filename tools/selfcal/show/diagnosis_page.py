@@ -12,15 +12,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from markupsafe import Markup
 
 from selfcal.base import units
 from selfcal.base.ending import Stopped
 from selfcal.base.output import write_text
-from selfcal.diagnosis.events import UNEXPLAINED, parted, times_of
+from selfcal.diagnosis.events import parted, times_of
 from selfcal.diagnosis.extend import fitted_law
-from selfcal.diagnosis.finding import Diagnosed, Finding
+from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.show import chart, pictures
@@ -222,19 +223,31 @@ def _sides(results: Mapping[str, Entry]) -> tuple[list[str], list[str], list[str
 
 def _readings(findings: Sequence[Entry], axes: Sequence[_Axis]) -> Markup:
     """The readings of all axes over one time, the events marked by their numbers in the list."""
-    marks = [(time, str(row)) for row, finding in enumerate(findings, 1) for time in times_of(finding)]
+    marks = [(*times, str(row)) for row, finding in enumerate(findings, 1) for times in times_of(finding)]
     panels = []
     for axis in axes:
         unit, record, state = str(axis.entry["unit"]), axis.diagnosed.record, axis.diagnosed.first
         factor = units.factor(axis.diagnosed.state.unit, unit)
         x, mean, low, high = envelope(record.time_s + record.start_s, state.y, chart.POINTS)
-        band = Band("lowest to highest reading", x, factor * low, factor * high, "spread")
+        bands = [Band("lowest to highest reading", x, factor * low, factor * high, "spread")]
+        bands += _moving(record, axis.name, factor, state.level)
         curve = Curve("mean", x, factor * mean)
         panels.append(
-            Panel(axis.name, "time, s", units.typeset(unit), [curve], [band], marks=[time for time, _ in marks])
+            Panel(axis.name, "time, s", units.typeset(unit), [curve], bands, marks=[time for time, *_ in marks])
         )
-    caption = "Readings of each axis about its level, each on its own scale. Numbers: the rows of the list."
+    caption = "Readings of each axis about its level, each on its own scale that rest fills: a shake is cut off at its "
+    caption += "edges. Numbers: the rows of the list."
     return strips(Figure("Readings and events", caption, panels), marks)
+
+
+def _moving(record: Record, name: str, factor: float, level: float) -> list[Band]:
+    """The readings of an axis that were left out because the sensor moved; none where it rested."""
+    read = record.readings.get(name)
+    if read is None or not read.moving.any():
+        return []
+    values = np.where(read.moving, read.values - level, np.nan)
+    x, _, low, high = envelope(read.recording.time_s + read.recording.start_s, values, chart.POINTS)
+    return [Band("moving, left out", x, factor * low, factor * high, "moving")]
 
 
 def _fitted(diagnosed: Diagnosed, unit: str) -> tuple[str, str, dict[str, Entry]]:

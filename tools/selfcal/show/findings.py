@@ -80,7 +80,7 @@ def noisier_of(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def _events(findings: Sequence[Mapping[str, Any]]) -> Table:
-    table = table_of(("", "from", "what", "changes", "do"), wraps=True, pad_edge=False)
+    table = table_of(("", "from", "what", "without it", "do"), wraps=True, pad_edge=False)
     for number, finding in enumerate(findings, 1):
         what = "; ".join(filter(None, (words.what(finding), words.how_much(finding))))
         row = (what, words.effects(finding), words.action(finding))

@@ -24,6 +24,8 @@ from selfcal.readings.misread import MISREAD
 from selfcal.readings.rest import MOST_LISTED
 
 Reason = TypeVar("Reason", str, tuple[str, str])
+#: A check, its axes, and their outcomes.
+_Event = tuple[str, list[str], list[Mapping[str, Any]]]
 
 #: Least probability of a law that is named if the grid is too coarse for it.
 TOLD_OF = 0.01
@@ -231,14 +233,16 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
     )
     line = "priors: {}: from this record, which lies outside the model's: {}"
     kept = [line.format(names, own) for own, names in own_priors.items()]
-    lost = _by_reason(
-        (", ".join(f"{count} {what}" for what, count in axis.get("samples_kept_out", {}).items() if count), name)
-        for name, axis in axes.items()
-    )
-    kept += [f"kept out: {names}: {counts}" for counts, names in lost.items() if counts]
-    harmless = {name: axis["checks"].get("motion", {"passed": False}) for name, axis in axes.items()}
-    moved = _by_reason((_times(one["intervals"]), name) for name, one in harmless.items() if one["passed"])
-    kept += [f"motion, left out, N is the same with it: {names}: {times}" for times, names in moved.items()]
+    lost: dict[str, dict[str, int]] = {}
+    for name, axis in axes.items():
+        for what, count in axis.get("samples_kept_out", {}).items():
+            if count:
+                lost.setdefault(what, {})[name] = count
+    for what, counts in lost.items():
+        ends = " to ".join(dict.fromkeys(str(end(counts.values())) for end in (min, max)))
+        kept.append(f"kept out: {', '.join(counts)}: {ends} {what}")
+    for check, names, outcomes in _events(axes, passed=True):
+        kept.append(f"{check}, left out, N is the same with it: {', '.join(names)}: {_times(outcomes[0]['intervals'])}")
     without = _by_reason((axis["error"], name) for name, axis in document["axes"].items() if name not in axes)
     failed = [f"no result: {names}: {error}; choose axes with --axis" for error, names in without.items()]
     for name, axis in axes.items():
@@ -258,11 +262,11 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         )
         if suspected:
             failed.append(f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in suspected.items())}")
-    for name, axis in axes.items():
-        if "more_laws" in axis:
-            laws = sorted(axis["more_laws"].items(), key=lambda law: -law[1])[:3]
-            likeliest = ", ".join(f"{law} {P:.2g}" for law, P in laws)
-            failed.append(f"with the laws of sums.yaml: {name}: {likeliest}")
+    more = _by_reason(
+        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > TOLD_OF), name)
+        for name, more in ((name, axis["more_laws"]) for name, axis in axes.items() if "more_laws" in axis)
+    )
+    failed += [f"with the laws of sums.yaml: {names}: {laws}" for laws, names in more.items()]
     if any(line.startswith("not adequate") for line in failed):
         there = Path(recording["path"]).exists() or recording.get("paths")
         typed = f"{called()} diagnose {as_typed(recording)}" if there else "selfcal.diagnose() of the same readings"
@@ -271,21 +275,36 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
     return [*kept, *_unidentified(axes), *noisier(N), *_ahead(axes), *failed]
 
 
-def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
-    """Evidence against the laws: a line an event or source, which covers the statistics of its axes."""
-    events: list[tuple[str, list[str], list[Mapping[str, Any]]]] = []
-    named: set[str] = set()
+def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
+    """Checks that name an event or source, with the axes and their outcomes: those that speak against the laws, or the
+    stretches of time that are left out and `passed`. Each stretch is an event, those of the same axes are one again."""
+    events: list[_Event] = []
     for name, axis in axes.items():
         for check, outcome in axis["checks"].items():
-            if outcome["passed"] or check.startswith(STATISTICS):
+            if outcome["passed"] is not passed or check.startswith(STATISTICS) or passed > ("intervals" in outcome):
                 continue
-            named.add(name)
-            known = next((event for event in events if event[0] == check and _same(check, event[2][0], outcome)), None)
-            if known is None:
-                events.append((check, [name], [outcome]))
-            else:
-                known[1].append(name)
-                known[2].append(outcome)
+            for one in [{**outcome, "intervals": [each]} for each in outcome.get("intervals", ())] or [outcome]:
+                known = next((event for event in events if event[0] == check and _same(check, event[2][0], one)), None)
+                if known is None:
+                    events.append(known := (check, [], []))
+                known[1].extend([name] if name not in known[1] else [])
+                known[2].append(one)
+    found: dict[Any, _Event] = {}
+    for k, (check, names, outcomes) in enumerate(events):
+        event = found.setdefault((check, *names) if "intervals" in outcomes[0] else k, (check, names, []))
+        if "intervals" not in outcomes[0]:
+            event[2].extend(outcomes)
+            continue
+        begins, ends = zip(*(one["intervals"][0] for one in outcomes), strict=True)
+        before = event[2][0]["intervals"] if event[2] else []
+        event[2][:] = [{**outcomes[0], "intervals": [*before, [min(begins), max(ends)]]}]
+    return list(found.values())
+
+
+def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
+    """Evidence against the laws: a line an event or source, which covers the statistics of its axes."""
+    events = _events(axes, passed=False)
+    named = {name for _, names, _ in events for name in names}
     lines = []
     for check, names, outcomes in events:
         values = [
@@ -327,8 +346,9 @@ def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
             return True
         case "channel":
             return bool(a["column"] == b["column"])
-        case "motion":
-            return list(a["intervals"]) == list(b["intervals"])
+        case "motion" | "stuck":
+            (begin, end), (other, last) = a["intervals"][0], b["intervals"][0]
+            return bool(begin <= last and other <= end)
     return False
 
 

@@ -345,15 +345,27 @@ class Diagnosis(Document):
         show(self, console=console)
 
     def _rows(self) -> Iterator[dict[str, Any]]:
-        """Axis, cause and each number of its estimate; of an axis without a finding the verdict, or the reason."""
+        """Axis, cause, evidence and each number of its estimate, of what acts on all axes too; `value`: no number. Of
+        an axis without a finding the verdict, or the reason."""
+        events = {event["id"]: event for event in self.get("findings", ())}
         for name, axis in self["axes"].items():
             head = {"axis": name, **{key: axis[key] for key in ("verdict", "error") if key in axis}}
-            if not axis.get("findings"):
+            rows = list(axis.get("findings", ()))
+            own = {finding.get("of") for finding in rows}
+            for event in events.values():
+                if name in event["axes"] and event["id"] not in own:  # one of all axes together
+                    estimate = {**event["estimate"], **event["axes"][name]["estimate"]}
+                    gain = {"evidence_gain_nats": event["evidence_nats"], "net_nats": event["net_nats"]}
+                    rows.append({"cause": event["cause"], "of": event["id"], "estimate": estimate, **gain})
+            if not rows:
                 yield head
-            for finding in axis.get("findings", ()):
-                of = {**head, "cause": finding["cause"], "evidence_gain_nats": finding["evidence_gain_nats"]}
-                for key, value in finding["estimate"].items():
-                    yield {**of, "key": key, **(value if isinstance(value, Mapping) else {"median": value})}
+            for finding in rows:
+                event = events.get(finding.get("of"), {})
+                of = {**head, "cause": finding["cause"], "of": finding.get("of"), "material": event.get("material")}
+                of |= {key: finding.get(key) for key in ("evidence_gain_nats", "net_nats")}
+                for key, value in finding["estimate"].items() or [("", "")]:
+                    told = "value" if isinstance(value, str | list | tuple) else "median"
+                    yield {**of, "key": key, **(value if isinstance(value, Mapping) else {told: value})}
 
 
 class Comparison(Document):

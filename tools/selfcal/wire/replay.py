@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from selfcal.adequacy.checks import Judged, judge, with_drift, with_readings
+from selfcal.adequacy.checks import Judged, judge, with_readings
 from selfcal.adequacy.document import Identified, as_typed, to_document
 from selfcal.adequacy.identify import may_act, with_reasons
 from selfcal.adequacy.one_over_f import weigh, with_white
@@ -511,8 +511,7 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
     if not gate:
         used = list(range(len(tables.regressors))) if scored is not None and scored.best == 1 else []
         readings = look(recording, name, group)
-        judged = judge(blocks, tables, group, result, used)
-        judged = with_drift(judged, blocks, tables, result, recording, may_act(model, recording, name), used)
+        judged = judge(blocks, tables, group, result, recording, may_act(model, recording, name), used)
         judged = with_readings(judged, readings, group, unit, tables.dt_s, as_fed=True)
     extent = tables.dt_s, blocks.mean.size, tables.block
     in_reading_unit = in_unit(with_white(result, group, *extent), group.unit, unit)

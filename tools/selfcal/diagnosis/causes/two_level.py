@@ -38,8 +38,8 @@ QUANTILES = 64
 JUMPS_LEAST = 4
 #: Price of the search beside three degrees of freedom.
 LN_LOOKS = 2.0 + LN_SLOW
-#: Limits of a probability.
-LEAST = 1e-9
+#: Limits of a probability, and the largest exponent.
+LEAST, LN_MOST = 1e-9, 700.0
 
 
 def switching(y: Array, theta: Array) -> tuple[Array, Array]:
@@ -49,28 +49,30 @@ def switching(y: Array, theta: Array) -> tuple[Array, Array]:
     A, low, high, rho, sigma = np.exp(theta).T
     R, Q, half = sigma**2, (rho * sigma) ** 2, 0.5 * A
     up, down = -np.expm1(-1.0 / low), -np.expm1(-1.0 / high)
-    there = y[np.isfinite(y)]
-    x, P = np.full(A.size, there[:30].mean()), 1e4 * R
-    w, total = up / (up + down), np.zeros(A.size)
-    kept = np.empty((y.size, A.size))
-    for k, value in enumerate(y):
+    stay, there = 1.0 - up - down, np.isfinite(y)
+    x, P = np.full(A.size, y[there][:30].mean()), 1e4 * R
+    w = up / (up + down)
+    kept, spread, apart, odds = np.empty((4, y.size, A.size))
+    for k, value in enumerate(y.tolist()):
         P = P + Q
-        w = w * (1.0 - down) + (1.0 - w) * up
+        w = up + stay * w
         if value == value:  # not missing
-            S = P + R
-            e = value - x
-            lower = (e + half) ** 2 / S
-            odds = np.log(w / (1.0 - w)) + 0.5 * (lower - (e - half) ** 2 / S)
-            most = np.maximum(odds, 0.0)
-            total += np.log1p(-w) + most + np.log(np.exp(-most) + np.exp(odds - most)) - 0.5 * (np.log(S) + lower)
-            # np.clip takes five times as long over so few.
-            odds = np.minimum(np.maximum(odds, -30.0), 30.0)
-            w = np.minimum(np.maximum(1.0 / (1.0 + np.exp(-odds)), LEAST), 1.0 - LEAST)
+            S = spread[k] = P + R
             gain = P / S
-            x = x + gain * (e - half * (2.0 * w - 1.0))
-            P = P * (1.0 - gain) + (gain * A) ** 2 * w * (1.0 - w)
+            e = apart[k] = value - x
+            # The likelihood of the upper level over that of the lower one.
+            ratio = np.exp(np.minimum(A * e / S, LN_MOST))
+            upper = w * ratio
+            both = odds[k] = upper - w + 1.0
+            w = np.minimum(np.maximum(upper / both, LEAST), 1.0 - LEAST)
+            e = e + half
+            x = x + gain * (e - A * w)
+            P = P - gain * P + (gain * A) ** 2 * (w - w * w)
         kept[k] = w
-    return total, kept
+    odds, spread, apart = odds[there], spread[there], apart[there]
+    terms = np.log(odds) + np.maximum(A * apart / spread - LN_MOST, 0.0)
+    terms -= 0.5 * (np.log(spread) + (apart + half) ** 2 / spread)
+    return terms.sum(axis=0), kept
 
 
 def looks(state: State, record: Record) -> list[Look]:
@@ -87,7 +89,6 @@ def looks(state: State, record: Record) -> list[Look]:
     walk = next(fit for fit in state.fits if fit.terms.walk)
     ln_rho = walk.of_means(block, 0.0)[walk.terms.names.index("ln_rho")]
     ln_sigma = math.log(walk.sigma / math.sqrt(block))
-    none = _without(y, ln_rho, ln_sigma) + _law(state)
     tried = np.array(
         [
             (math.log(a) + ln_sigma, math.log(d), math.log(d), ln_rho - less, ln_sigma)
@@ -96,10 +97,12 @@ def looks(state: State, record: Record) -> list[Look]:
             for less in (0.0, *SMALLER)
         ]
     )
-    value = switching(y, tried)[0]
+    one_level = _without(ln_rho, ln_sigma)
+    value, walks = np.split(switching(y, np.vstack([tried, one_level]))[0], [len(tried)])
+    none = float(walks.max()) + _law(state)
     if net(float(value.max()) - none, 3, LN_LOOKS) < 1.0:
         return []
-    theta, gain = _best(y, tried[int(value.argmax())])
+    theta, gain = _best(y, tried[int(value.argmax())], float(value.max()))
     upper = _smoothed(y, theta) > 0.5
     jumps = int(np.count_nonzero(np.diff(upper)))
     if jumps < JUMPS_LEAST:
@@ -154,12 +157,11 @@ def _shaken(state: State, record: Record, levels: Array) -> bool:
     return bool(louder & known)
 
 
-def _without(y: Array, ln_rho: float, ln_sigma: float) -> float:
-    """The likeliest walk beside one level, by the same filter."""
+def _without(ln_rho: float, ln_sigma: float) -> Array:
+    """Walks beside one level [g, 5], for the same filter."""
     walks, whites = (one.ravel() for one in np.meshgrid(WALKS, WHITES))
     none, dwell = np.full(walks.size, math.log(LEAST) + ln_sigma), np.full(walks.size, math.log(100.0))
-    theta = np.column_stack([none, dwell, dwell, ln_rho + walks, ln_sigma + whites])
-    return float(switching(y, theta)[0].max())
+    return np.column_stack([none, dwell, dwell, ln_rho + walks, ln_sigma + whites])
 
 
 def _law(state: State) -> float:
@@ -168,13 +170,12 @@ def _law(state: State) -> float:
     return max(0.0, state.best.ln_likelihood - walk.ln_likelihood)
 
 
-def _best(y: Array, theta: Array) -> tuple[Array, float]:
-    """The likeliest parameters from `theta` on, and their ln likelihood."""
+def _best(y: Array, middle: Array, value: float) -> tuple[Array, float]:
+    """The likeliest parameters from `middle` on, of the ln likelihood `value`, and theirs."""
     random = np.random.default_rng(1)
     spread = np.diag([0.3, 0.8, 0.8, 0.8, 0.03])
-    middle, value = theta, float(switching(y, theta[None, :])[0][0])
     for _ in range(ROUNDS):
-        drawn = middle + random.standard_normal((DRAWS, theta.size)) @ spread.T
+        drawn = middle + random.standard_normal((DRAWS, middle.size)) @ spread.T
         found = switching(y, drawn)[0]
         order = np.argsort(-found)
         if found[order[0]] > value:
@@ -184,7 +185,7 @@ def _best(y: Array, theta: Array) -> tuple[Array, float]:
         weight[order[DRAWS // 3 :]] = 0.0
         apart = drawn - middle
         covariance = (weight[:, None] * apart).T @ apart / weight.sum()
-        spread = np.linalg.cholesky(1.5 * covariance + 1e-5 * np.eye(theta.size))
+        spread = np.linalg.cholesky(1.5 * covariance + 1e-5 * np.eye(middle.size))
     return middle, value
 
 
