@@ -17,7 +17,7 @@ from scipy.special import gammainc, gammaincc, log_ndtr, ndtr, ndtri, stdtr, std
 
 from selfcal.likelihood.fit import Fit, Series, run
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array, Matrices, matrices
+from selfcal.likelihood.statemodel import Array, Mask, Matrices, matrices
 from selfcal.readings.lattice import WHITE_REMAINDERS
 
 Indices = NDArray[np.int64]
@@ -72,16 +72,13 @@ class Judged:
     p: float
 
 
-def all_statistics(
-    w: Array, y: Array | None, lsb: float, jumps: Callable[[Array], float] | None = None
-) -> dict[str, float]:
+def all_statistics(w: Array, y: Array | None, lsb: float, jumps: Callable[[Array], float] | None) -> dict[str, float]:
     """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read."""
     present = np.isfinite(w)
     x = w[present]
     n = x.size
-    found: dict[str, float] = {}
     if n < 50:
-        return found
+        return {}
     sd = float(np.clip(x, -FAR_OFF, FAR_OFF).std())
     if not sd > 0.0:
         return {SPREAD: math.inf}
@@ -89,98 +86,118 @@ def all_statistics(
     filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)
     reach = max(min(1 + max(LAGS), n // 8), min(ECHOES, n // 4))
     power = _power(filled, reach)
-    lagged = _lagged(power, reach) / math.sqrt(n)
+    found = dict(_of_memory(filled, present, n, _lagged(power, reach) / math.sqrt(n)))
+    clipped = np.clip(filled, -5.0, 5.0)
+    for size in SEGMENTS:
+        if filled.size >= 4 * size:
+            found[f"spectrogram_of_{size}_samples"] = _uneven(clipped, size)
+    if jumps is not None:
+        found["jumps_of_the_bias"] = jumps(clipped)
+    found |= _of_sizes(x)
+    found |= _over_the_record(x, filled, present)
+    found |= _worst_band(power, n, w.size)
+    return found if y is None else found | _of_readings(y, lsb)
+
+
+def _of_memory(filled: Array, present: Mask, n: int, lagged: Array) -> Iterator[tuple[str, float]]:
+    """Correlation of `n` residuals (missing: 0): `lagged` [lags] of single ones, of sums, and of Allan deviations."""
     for lag in LAGS:
         if lag < min(lagged.size, n // 8):
-            found[f"innovation_lag{lag}"] = float(lagged[lag])
-    found["innovation_correlation_to_lag_20"] = _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
+            yield f"innovation_lag{lag}", float(lagged[lag])
+    yield "innovation_correlation_to_lag_20", _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
     for size in BLOCKS:
         if n >= BLOCKS_LEAST * size:
             sums = np.add.reduceat(filled, np.arange(0, filled.size - size + 1, size))
             scale = math.sqrt(sums.size) * float(sums.var())
             for lag in SLOW_LAGS:
-                found[f"innovation_lag{lag}_of_{size}_samples"] = float(sums[lag:] @ sums[:-lag]) / scale
+                yield f"innovation_lag{lag}_of_{size}_samples", float(sums[lag:] @ sums[:-lag]) / scale
     sizes = 2 ** np.arange(max(1, int(math.log2(n / LONGEST)) + 1))
     for m, deviation in zip(sizes, allan_deviation(np.where(present, filled, np.nan), sizes), strict=True):
         if math.isfinite(deviation):
-            found[f"allan_of_{m}_samples"] = _root(n * float(deviation) ** 2, n / float(m))
+            yield f"allan_of_{m}_samples", _root(n * float(deviation) ** 2, n / float(m))
     # A reading that repeats what was before, however long before.
-    found["innovation_largest_correlation"] = _largest(lagged[4:] * np.sqrt(n / (n - np.arange(4, lagged.size))))
-    for size in SEGMENTS:
-        if filled.size >= 4 * size:
-            found[f"spectrogram_of_{size}_samples"] = _uneven(np.clip(filled, -5.0, 5.0), size)
-    if jumps is not None:
-        found["jumps_of_the_bias"] = jumps(np.clip(filled, -5.0, 5.0))
+    yield "innovation_largest_correlation", _largest(lagged[4:] * np.sqrt(n / (n - np.arange(4, lagged.size))))
+
+
+def _of_sizes(x: Array) -> dict[str, float]:
+    """The distribution of residuals [n], and the spread of the noise level over the record."""
+    n = x.size
     clipped = np.clip(x, -12.0, 12.0)
     squared = clipped * clipped
-    found["innovation_excess_kurtosis"] = (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0)
-    found["innovation_skewness"] = float(squared @ clipped) / n * math.sqrt(n / 6.0)
-    found["innovation_largest"] = _largest(x)
-    # Spread of the noise level over the record, in pieces of three lengths.
+    found = {
+        "innovation_excess_kurtosis": (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0),
+        "innovation_skewness": float(squared @ clipped) / n * math.sqrt(n / 6.0),
+        "innovation_largest": _largest(x),
+    }
     energies = np.minimum(squared, 16.0)
     variance = float(energies.var())
     for pieces in (8, 40, 200):
         size = n // pieces
-        if size < 10:
-            break
-        energy = energies[: size * pieces].reshape(pieces, size).mean(axis=1)
-        # In units of the pieces' own expected spread, from the fourth moment.
-        spread = variance / size
-        found[f"noise_level_of_{pieces}_pieces"] = _root(
-            float(((energy - energy.mean()) ** 2).sum() / spread), pieces - 1
-        )
+        if size >= 10:
+            energy = energies[: size * pieces].reshape(pieces, size).mean(axis=1)
+            # In units of the pieces' own expected spread, from the fourth moment.
+            spread = float(((energy - energy.mean()) ** 2).sum() / (variance / size))
+            found[f"noise_level_of_{pieces}_pieces"] = _root(spread, pieces - 1)
+    return found
+
+
+def _over_the_record(x: Array, filled: Array, present: Mask) -> dict[str, float]:
+    """Correlation of the magnitudes of residuals `x` [n], and their level: means of pieces against white noise."""
+    n = x.size
     # Magnitudes, not squares: their products have no heavy tail.
-    square = np.minimum(np.abs(filled), 3.5)
-    square = np.where(present, square - square[present].mean(), 0.0)
-    scale = math.sqrt(n) * float(square[present].var())
+    magnitude = np.minimum(np.abs(filled), 3.5)
+    magnitude = np.where(present, magnitude - magnitude[present].mean(), 0.0)
+    scale = math.sqrt(n) * float(magnitude[present].var())
     count = min(101, n // 8)
-    lagged = _lagged(_power(square, count), count) / scale
-    for lag in (1, 3, 10, 30, 100):
-        if lag < lagged.size:
-            found[f"innovation_magnitude_lag{lag}"] = float(lagged[lag])
-    # Level over the record: means of pieces against white noise.
+    lagged = _lagged(_power(magnitude, count), count) / scale
+    found = {f"innovation_magnitude_lag{lag}": float(lagged[lag]) for lag in (1, 3, 10, 30, 100) if lag < lagged.size}
     for pieces in (8, 40):
         size = n // pieces
-        if size < 10:
-            break
-        means = x[: size * pieces].reshape(pieces, size).mean(axis=1) * math.sqrt(size)
-        found[f"innovation_means_of_{pieces}_pieces"] = _root(float((means**2).sum()), pieces)
-    # The spectrum in bands of a third of an octave.
-    worst, places = 0.0, 0
+        if size >= 10:
+            means = x[: size * pieces].reshape(pieces, size).mean(axis=1) * math.sqrt(size)
+            found[f"innovation_means_of_{pieces}_pieces"] = _root(float((means**2).sum()), pieces)
+    return found
+
+
+def _worst_band(power: Array, n: int, padded: int) -> dict[str, float]:
+    """The spectrum in thirds of an octave. `padded`: samples with the missing ones, `n` of them are there."""
+    worst: list[float] = []
     high = power.size - 1
     while high > 8:
         low = max(1, int(high / 2 ** (1.0 / 3.0)))
         if high - low < 4:
             break
         # The padding makes a few more points of as much information.
-        points = (high - low) * w.size / (2 * (power.size - 1))
-        z = _root(2.0 * float(power[low:high].mean()) / n * points, 2.0 * points)
-        places += 1
-        worst = z if abs(z) > abs(worst) else worst
+        points = (high - low) * padded / (2 * (power.size - 1))
+        worst.append(_root(2.0 * float(power[low:high].mean()) / n * points, 2.0 * points))
         high = low
-    if places:
-        found["spectrum_worst_third_octave"] = worst
-    if y is None:
-        return found
+    return {"spectrum_worst_third_octave": max(worst, key=abs)} if worst else {}
+
+
+def _of_readings(y: Array, lsb: float) -> dict[str, float]:
+    """Readings `y` [n] that repeat, and how their codes on a lattice `lsb` are used."""
     # The codes of the lattice: sums in floating point differ in the last digit.
     codes = y if lsb <= 0.0 else np.rint((y - y[np.argmax(np.isfinite(y))]) / lsb)
     # Readings that repeat the one before, beyond those that repeat an earlier one: these do by chance.
     equal = [int((codes[k:] == codes[:-k]).sum()) for k in (1, 2, 3, 4)]
     usual = sum(equal[1:]) / 3.0
-    found["repeated_readings"] = (equal[0] - usual) / math.sqrt(max(1.0, (sum(equal) / 3.0)))
+    found = {"repeated_readings": (equal[0] - usual) / math.sqrt(max(1.0, (sum(equal) / 3.0)))}
     if lsb <= 0.0:
         # Without a lattice, or on one of several steps, no reading is much commoner than the next.
-        found["commonest_reading"] = _commonest(codes) if sum(equal) else 0.0
-    else:
-        found["longest_repeat"] = math.log(_longest_run(codes))
-        read = codes[np.isfinite(codes)].astype(np.int64)
-        odd = int((read & 1).sum())
-        if PARITY_MOST * float(np.diff(read).std()) > math.sqrt(2.0):
-            # A code that never comes leaves its readings to others: more pairs are equal than differ by little.
-            apart = np.concatenate([np.abs(codes[k:] - codes[:-k]) for k in (1, 2, 3, 4)])
-            same, near, next_ = (float((apart == k).sum()) for k in (0.0, 1.0, 2.0))
-            found["equal_readings"] = (same - (4.0 * near - next_) / 6.0) / math.sqrt(max(1.0, 2.0 * same))
-            found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
+        _, counts = np.unique(y[np.isfinite(y)], return_counts=True)
+        first, second = np.sort(counts)[:-3:-1] if counts.size > 1 else (counts[0], 0)
+        found["commonest_reading"] = float(first - second) / math.sqrt(float(first + second)) if sum(equal) else 0.0
+        return found
+    changes = np.flatnonzero(np.diff(codes, prepend=np.nan) != 0.0)
+    found["longest_repeat"] = math.log(int(np.diff(np.append(changes, codes.size)).max()))
+    read = codes[np.isfinite(codes)].astype(np.int64)
+    odd = int((read & 1).sum())
+    if PARITY_MOST * float(np.diff(read).std()) > math.sqrt(2.0):
+        # A code that never comes leaves its readings to others: more pairs are equal than differ by little.
+        apart = np.concatenate([np.abs(codes[k:] - codes[:-k]) for k in (1, 2, 3, 4)])
+        same, near, next_ = (float((apart == k).sum()) for k in (0.0, 1.0, 2.0))
+        found["equal_readings"] = (same - (4.0 * near - next_) / 6.0) / math.sqrt(max(1.0, 2.0 * same))
+        found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
     return found
 
 
@@ -263,18 +280,6 @@ def _largest(x: Array) -> float:
     ln_p = math.log(2.0) + float(log_ndtr(-np.abs(x).max())) + math.log(x.size)
     p = -math.expm1(-math.exp(min(ln_p, 5.0)))
     return -float(ndtri(min(max(p, 1e-300), 1.0 - 1e-16)))
-
-
-def _commonest(y: Array) -> float:
-    """How much oftener the commonest reading comes than the next, as a normal deviate."""
-    _, counts = np.unique(y[np.isfinite(y)], return_counts=True)
-    first, second = np.sort(counts)[:-3:-1] if counts.size > 1 else (counts[0], 0)
-    return float(first - second) / math.sqrt(float(first + second))
-
-
-def _longest_run(y: Array) -> int:
-    change = np.flatnonzero(np.diff(y, prepend=np.nan) != 0.0)
-    return int(np.diff(np.append(change, y.size)).max())
 
 
 def simulated(state: State, random: np.random.Generator) -> Array:
