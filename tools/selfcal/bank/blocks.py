@@ -17,8 +17,6 @@ from selfcal.model.file import Group
 from selfcal.model.tables import Tables
 from selfcal.readings.readings import mostly_beyond
 
-#: Fewest whole averages, and the share of readings in them: too few, if other averages have lost most of their samples.
-FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
 #: Bank intervals, gaps included, that the checks and the reference compute one by one.
 MOST_DENSE = 10_000_000
 
@@ -69,7 +67,8 @@ def usable_blocks(
     if present.size < needed:
         more = alone if tables.block > 1 and each >= needed else ""
         raise UserError(f"too short: {averages}, {needed} are needed (samples kept out: {kept}){more}")
-    if present.size < FEWEST_WHOLE and whole < WHOLE_SHARE * each:
+    # Other averages have lost most of their samples.
+    if present.size < 20 and whole < 0.25 * each:
         raise UserError(f"too few whole averages: {averages} hold {whole:.0f} of the {each} readings{alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"

@@ -164,7 +164,6 @@ def finite(value: Any) -> Any:
 
 #: Columns of a table at most, and of an output that is not a terminal.
 TABLE_WIDTH = 140
-_NO_WIDTH = 1000
 #: Suffixes of pictures.
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
@@ -182,7 +181,7 @@ def console_of(*, to_stderr: bool = False, fits: bool = False) -> Console:
 
     console = Console(stderr=to_stderr)
     if not console.is_terminal:
-        console.width = _NO_WIDTH
+        console.width = 1000
     elif not fits:
         console.width = max(console.width, TABLE_WIDTH)
     return console

@@ -10,9 +10,6 @@ from rich.progress import Progress, ProgressColumn
 
 from selfcal.base.errors import note
 
-#: Interval of lines without a terminal, and time before the first line, s.
-EVERY_S = 10.0
-
 
 class Doing:
     """`with Doing("diagnose") as doing:`, then `doing.now("gx: round 2")` whenever the work changes, from any thread,
@@ -37,9 +34,9 @@ class Doing:
         self.tell(f"{self.text} ({time.monotonic() - self.began:.0f} s)")
 
     def tell(self, text: str) -> None:
-        """Write this line if one is due."""
+        """Write this line if the last was 10 s ago."""
         now = time.monotonic()
-        if self.verb and not self.terminal and now - self.told >= EVERY_S:
+        if self.verb and not self.terminal and now - self.told >= 10.0:
             self.told = now
             note(f"{self.verb}: {text}")
 

@@ -33,8 +33,8 @@ from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Terms
 from selfcal.model.file import Model
 
-#: Lengths of a bit over the lag that is expected, and stages of the register that makes them.
-BITS, STAGES = (0.5, 1.0, 2.0, 4.0), 9
+#: Stages of the register that makes the bits.
+STAGES = 9
 #: Records that a length is tried with, how exact the predicted one is, and how much longer the next is.
 DRAWN, STEP, LONGER = 20, 1.1, 1.2
 LAG = Structure("lag", ("gain",), ("lag_s",))
@@ -117,7 +117,7 @@ def designed(
             low, high = (middle, high) if lacks(bit_s, middle) else (low, middle)
         return high
 
-    bits = [max(one * experiment.lag_s, 2.0 * dt) for one in BITS]
+    bits = [max(one * experiment.lag_s, 2.0 * dt) for one in (0.5, 1.0, 2.0, 4.0)]
     reached = {bit_s: samples for bit_s in bits if (samples := length(bit_s)) is not None}
     if not reached:
         return {"bit_s": None, "duration_s": None}

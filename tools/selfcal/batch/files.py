@@ -18,8 +18,6 @@ from selfcal.base.errors import UserError, note, short
 from selfcal.base.limits import read_text
 from selfcal.logs.recording import meta_place
 
-#: Bytes of a table of units: 10 000 lines of 100 letters are 1 MB.
-MOST_TABLE_BYTES = 1 << 26
 #: Columns of a table of units; the first two must be there.
 TABLE_COLUMNS = ("file", "device", "station", "lot", "date")
 #: Sources of a serial number.
@@ -207,7 +205,8 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
     """Device, station, lot and date by path. A file is named as the pattern names it, from the table's folder on, or by
     its bare name."""
     try:
-        text = read_text(table, MOST_TABLE_BYTES, "not a table of units")
+        # 10 000 lines of 100 letters are 1 MB.
+        text = read_text(table, 1 << 26, "not a table of units")
     except FileNotFoundError as error:
         raise UserError(f"{table}: there is no such file") from error
     try:

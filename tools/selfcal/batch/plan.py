@@ -46,18 +46,12 @@ SCHEMA = "selfcal.plan/1"
 LEAST, MOST = 64, 200_000
 #: Halvings of the last step of the length, in its logarithm.
 HALVINGS = 3
-#: A law is there in so many of the records at least.
-LEAST_SHARE = 0.1
 #: A bank so many times faster or slower is worth a line if it shortens the length to this share, or lengthens it less.
 FASTER, WORTH = 10.0, 0.8
-#: Smallest number of a metric: an interval of no width has no logarithm.
-TINY = 1e-12
-#: Readings at least of which an information is taken.
-_FEWEST = 8
 #: A bias is in its steady state where half the length has an interval that is wider by less than this factor.
 STEADY = 1.1
-#: Cycles of a regressor's channel over the record: one sweep is half of one. Record without another wish, s.
-CYCLES, SWEEP_S = (0.5, 1.0, 4.0), 3600.0
+#: Record without another wish, s.
+SWEEP_S = 3600.0
 #: Forms whose column is in proportion to the channel.
 LINEAR = ("static", "lag", "rate")
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
@@ -160,13 +154,14 @@ class Ensemble:
         """ln of the metric that SHARE of the records keep, over the wish's: 0 or less is reached."""
         metric = self.metrics(samples)[:, k]
         metric = metric[~np.isnan(metric)]
-        if metric.size < LEAST_SHARE * len(self.seeds):
+        if metric.size < 0.1 * len(self.seeds):
             raise UserError(
                 f"--want '{self.wishes[k].text}': hardly a part of {self.model.path} has a law with "
                 f"{self.wishes[k].parameter} on {self.axis}: state `hypothesis` under simulate.axes.{self.axis}, "
                 "of a recording in the file that `part` writes"
             )
-        return math.log(max(float(np.quantile(metric, SHARE)), TINY) / self.wishes[k].most)
+        # An interval of no width has no logarithm.
+        return math.log(max(float(np.quantile(metric, SHARE)), 1e-12) / self.wishes[k].most)
 
     def length(self, k: int) -> int | None:
         """Bank samples at which the wish is reached; None beyond MOST."""
@@ -201,7 +196,8 @@ def cycling(
     bare, found = replace(model, regressors=()), []
     parts = [part_of(bare, axis, seed) for seed in seeds]
     needed = (HALF_90 / wish.most) ** 2 - regressor.sd[model.group_of(axis).name] ** -2
-    for cycles in CYCLES:
+    # One sweep is half a cycle.
+    for cycles in (0.5, 1.0, 4.0):
         omega = np.array([2.0 * math.pi * cycles / samples])
         one_swing = column_of(regressor, swung(samples, cycles, 1.0), model.bank_rate_hz)
         power = [
@@ -315,7 +311,7 @@ def _half_interval(
 ) -> float | None:
     """Half of the 90 % interval of ln of a parameter, by the Fisher information; None where the record has none."""
     n = duration_s * rate_hz
-    if n < _FEWEST:
+    if n < 8:
         return None
     try:
         covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))

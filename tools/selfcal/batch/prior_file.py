@@ -23,9 +23,6 @@ from selfcal.batch.population import TWO_GROUPS, Population
 from selfcal.batch.summary import Batch, axes_of, sound_of
 from selfcal.model.file import LOG_NORMAL_SD, Model, Prior, read_yaml
 
-#: Significant digits of a prior.
-DIGITS = 4
-
 
 def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[str, Prior]]:
     """Write the file of `model` with the batch's priors to `path`; return these, by axis and parameter.
@@ -72,7 +69,7 @@ def _trees(priors: Mapping[str, Prior]) -> dict[str, Any]:
 
 
 def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
+    return float(f"{value:.4g}")
 
 
 def _prior(population: Population, batch: Batch) -> Prior:

@@ -27,8 +27,6 @@ DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
-#: Fewest distinct readings with a known lattice.
-LEAST_DISTINCT = 8
 #: Most devices with a page of their own, and the characters that its name lacks.
 MOST_PAGES = 20
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
@@ -138,7 +136,7 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     marks = [name for name in failed if name in READINGS]
     marks += [name for name, check in failed.items() if name in INNOVATIONS and _far(check)]
     lattice = checks.get("lattice", {})
-    known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= LEAST_DISTINCT else {}
+    known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= 8 else {}
     return {"marks": list(dict.fromkeys(marks)), **known}
 
 

@@ -33,19 +33,12 @@ from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
 
-#: Rounds of the search for the shares of the laws.
-SHARE_ROUNDS = 100
 #: Evidence of a unit's law over the batch's law, nats: at most 1 in e^12 by chance.
 OTHER_LAW = 12.0
-#: Largest relative difference of equal lattices.
-LATTICE = 0.05
-#: Least weight of a recording over that of a normal prior, of a quantity or its logarithm, that says anything.
-LEAST_WEIGHT = 0.1
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
 #: Most devices of a line.
 MOST_NAMED = 20
-SECONDS_A_DAY = 86400.0
 #: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0
 
@@ -189,7 +182,7 @@ def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
         laws = list(dict.fromkeys(law for nats in behind for law in nats))
         likelihood = np.exp([[-nats.get(law, math.inf) for law in laws] for nats in behind])
         share = np.ones(len(laws))
-        for _ in range(SHARE_ROUNDS if behind else 0):
+        for _ in range(100 if behind else 0):
             share = likelihood.T @ (1.0 / (likelihood @ share)) * share / len(behind)
         laws_of |= {axis: laws[int(np.argmax(share))]} if behind else {}
     return laws_of
@@ -217,7 +210,7 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
         for device, units in devices.items():
             for unit in units:
                 if "error" not in unit.axes.get(axis, {"error": ""}):
-                    day = None if unit.moment is None else unit.moment.timestamp() / SECONDS_A_DAY
+                    day = None if unit.moment is None else unit.moment.timestamp() / 86400.0
                     known = _of_recording(unit.axes[axis], law, group, regressors)
                     known_of.setdefault(axis, {}).setdefault(device, []).append((day, known))
     return known_of
@@ -269,7 +262,7 @@ def _coefficient(estimate: Mapping[str, Any], sd: float) -> Known | None:
 def _without(known: Known, mean: float, sd: float) -> Known | None:
     """A quantity without its normal prior. None: hardly anything is left."""
     own = known.s**-2 - sd**-2
-    if own < LEAST_WEIGHT * sd**-2:
+    if own < 0.1 * sd**-2:
         return None
     return replace(known, y=(known.y * known.s**-2 - mean * sd**-2) / own, s=own**-0.5)
 
@@ -345,7 +338,7 @@ def _marked(
             for mark in dict.fromkeys(mark for result in axes for mark in result.get("marks", [])):
                 marked.setdefault(mark, []).append((name, f"{axis} {mark}"))
             own = axes[-1].get("lattice", math.nan)
-            if abs(own / step - 1.0) > LATTICE:
+            if abs(own / step - 1.0) > 0.05:
                 unit = axes[-1]["bias_now"]["unit"]
                 yield axis, name, f"{axis} steps of {own:.3g} {unit}, the batch's are {step:.3g}"
             behind = _behind(axes[-1])

@@ -34,10 +34,6 @@ OF_GYRO = (
     *(("scale", name, "1") for name in GYRO),
     *(("misalignment", AXES[row] + AXES[column], "rad") for row, column in gyroscope.PLACES),
 )
-#: A turn that ends within this angle of where it began, and is longer than that angle, tells little, rad.
-SAME_SIDE, TURNED = math.radians(15.0), math.radians(30.0)
-#: Positions that would mend a calibration: at most so many are named.
-MOST_NAMED = 4
 
 
 def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyroscope | str | None) -> dict[str, Any]:
@@ -167,7 +163,7 @@ def _positions(accel: Accelerometer) -> list[str]:
     covariance, named = fit.widened(), []
     inverse = np.linalg.inv(accel.matrix)
     candidates = [np.array(c, float) for c in np.ndindex(3, 3, 3) if 1 <= sum(abs(one - 1) for one in c) <= 2]
-    for _ in range(MOST_NAMED):
+    for _ in range(4):
         best, gained = None, 0.0
         weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
         for c in candidates:
@@ -217,6 +213,7 @@ def _told_of_turns(accel: Accelerometer) -> list[str]:
             continue
         way = float(np.linalg.norm(one.gyro - tumble.rests[one.first].gyro, axis=1).sum()) * one.dt
         apart = math.acos(float(np.clip(u[one.first] @ u[one.first + 1], -1.0, 1.0)))
-        if way > TURNED and apart < SAME_SIDE:
+        # A turn of more than 30 deg that ends within 15 deg of where it began tells little.
+        if way > math.radians(30.0) and apart < math.radians(15.0):
             told.append(f"{where}: {math.degrees(way):.0f} deg, and the same side is up: it tells little")
     return told

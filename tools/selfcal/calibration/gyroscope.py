@@ -37,9 +37,8 @@ SCALE_SD, ANGLE_SD = 0.02, 0.02
 #: The accelerometers' parameters.
 OF_ACCEL = accelerometer.THERMAL.stop
 #: Windows of a turn that show signs and units, s. A gyro's factor may be off by WRONG. Share of the most turned axis,
-#: or of a turn, from which on it is judged. Information below which there is none. Units taken for each other.
+#: or of a turn, from which on it is judged. Information below which there is none.
 WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
-TAKEN = (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
 #: Where the parameters are, behind the accelerometers'.
 BIAS, G, SCALE, ANGLE, THERMAL = (slice(a, b) for a, b in ((0, 3), (3, 12), (12, 15), (15, 21), (22, 25)))
 VERTICAL, LEVEL = 21, 25
@@ -118,7 +117,12 @@ def fault_of(accel: Accelerometer) -> str:
             continue
         words = [f"has the turns about {'xyz'[k]}"] * (at != k) + ["is of the other sign"] * (value < 0.0)
         if not 1.0 - WRONG < abs(value) < 1.0 + WRONG:
-            units = [one for one, size in TAKEN if abs(math.log(abs(value) / size)) < WRONG]
+            # Units that are taken for each other.
+            units = [
+                one
+                for one, size in (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
+                if abs(math.log(abs(value) / size)) < WRONG
+            ]
             words.append(
                 f"reads as if its unit were {units[0]}" if units else f"reads {1 / abs(value):.2g} times the rate"
             )

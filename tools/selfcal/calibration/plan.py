@@ -41,8 +41,6 @@ LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
 #: A hand places the part off by so much, rad, sd of each of two angles. Placements that are drawn, and the share of
 #: them that have what is planned.
 PLACED, DRAWN, SHARE = math.radians(3.0), 10, 0.9
-#: Share of the mean square of a drift that is not known: from the top of three decades to their middle.
-MIDDLE = 0.014
 #: What may be wished: the sensor, the unit here, and where the sensor's parameters are.
 WISHES = {
     "accelerometer bias": ("accelerometer", "m/s^2", accelerometer.BIAS),
@@ -93,7 +91,8 @@ def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
         group = model.group_of(name)
         N = group.priors["N"].median * units.factor(group.unit, UNITS[name])
         own = of_model(model, name, UNITS[name], N)
-        noise[name] = replace(own.scaled(np.full(len(own.terms), MIDDLE)), wide=False)
+        # A drift that is not known: from the top of three decades to their middle.
+        noise[name] = replace(own.scaled(np.full(len(own.terms), 0.014)), wide=False)
     random = np.random.default_rng(count)
     found = [_of_placement(noise, _placed(random, POSITIONS[count]), length_s) for _ in range(DRAWN)]
     return {name: sorted(one[name] for one in found)[math.ceil(SHARE * DRAWN) - 1] for name in WISHES}

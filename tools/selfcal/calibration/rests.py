@@ -29,17 +29,13 @@ UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
 SETTLE_S = PIECE_S
 #: Shortest rest that is advised, s, and what the search for motion takes off both ends of one at most, s.
 REST_S, CUT_S = 10.0, 6.0 * PIECE_S
-#: Shortest rest that counts, s of readings, and rests at most: the fit is dense.
-LEAST_S, MOST = 2.0, 200
+#: Most rests: the fit is dense.
+MOST = 200
 #: Pieces of a rest: their differences show its drift.
 PIECES = 8
 #: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
 #: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
 SHARES, RESTLESS = 10.0 ** (1.5 - np.arange(0.0, 8.0, 0.75)), 10.0
-#: N^2 of a gyro that is not recorded beside others: it weighs nothing.
-UNRECORDED = 1e6
-#: Readings at the extreme in a row that a turn clips at, and steps of the lattice to the readings beside them at least.
-FLAT, STEEP = 3, 3.0
 #: Assumed time between two logs without stamps of one clock, s.
 BETWEEN_S = 60.0
 
@@ -235,7 +231,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     noise = {name: _noise(logs, name, model, long_rest) for name in axes}
     for name in (one for one in GYRO if gyros and one not in axes):
         notes.append(f"{name} is not recorded: it has no number, and turns take three gyros")
-        noise[name] = Noise(UNRECORDED, (), "")
+        noise[name] = Noise(1e6, (), "")  # it weighs nothing
     return Tumble(tuple(rests), tuple(turns), noise, tuple(left_out), tuple(notes))
 
 
@@ -261,7 +257,7 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
         end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in found.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
-        if end - begin >= LEAST_S and behind - first >= PIECES:
+        if end - begin >= 2.0 and behind - first >= PIECES:
             rests.append(slice(first, behind))
     return _Log(recording, begin_s, own, bridged, steps, temp, tuple(rests))
 
@@ -413,6 +409,7 @@ def _flat(part: Array, values: Array, step: float) -> bool:
     for extreme in (float(np.nanmax(values)), float(np.nanmin(values))):
         for first, behind in runs(part == extreme):
             beside = part[[max(first - 1, 0), min(behind, part.size - 1)]]
-            if behind - first >= FLAT and np.abs(beside - extreme).min() > STEEP * step:
+            # A turn clips at three readings in a row, three steps of the lattice from the readings beside them.
+            if behind - first >= 3 and np.abs(beside - extreme).min() > 3.0 * step:
                 return True
     return False

@@ -39,8 +39,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: Its name in the document.
 ID = "hidden_input"
-#: What an axis that the quantity moves must show, nats.
-ACTS = 3.0
 #: Samples of which an error ahead is taken, at least.
 LEAST = 60
 #: Correlation times that the search begins at.
@@ -181,7 +179,8 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
     if net(model.value - null.value, m + 1, LN_LOOKS) < NET_LEAST:
         return None
     # A drift that one axis has beside a walk and a Gauss-Markov process would be taken for the quantity.
-    if (without_each(bins, model) > ACTS).sum() < LEAST_AXES:
+    # An axis that the quantity moves shows 3 nats.
+    if (without_each(bins, model) > 3.0).sum() < LEAST_AXES:
         return None
     gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
     return model if net(gain, m + 1, LN_LOOKS) >= NET_LEAST else None

@@ -39,8 +39,6 @@ LEAST, MOST = 200, 10_000_000
 BEYOND = 100.0
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
 SLOWEST = 0.99
-#: A stated line whose sine stays below this is at half the rate, where the sine is rounding of the frequency.
-ROUNDED_SINE = 0.01
 #: Keys of a regressor that are times of the recording.
 TIMES = ("time_s", "start_s", "end_s")
 
@@ -315,7 +313,8 @@ def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple
         entry = {key: getattr(regressor, key) for key in keys if key != "unit"}
         entry |= {key: entry[key] - recording.start_s for key in TIMES if key in entry}
         for column, row in zip(regressor.columns, values.T, strict=True):
-            if regressor.kind == "periodic" and np.abs(row).max() < ROUNDED_SINE:
+            # At half the rate a line's sine is rounding of the frequency.
+            if regressor.kind == "periodic" and np.abs(row).max() < 0.01:
                 continue
             about = bridged(grid.means(own.clock, np.ascontiguousarray(row))[0]) - regressor.offset
             stated.append(Regressor(column, _cause(regressor, model), about, regressor.unit, entry))

@@ -33,11 +33,8 @@ SCHEMA = "selfcal.response/1"
 #: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
 #: time constants are in memory together.
 SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
-#: Other methods take so many means at least, and so many records that the answer makes. Of 20 records the next one is
-#: within their range with 90 %.
-STEPS_LEAST, RECORDS = 150, 20
-#: Frequencies of the response that is written.
-FREQUENCIES = 60
+#: Records that the answer makes. Of 20 records the next one is within their range with 90 %.
+RECORDS = 20
 #: Several inputs are each looked at beside the others so many times before they are answered.
 ROUNDS = 2
 #: Of so many readings of an input one may be wild on either side.
@@ -331,7 +328,8 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
         return {}
     late_s = abs(float(np.median(pooled.each[0].delay_s)))
     finest = max(state.dt, late_s / 3.0)
-    steps = max(1, min(round(finest / state.dt), state.y.size // STEPS_LEAST))
+    # Other methods take 150 means at least.
+    steps = max(1, min(round(finest / state.dt), state.y.size // 150))
     own = len(chosen.structure.keys)
     parts = chosen.fit.c[-len(chosen.columns) :, None] * chosen.columns
     answers = np.vstack([parts[:own].sum(axis=0), *pooled.answers(drive, RECORDS - 1)])
@@ -363,7 +361,7 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
 
 def _band(pooled: Pooled, n: int, dt: float) -> dict[str, list[float]]:
     """Gain and phase over frequency with their 90 % bands, point by point."""
-    frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, FREQUENCIES)
+    frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, 60)
     G = pooled.of(lambda one: one.at(frequency), pooled.each[0].structure.keys[0])
     gain = np.quantile(np.abs(G), ENDS, axis=0)
     middle = G.mean(axis=0)

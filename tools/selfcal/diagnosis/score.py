@@ -25,12 +25,8 @@ from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
 
-#: Predictions of the bias at most.
-PREDICTIONS = 300
 #: Samples to score, and between the first and the last prediction, at least.
 LEAST = 30
-#: A walk that moves less over the record than so many times what its white noise leaves of the mean is none.
-WALK_LEAST = 3.0
 #: The bias is a mean over so long, s.
 BIAS_S = 60.0
 
@@ -130,7 +126,7 @@ def _cut(one: State, two: State, split: int) -> Cut | None:
 
 def _horizons(dt: float, n: int, split: int) -> dict[float, Rows]:
     """By horizon the samples from which the bias is predicted, where there are enough."""
-    places = np.unique(np.linspace(split, n - 1, PREDICTIONS).astype(np.int64))
+    places = np.unique(np.linspace(split, n - 1, 300).astype(np.int64))
     found = {horizon: places[places <= n - _ahead(horizon, dt) - _window(dt)] for horizon in HORIZONS_S}
     return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= LEAST}
 
@@ -259,7 +255,8 @@ def numbers(state: State) -> dict[str, float]:
     the record shows none. B is that of the model's flicker noise, else by the minimum of the Allan deviation."""
     plain, best = next(one for one in state.fits if one.terms.walk), state.best
     N, K = plain.N_of_color, plain.K
-    if not K * plain.duration_s > WALK_LEAST * N:
+    # Drop a walk that moves less over the record than three times the mean's white noise.
+    if not K * plain.duration_s > 3.0 * N:
         K = 0.0
     if best.terms.flicker:
         return {"N": N, "K": K, "B": best.sigma * math.exp(best.value("ln_flicker"))}

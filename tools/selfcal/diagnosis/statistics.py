@@ -26,26 +26,16 @@ Indices = NDArray[np.int64]
 ENSEMBLE = 48
 #: Of which so many have a statistic at least.
 FEWEST = 8
-#: An ensemble of this size shows the skewness of a statistic too.
-SKEWED = 200
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
 LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}
-#: Steps of the lattice in the noise of a reading up to which even and odd codes are alike, block means of a coarser
-#: lattice included: beyond, the level decides.
-PARITY_MOST = 0.5
-#: Lags at most at which an echo is looked for, lengths of a spectrogram's pieces, and places of a jump at most: longer
-#: records are looked at in blocks.
-ECHOES = 20_000
-SEGMENTS = (32, 128, 512)
-JUMP_PLACES = 20_000
 #: Times at least that the drift forgets in a record in which jumps are looked for.
 TURNS_LEAST = 50.0
 #: Whitened residuals beyond are of a model that does not describe the readings at all, which `SPREAD` states.
 FAR_OFF, SPREAD = 1e9, "innovation_spread"
-#: Samples of the blocks whose sums show slow correlation, the lags in blocks, and blocks at least.
-BLOCKS, SLOW_LAGS, BLOCKS_LEAST = (4, 16, 64, 256), (1, 2, 3, 5), 60
-#: The longest averaging time of an Allan deviation is this part of a record; pairs of means a time, at most.
-LONGEST, PAIRS = 8, 100_000
+#: Samples of the blocks whose sums show slow correlation.
+BLOCKS = (4, 16, 64, 256)
+#: The longest averaging time of an Allan deviation is this part of a record.
+LONGEST = 8
 #: Share of simulated records beyond which the tail of the most striking statistic is fitted.
 TAIL = 1.0 / 3.0
 #: Lags of the correlation, roughly a factor 1.6 apart.
@@ -84,11 +74,12 @@ def all_statistics(w: Array, y: Array | None, lsb: float, jumps: Callable[[Array
         return {SPREAD: math.inf}
     x = (x - x.mean()) / sd
     filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)
-    reach = max(min(1 + max(LAGS), n // 8), min(ECHOES, n // 4))
+    # A longer echo is looked for in blocks.
+    reach = max(min(1 + max(LAGS), n // 8), min(20_000, n // 4))
     power = _power(filled, reach)
     found = dict(_of_memory(filled, present, n, _lagged(power, reach) / math.sqrt(n)))
     clipped = np.clip(filled, -5.0, 5.0)
-    for size in SEGMENTS:
+    for size in (32, 128, 512):
         if filled.size >= 4 * size:
             found[f"spectrogram_of_{size}_samples"] = _uneven(clipped, size)
     if jumps is not None:
@@ -106,10 +97,10 @@ def _of_memory(filled: Array, present: Mask, n: int, lagged: Array) -> Iterator[
             yield f"innovation_lag{lag}", float(lagged[lag])
     yield "innovation_correlation_to_lag_20", _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
     for size in BLOCKS:
-        if n >= BLOCKS_LEAST * size:
+        if n >= 60 * size:
             sums = np.add.reduceat(filled, np.arange(0, filled.size - size + 1, size))
             scale = math.sqrt(sums.size) * float(sums.var())
-            for lag in SLOW_LAGS:
+            for lag in (1, 2, 3, 5):
                 yield f"innovation_lag{lag}_of_{size}_samples", float(sums[lag:] @ sums[:-lag]) / scale
     sizes = 2 ** np.arange(max(1, int(math.log2(n / LONGEST)) + 1))
     for m, deviation in zip(sizes, allan_deviation(np.where(present, filled, np.nan), sizes), strict=True):
@@ -192,7 +183,8 @@ def _of_readings(y: Array, lsb: float) -> dict[str, float]:
     found["longest_repeat"] = math.log(int(np.diff(np.append(changes, codes.size)).max()))
     read = codes[np.isfinite(codes)].astype(np.int64)
     odd = int((read & 1).sum())
-    if PARITY_MOST * float(np.diff(read).std()) > math.sqrt(2.0):
+    # Beyond two steps of the lattice in the noise of a reading its level does not decide.
+    if 0.5 * float(np.diff(read).std()) > math.sqrt(2.0):
         # A code that never comes leaves its readings to others: more pairs are equal than differ by little.
         apart = np.concatenate([np.abs(codes[k:] - codes[:-k]) for k in (1, 2, 3, 4)])
         same, near, next_ = (float((apart == k).sum()) for k in (0.0, 1.0, 2.0))
@@ -209,7 +201,7 @@ def allan_deviation(y: Array, sizes: Indices) -> Array:
     count = np.concatenate([[0.0], np.cumsum(good)])
     found = np.full(len(sizes), np.nan)
     for k, m in enumerate(int(size) for size in sizes):
-        every = max(1, m // 8, y.size // PAIRS)
+        every = max(1, m // 8, y.size // 100_000)
         last = y.size - 2 * m + 1
         first, middle, end = (slice(j * m, last + j * m, every) for j in range(3))
         before, after = count[middle] - count[first], count[end] - count[middle]
@@ -236,7 +228,7 @@ def jumps_of(answer: Array) -> Callable[[Array], float] | None:
     """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger.
     `answer` [n]: residuals to a unit step of the bias at the first sample. None where the drift forgets too seldom for
     a kurtosis. A long record is looked at in blocks."""
-    block = max(1, answer.size // JUMP_PLACES)
+    block = max(1, answer.size // 20_000)
     count = answer.size // block
     g = answer[: count * block].reshape(count, block).sum(axis=1)
     forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
@@ -446,7 +438,7 @@ def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) 
     # Student's t of a new value against the ensemble: its spread is known to 1 / sqrt(2 n).
     z = (values - mean) / (sd * math.sqrt(1.0 + 1.0 / n))
     size = np.abs(z)
-    if n >= SKEWED:
+    if n >= 200:
         # Type III of Pearson: the largest, the kurtosis and sums of squares have a long tail on one side.
         p = _pearson3_above(size, np.sign(z) * third / sd**3)
     else:

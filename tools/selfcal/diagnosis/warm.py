@@ -29,13 +29,11 @@ WIDENED = REACH / math.sqrt(3.0)
 #: From three runs of one ADIS16405 (tests/ACCURACY.md, "Warm start"). Of a coefficient, assumed: the runs have no
 #: temperature.
 RUN_TO_RUN = {"N": 0.05, "K": 0.2, "sigma_m": 0.2, "B": 0.2}
-RUN_TO_RUN_SECOND, RUN_TO_RUN_COEFFICIENT = 0.4, 0.1
+RUN_TO_RUN_COEFFICIENT = 0.1
 #: A law with less than this probability keeps the model's priors: its parameters stand for nothing.
 LEAST_PROBABILITY = 0.01
 #: ln of the odds, at most, that a regressor is in use or is not: 99 to 1. The next record may say otherwise.
 MOST_LN_ODDS = math.log(99.0)
-#: Bytes of a diagnosis.
-MOST_BYTES = 1 << 25
 
 
 @dataclass(frozen=True)
@@ -116,7 +114,7 @@ class _Reader:
         from selfcal.diagnosis.document import SCHEMA  # takes long to import
 
         try:
-            text = read_text(self.path, MOST_BYTES, "not a diagnosis")
+            text = read_text(self.path, (1 << 25), "not a diagnosis")
         except OSError as error:
             raise UserError(f"{self.path}: cannot read the diagnosis: {error.strerror}") from error
         with reading(self.path, "not a diagnosis (the JSON that `selfcal diagnose --json` writes)"):
@@ -219,7 +217,7 @@ class _Reader:
         prior = self.model.group_of(axis).priors[parameter]
         if not math.log(prior.min) <= middle <= math.log(prior.max):
             raise self.fail(f"{where}.median", f"lies outside the model's prior, {prior.min:g} to {prior.max:g}")
-        half = REACH * math.hypot((q95 - q05) / (2.0 * HALF_90), RUN_TO_RUN.get(parameter, RUN_TO_RUN_SECOND))
+        half = REACH * math.hypot((q95 - q05) / (2.0 * HALF_90), RUN_TO_RUN.get(parameter, 0.4))
         return middle - half, middle + half
 
     def regressors(

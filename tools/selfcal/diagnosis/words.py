@@ -94,9 +94,8 @@ LATER = (
 )
 #: Half of a coefficient's 90 % interval over it, below which it is applied and not recorded again.
 APPLIED = 0.05
-#: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g). A
-#: coefficient so many times larger is no leak of that kind.
-G_SENSITIVITY, IMPLAUSIBLE = 0.02, 50.0
+#: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g).
+G_SENSITIVITY = 0.02
 
 
 def rounded(value: float, half: float) -> str:
@@ -330,7 +329,7 @@ def inflation_sentence(inflation: Mapping[str, float]) -> str:
 def plausibility(coefficient: float) -> str:
     """How a gyroscope's coefficient on an accelerometer, deg/s per m/s^2, compares with parts; empty if plausible."""
     times = abs(coefficient) / G_SENSITIVITY
-    if times < IMPLAUSIBLE:
+    if times < 50.0:
         return ""
     return (
         f"That is {times:.2g} times the largest sensitivity to acceleration of any part ({G_SENSITIVITY:g} deg/s per "

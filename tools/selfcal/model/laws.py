@@ -195,8 +195,7 @@ NAMED: dict[str, Law] = {
     "moving_average": Law((Term("walk"),), coloured_noise=True),
     "walk_and_markov": Law((Term("walk"), Term("markov", bandwidth=math.nan, stated=True, by_ratio=True))),
 }
-#: Those that are sums of several terms, and the others, which are the paper's.
-SUMS = tuple(name for name, law in NAMED.items() if law.is_sum)
+#: Those of one term, which are the paper's.
 PLAIN = tuple(name for name, law in NAMED.items() if not law.is_sum)
 
 

@@ -16,8 +16,6 @@ from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import KIND, Source, curved, made, played, source_of, variance_of
 
-#: End of a pulse that is over before the first row, s.
-OVER_S = 1e-6
 #: A subset of the regressors.
 Choice = tuple[Regressor, ...]
 
@@ -67,7 +65,7 @@ def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regresso
         if one.kind == "step":
             return replace(one, time_s=max(0.0, one.time_s - start_s))
         if one.kind == "pulse":
-            return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(OVER_S, one.end_s - start_s))
+            return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(1e-6, one.end_s - start_s))
         return one
 
     return tuple(moved(one) for one in regressors)

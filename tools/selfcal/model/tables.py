@@ -21,8 +21,8 @@ from selfcal.model.regressors import channels_of, sources_of
 
 #: Samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
-#: Bank intervals of a stated correlation time, at most: ALPHA_DT_MAX in lib/bank_inside.h, TIME_MAX in bank_states.c.
-ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
+#: Bank intervals of a stated correlation time, at most: TIME_MAX in bank_states.c.
+TIME_MAX = 1e6
 
 
 class PriorLaw(IntEnum):
@@ -318,7 +318,8 @@ def _check_times(model: Model, dt: float) -> None:
         for term in law.terms:
             if term.stated and term.kind == "markov":
                 stated = "correlation_time_s" if name in NAMED else f"{where}correlation_time_s"
-                check(stated, 1.0 / term.bandwidth, dt / ALPHA_DT_MAX, TIME_MAX * dt)
+                # 6.9 is ALPHA_DT_MAX in lib/bank_inside.h.
+                check(stated, 1.0 / term.bandwidth, dt / 6.9, TIME_MAX * dt)
 
 
 def priors_of(group: Group, law: str) -> tuple[PriorRow, ...]:

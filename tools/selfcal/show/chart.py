@@ -21,8 +21,6 @@ WIDTH, HEIGHT = 340, 220
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Size of a picture of strips, room for their names, and the height of each.
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
-#: Share of a strip's points that may lie beyond each of its edges.
-USUAL = 0.02
 #: Points of a curve at most.
 POINTS = 400
 #: Rows of a table behind a picture at most.
@@ -273,7 +271,7 @@ def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
 def _usual(panel: Panel) -> tuple[float, float]:
     """Limits that all but a few points of a panel keep: a shock must not hide a step."""
     values = [curve.y for curve in panel.curves] + [edge for band in panel.bands for edge in (band.low, band.high)]
-    usual = [np.nanquantile(ys, (USUAL, 1.0 - USUAL)) for ys in values if np.isfinite(ys).any()]
+    usual = [np.nanquantile(ys, (0.02, 0.98)) for ys in values if np.isfinite(ys).any()]
     return _limits(usual, False, 0.06)
 
 

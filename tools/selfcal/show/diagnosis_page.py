@@ -28,8 +28,8 @@ from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outsi
 from selfcal.show.findings import before_after, noisier_of
 from selfcal.show.template import number, render, spaced
 
-#: Bytes of the page at most, and of the line in place of a picture.
-SIZE_MOST, LINE = 995_000, 140
+#: Bytes of the line in place of a picture.
+LINE = 140
 #: Name of the Allan figure, and the share of its points outside the band from which on the curve leaves it. Each point
 #: of a fitting record is outside the range of 20 with a probability of 2/21, neighbours together: 1 of 400 fitting
 #: records had more than this share outside, 9 more than a quarter.
@@ -92,7 +92,8 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
     }
     functions = {"id": _id, "whole": _whole, "gained": _gained, "factor": _factor, "outside": _outside}
     text = render("diagnosis.html", **values, **functions)
-    if _leave_out([picture for axis in axes for picture in axis.pictures], len(_bytes(text)) - SIZE_MOST):
+    # A page has 995 000 bytes at most.
+    if _leave_out([picture for axis in axes for picture in axis.pictures], len(_bytes(text)) - 995_000):
         text = render("diagnosis.html", **values, **functions)
     return str(text)
 

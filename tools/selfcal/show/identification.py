@@ -25,8 +25,6 @@ from selfcal.readings.rest import MOST_LISTED
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 
-#: Least probability of a law that is named if the grid is too coarse for it.
-TOLD_OF = 0.01
 #: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
 #: Largest distance of jumps of one event, s.
@@ -245,7 +243,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         coarse = [
             law
             for law, parameters in axis["parameters"].items()
-            if axis["hypotheses"][law] >= TOLD_OF and any(e["off_grid"] for e in parameters.values())
+            if axis["hypotheses"][law] >= 0.01 and any(e["off_grid"] for e in parameters.values())
         ]
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")

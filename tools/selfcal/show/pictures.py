@@ -24,10 +24,6 @@ from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope
 
 #: Simulated records of a band.
 RECORDS = 20
-#: Averaging times a decade, and frequencies a decade, of the overview.
-TAUS_A_DECADE, BINS_A_DECADE = 8, 24
-#: Standard deviations within which 99 % of a normal deviate lie.
-TWO_SIDED_99 = 2.576
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
 
@@ -160,7 +156,7 @@ def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> 
 def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
     n = before.y.size
     most = max(2, n // 6)
-    count = max(2, round(TAUS_A_DECADE * math.log10(most)) + 1)
+    count = max(2, round(8 * math.log10(most)) + 1)
     sizes = np.unique(np.rint(np.logspace(0.0, math.log10(most), count)).astype(int))
 
     def summary(y: Array, w: Array) -> Array:
@@ -193,7 +189,7 @@ def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared
     frequency = rfftfreq(n, dt)
     first = min(3, frequency.size - 2)
     decades = math.log10(frequency[-1] / frequency[first])
-    wanted = np.logspace(0.0, decades, max(4, round(BINS_A_DECADE * decades))) * frequency[first]
+    wanted = np.logspace(0.0, decades, max(4, round(24 * decades))) * frequency[first]
     edges = np.unique(np.searchsorted(frequency, wanted))
     edges = edges[edges < frequency.size - 1]
     size = np.diff(np.append(edges, frequency.size))
@@ -412,7 +408,7 @@ def _together(finding: Finding) -> Iterator[Figure]:
                 "frequency, Hz",
                 "correlation",
                 [Curve("measured", hz, r, "dots")],
-                [Band("99 % of axes that share nothing", hz, -TWO_SIDED_99 * sd, TWO_SIDED_99 * sd)],
+                [Band("99 % of axes that share nothing", hz, -2.576 * sd, 2.576 * sd)],
                 log_x=True,
             )
         ],

@@ -48,10 +48,8 @@ SAMPLES = (150, 600)
 MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
-#: Ratio of an interval's ends that says nothing: wider than any prior here.
-LOOSE = 1e4
-#: Columns of a terminal that the table takes with the intervals, and without.
-WHOLE_WIDTH, BRIEF_WIDTH = 190, 110
+#: Columns of a terminal that the table takes with the intervals; without them it takes 110.
+WHOLE_WIDTH = 190
 
 
 def of_recording(
@@ -253,7 +251,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table an axis: a row for each method and law."""
     console = console_of(to_stderr=to_stderr)
     brief = console.is_terminal and console.width < WHOLE_WIDTH
-    console.width = max(console.width, BRIEF_WIDTH if brief else WHOLE_WIDTH)
+    console.width = max(console.width, 110 if brief else WHOLE_WIDTH)
     for name, axis in document["axes"].items():
         console.print(_table(name, axis, brief=brief))
         if axis["samples_left_out"]:
@@ -383,6 +381,6 @@ def _shown(value: Mapping[str, Any] | None, *, inverse: bool = False, brief: boo
         middle, low, high = 1.0 / middle, 1.0 / high, 1.0 / low
     if brief or not (math.isfinite(low) and math.isfinite(high)):
         return f"{middle:.3g}"
-    if not (low > 0.0 and high < LOOSE * low):
+    if not (low > 0.0 and high < 1e4 * low):
         return f"{middle:.3g} (undetermined)"
     return f"{middle:.3g} \\[{low:.3g}, {high:.3g}]"

@@ -20,8 +20,8 @@ from selfcal.model.laws import KINDS
 from selfcal.model.tables import AxisTable, PriorRow, Tables, gate_table
 from selfcal.wire.frames import AXES, carries
 
-#: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal_parts.h, SIGMA_BITS in bank_kernel_fixed.c.
-SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
+#: SELFCAL_SAMPLE_MAX in selfcal_parts.h.
+SAMPLE_MAX = 2.0**40
 
 
 #: Nodes of the smallest grid, for a model without one.
@@ -204,7 +204,8 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
     span = 2.0 * min(axis.range or SAMPLE_MAX, SAMPLE_MAX)
     least, most = (math.exp(limits[0]) / math.sqrt(dt_s) for limits in (axis.ln_min, axis.ln_max))
     sigma = max(least, min(most, span / math.sqrt(2.0)))
-    return max(math.ceil(math.log2(span / FIXED_LIMIT)), math.floor(math.log2(sigma) + 1e-5) - FIXED_SIGMA_BITS)
+    # SELFCAL_FIXED_LIMIT in selfcal_parts.h, and SIGMA_BITS in bank_kernel_fixed.c.
+    return max(math.ceil(math.log2(span / (3 * 2**25))), math.floor(math.log2(sigma) + 1e-5) - 20)
 
 
 def _f(value: float) -> str:

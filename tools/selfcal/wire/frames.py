@@ -37,14 +37,10 @@ STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
-#: Largest evidence difference of its item, nats: that or more, or no evidence at all.
-LEAST_EVIDENCE = -(2**31) * 0.001
 
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward and backward are alike
-BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
 FOREIGN_STATUSES = 2  # whole statuses in a row with another version, of a module that stated this version before
-TWINS = 3  # statuses that only two modules can have sent; a restart within a status looks like it
 RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is no stranger's from then
 
 
@@ -218,7 +214,8 @@ class AxisReport:
 
         def evidence(k: int) -> float:
             difference = v[f"h{k}_ln_evidence_diff"]
-            return best + (difference if difference > LEAST_EVIDENCE else -math.inf)
+            # The item's largest difference, nats, says that there is no evidence at all.
+            return best + (difference if difference > -(2**31) * 0.001 else -math.inf)
 
         def parameters(k: int) -> dict[str, Estimate]:
             there = [place for place in PLACE_NAMES if f"h{k}_{place}_mean" in v]
@@ -408,7 +405,8 @@ class Decoder:
     @property
     def twins(self) -> str:
         """What is wrong if two modules send as this node; empty if they do not. Their reports are of neither."""
-        return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= TWINS else ""
+        # A restart within a status looks like one.
+        return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= 3 else ""
 
     @property
     def surely_foreign(self) -> bool:
@@ -444,7 +442,8 @@ class Decoder:
         self.statistics.received += 1
         self.statistics.lost = self._sent - self.statistics.received
         if "time_ms" in values:
-            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else BACK_MS)
+            # A report may have been begun, and a corrected sample read, 5 min before what was sent before it.
+            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else 300_000)
         else:
             told_ms = self._begun(second)
         if name == STATUS:
@@ -815,12 +814,6 @@ class Link:
         self.close()
 
 
-#: Timeout of a write to a serial line, s: on a pseudo-terminal that nobody reads it would never end.
-WRITE_S = 1.0
-#: Frames that wait in a UDP socket while the host is busy: a report of six axes is 322, and a datagram takes 768 bytes.
-UDP_BUFFER = 4 << 20
-
-
 def open_bus(interface: str, channel: str, **options: Any) -> Link:
     """Open a python-can interface, a serial line for this process alone: of two readers each would lose what the other
     takes. Raises UserError when that fails."""
@@ -848,7 +841,8 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
         raise UserError(f"{interface} {channel}: {_reason(interface, channel, error)}") from error
     if isinstance(bus, slcanBus):
         _leave_out_line_feeds(bus.serialPortOrig)
-        bus.serialPortOrig.write_timeout = WRITE_S
+        # A write to a pseudo-terminal that nobody reads would never end.
+        bus.serialPortOrig.write_timeout = 1.0
         try:
             bus.serialPortOrig.exclusive = True
         except OSError as error:
@@ -859,7 +853,8 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
         import socket
 
         with socket.socket(fileno=os.dup(bus.fileno())) as same:
-            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER)
+            # Frames wait here while the host is busy: a report of six axes is 322 datagrams of 768 bytes.
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, (4 << 20))
     return bus
 
 

@@ -48,15 +48,13 @@ HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 BAR, SPARK = (4, 30), (8, 40)
 #: Indentation of an axis's further lines.
 INDENT = 2
-#: Most lines of the status.
-STATUS_LINES = 2
-#: Silence after which contact is lost: s, and times the longest interval so far.
-SILENT_S, INTERVALS = 3.0, 3.0
+#: Silence after which contact is lost, s, or three times the longest interval so far.
+SILENT_S = 3.0
 #: Silence of a module before its second status, s: it sends a status every 10 s (STATUS_MS in port/app/app_frames.c),
 #: and a save takes up to 2 s.
 FIRST_S = 12.0
-#: Most characters that wait for a terminal, and the time for it to read them at the end, s.
-MOST_WAITING, DRAIN_S = 1 << 16, 1.0
+#: Most characters that wait for a terminal, which has 1 s to read them at the end.
+MOST_WAITING = 1 << 16
 BLOCKS = "▁▂▃▄▅▆▇█"
 #: Colours of a module's judgement of its model.
 ADEQUACY = {"inadequate": "red", "adequate": "green"}
@@ -124,7 +122,7 @@ def patient() -> Iterator[None]:
     try:
         yield
     finally:
-        if own.drain(DRAIN_S):
+        if own.drain(1.0):
             sys.stderr = before
 
 
@@ -169,7 +167,7 @@ class Contact:
     @property
     def lost(self) -> bool:
         """The module is not heard any more, or never was."""
-        return self.silent_s > max(FIRST_S if self.waiting else SILENT_S, INTERVALS * self._longest)
+        return self.silent_s > max(FIRST_S if self.waiting else SILENT_S, 3.0 * self._longest)
 
     @property
     def waiting(self) -> bool:
@@ -418,7 +416,7 @@ class View:
                 text = status_text(name, value)
                 trouble = TROUBLE.get(name) == text or name in ("sensor_fault", "axes_retired", "state_refused")
                 said.insert(0 if trouble else len(said), Text(f"{name} {text}", "red" if trouble else "dim"))
-        return _flow(said, width, 3)[:STATUS_LINES]
+        return _flow(said, width, 3)[:2]
 
     def _blocks(
         self,

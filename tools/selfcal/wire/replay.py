@@ -51,10 +51,7 @@ MAGIC = b"SELFCAL2"
 #: Channels of every sample apart from the model's (port/port.h); not a number if the recording lacks them.
 SIDE = tuple(SIDE_CHANNELS.values())
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
-GONE_S = 2.0  # s without a frame after which none will come from firmware that has ended
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
-#: Longest silence of an emulated module, s: its reports are slow, and so may the machine be.
-EMULATED_TIMEOUT_S = 600.0
 #: Sources of a firmware, and the environment variables that its `make` file reads.
 SOURCES = (".c", ".h", ".ld", ".mk")
 #: Debian packages of the programs that build and run it.
@@ -87,7 +84,7 @@ class Target:
     @property
     def patience_s(self) -> float:
         """s that it may be silent."""
-        return EMULATED_TIMEOUT_S if self.board else TIMEOUT_S
+        return 600.0 if self.board else TIMEOUT_S
 
 
 TARGETS = {
@@ -429,7 +426,8 @@ def _watch(
             if frame is None:
                 silent_s = time.monotonic() - heard
                 ended = module is not None and module.poll() is not None
-                if link.closed or silent_s > patience_s or (ended and silent_s > GONE_S):
+                # None will come from firmware that has ended 2 s ago.
+                if link.closed or silent_s > patience_s or (ended and silent_s > 2.0):
                     break
                 continue
             heard = time.monotonic()

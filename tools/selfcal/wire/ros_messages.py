@@ -12,8 +12,6 @@ from typing import Any
 
 from selfcal.base import units
 
-#: Levels of a status, as diagnostic_msgs has them.
-OK, WARN, STALE = 0, 1, 3
 #: Fields of an Imu by the letter of an axis, and their unit.
 _SENSORS = {"g": ("angular_velocity", "rad/s"), "a": ("linear_acceleration", "m/s^2")}
 
@@ -28,11 +26,12 @@ def diagnostics(report: Mapping[str, Any], at_s: float) -> dict[str, Any]:
     """The DiagnosticArray of one report's content (`streams.content`): a status of its axis."""
     judged, laws = report.get("adequacy", {}), report["laws"]
     likeliest = _likeliest(report)
-    level, told = OK, "calibrated"
+    # Levels as diagnostic_msgs has them: 0 OK, 1 WARN, 3 STALE.
+    level, told = 0, "calibrated"
     if not report["complete"] or likeliest is None:
-        level, told = STALE, "the report is not complete"
+        level, told = 3, "the report is not complete"
     elif judged.get("state") == "inadequate":
-        level, told = WARN, f"not adequate: {judged['suspicion']}"
+        level, told = 1, f"not adequate: {judged['suspicion']}"
     elif judged.get("state") == "not_judged":
         told = "calibrated, not judged"
     values = {"unit": report["unit"], "law": likeliest or "", "bias": _pair(report["bias"])}

@@ -34,10 +34,6 @@ from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
 _LEAST_S, _S_PER_BYTE = 60.0, 4e-6
-#: Bytes of memory of a reading: for any file, as libraries are large; a byte; and at most.
-_LEAST_BYTES, _PER_BYTE, _MOST_BYTES = 3 << 30, 40, 16 << 30
-#: Of prctl(2): the signal that a process gets when its parent ends.
-_PR_SET_PDEATHSIG = 1
 #: What comes before the JSON: its size.
 _SIZE = struct.Struct("=Q")
 
@@ -138,7 +134,8 @@ def _spawned(one: Format, path: Path, hints: Hints, answer: int, folder: str) ->
 def answer(module: str, path: Path, hints: Hints, to: int) -> None:
     """In the child: read, within the bounds, and write the answer to the descriptor `to`."""
     seconds = int(_seconds(path)) + 1
-    most = min(_MOST_BYTES, _LEAST_BYTES + _PER_BYTE * _bytes(path))
+    # Libraries are large: 3 GB for any file, 16 GB at most.
+    most = min(16 << 30, (3 << 30) + 40 * _bytes(path))
     _bound(resource.RLIMIT_AS, most, most)
     _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
     # What it unpacks into files: each part of a folder, but for its index, into one.
@@ -191,7 +188,8 @@ def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[st
 def main() -> None:
     """`python -m selfcal.logs.loaders.child MODULE PATH HINTS PARENT`: answers on stdout, and ends with its parent."""
     module, path, hints, parent = sys.argv[1:]
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    # PR_SET_PDEATHSIG of prctl(2): the signal that a process gets when its parent ends.
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
     if os.getppid() != int(parent):  # it has ended before
         return
     to = os.dup(1)

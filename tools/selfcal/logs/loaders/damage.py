@@ -13,8 +13,6 @@ from pathlib import Path
 
 #: What is sliced and looked at by place.
 Bytes = mmap.mmap | bytes
-#: Messages in a row that make sure of a place in a form without checksums.
-_IN_A_ROW = 3
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,8 @@ def walk(
     size = len(data)
 
     def begins(place: int) -> bool:
-        for _ in range(1 if checked else _IN_A_ROW):
+        # Without checksums three messages in a row make sure of a place.
+        for _ in range(1 if checked else 3):
             place = end_of(place)
             if place in (0, size):
                 break

@@ -40,7 +40,6 @@ _TLOG = {
     "SCALED_IMU3": _SCALED,
     "HIGHRES_IMU": ("time_usec", "us", "rad/s", "m/s^2"),
 }
-_ARDUPILOT = 3
 #: How a message of a DataFlash log begins, and the kind that describes the others; the first byte of MAVLink's frames.
 _HEAD, _FMT = b"\xa3\x95", 0x80
 _MAVLINK_2 = 0xFD
@@ -204,7 +203,8 @@ def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str
             continue
         vehicle = message.get_srcSystem()
         if kind == "HEARTBEAT":
-            if message.autopilot == _ARDUPILOT:
+            # Its RAW_IMU is in counts but for ArduPilot, number 3.
+            if message.autopilot == 3:
                 ardupilot.add(vehicle)
             continue
         stamp, unit, gyro, accel = _TLOG[kind]

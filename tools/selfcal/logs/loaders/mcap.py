@@ -29,9 +29,9 @@ from selfcal.logs.loaders.table import Hints, Table, of_arrays
 #: Fields whose message is a stamp: seconds and nanoseconds by these names.
 _STAMPS = ("header/stamp", "timestamp", "stamp", "time")
 _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs", "nanos")
-#: The first and the last bytes of a file; a record's kind and length; kinds of records; bytes of the last one.
+#: The first and the last bytes of a file; a record's kind and length; the kind of a chunk.
 _MAGIC, _HEAD = b"\x89MCAP0\r\n", struct.Struct("<BQ")
-_MESSAGE, _CHUNK, _FOOTER_BYTES = 5, b"\x06", _HEAD.size + 20
+_CHUNK = b"\x06"
 #: Depth of a message's fields.
 _DEEPEST = 6
 #: What of a message's fields is a sensor's by convention.
@@ -184,7 +184,7 @@ def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
     if not (end := _end(data, at)):
         raise ValueError("no record")
     stream, kind = ReadDataStream(BytesIO(data[at + _HEAD.size : end])), data[at]
-    if kind == _MESSAGE:
+    if kind == 5:  # a message
         return end, [of.Message.read(stream, end - at - _HEAD.size)], False
     record = kinds[kind].read(stream) if kind in kinds else None
     if isinstance(record, of.Chunk):
@@ -217,7 +217,7 @@ def _next(data: Bytes, at: int) -> int:
 def _summary(data: Bytes) -> list[Any]:
     """The records of the summary, none where it is absent or damaged."""
     found: list[Any] = []
-    at = len(data) - _FOOTER_BYTES - len(_MAGIC)
+    at = len(data) - (_HEAD.size + 20) - len(_MAGIC)  # of the footer
     with suppress(Exception):
         end, (footer,), _ = _records(data, at)
         start = footer.summary_start
@@ -231,17 +231,12 @@ def _summary(data: Bytes) -> list[Any]:
 def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
     """What makes a mapping of a message in JSON or protobuf."""
     if channel.message_encoding == "json":
-        return _json
+        return lambda data: value if isinstance(value := json.loads(data), dict) else {}
     from mcap_protobuf.decoder import DecoderFactory
 
     decode = DecoderFactory().decoder_for("protobuf", schema)
     assert decode is not None
     return lambda data: _messages(decode(data))
-
-
-def _json(data: bytes) -> Mapping[str, Any]:
-    value = json.loads(data)
-    return value if isinstance(value, dict) else {}
 
 
 def _messages(message: Any) -> dict[str, Any]:

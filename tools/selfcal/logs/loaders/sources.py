@@ -12,8 +12,6 @@ from typing import Any
 
 from selfcal.base.errors import UserError, printable, short
 
-#: Times the rate of another sensor with the same axes from which on that other is a thinned out one.
-_OFTENER = 5.0
 #: Sources that a message lists.
 _MOST_LISTED = 30
 
@@ -91,7 +89,7 @@ def _by_rate(
         others = [other for other in kept if axes[other] & axes[source]]
         if not others:
             kept.append(source)
-        elif all(rate[other] >= _OFTENER * rate[source] for other in others):
+        elif all(rate[other] >= 5.0 * rate[source] for other in others):
             dropped.append(source)
         else:
             raise UserError(f"{path}: several sensors: {_listed(sources, axes, sensors)}")

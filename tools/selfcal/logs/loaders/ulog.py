@@ -19,8 +19,8 @@ from selfcal.logs.loaders.damage import Bytes, mapped, sifted
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 Columns = dict[str, NDArray[Any]]
-#: Bytes before the first message, the kinds of messages, and bytes of the types of fields.
-_HEADER, _KINDS = 16, b"BFIMPQARDLCSO"
+#: Kinds of messages, and bytes of the types of fields.
+_KINDS = b"BFIMPQARDLCSO"
 _TYPES = {b"float": 4, b"double": 8, b"bool": 1, b"char": 1} | {
     f"{sign}int{bits}_t".encode(): bits // 8 for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
@@ -40,7 +40,8 @@ def read(path: Path, _: Hints) -> list[Table]:
     from pyulog import ULog
 
     with mapped(path) as data:
-        damaged, sound = sifted(data, _HEADER, _ends(data))
+        # A header of 16 bytes goes before the first message.
+        damaged, sound = sifted(data, 16, _ends(data))
     with path.open("rb") if sound is None else BytesIO(sound) as stream:
         log = ULog(stream, [*_SOURCES, "sensor_selection"])
     found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
