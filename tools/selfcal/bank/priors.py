@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from selfcal.bank.result import AxisResult
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import Recording, as_float
-from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Gate, Group, Model, Prior
+from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.readings.rest import BIAS_SD, rest_of
 
@@ -77,7 +77,12 @@ def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model
             if moved != group.priors:
                 own[name] = moved
                 noise[group.name] = max(noise.get(group.name, 0.0), GATE_NOISE * seen.N)
-    return replace(_with_own(model, own), gate=_gate(model.gate, noise)) if own else model
+    if not own:
+        return model
+    gate = model.gate
+    if gate is not None:  # its noise is a bound: a noisier axis raises it
+        gate = replace(gate, N={name: max(N, rounded(noise.get(name, 0.0))) for name, N in gate.N.items()})
+    return replace(_with_own(model, own), gate=gate)
 
 
 def _with_own(model: Model, own: Mapping[str, Mapping[str, Prior]]) -> Model:
@@ -115,13 +120,6 @@ def prior_tree(prior: Prior) -> dict[str, Any]:
     if prior.law == "log_normal":
         return {"law": prior.law, "median": prior.median, "sd": prior.sd}
     return {"law": prior.law, "min": prior.min, "max": prior.max}
-
-
-def _gate(gate: Gate | None, noise: Mapping[str, float]) -> Gate | None:
-    """The gate's noise is a bound: a noisier axis raises it."""
-    if gate is None:
-        return None
-    return replace(gate, N={name: max(N, rounded(noise.get(name, 0.0))) for name, N in gate.N.items()})
 
 
 def at_rest(recording: Recording, name: str, model: Model) -> Seen | None:
@@ -249,7 +247,8 @@ def moved_along(
     The laws are those of one drift term, without regressors, on the means of LEANS_INTERVALS intervals at most."""
     recording = recording.along(name)
     length_s = recording.duration_s
-    least = _unseen(seen, length_s)
+    size = UNSEEN * seen.N / math.sqrt(length_s)
+    least = {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
     if not _may_lean(priors, seen, least):
         return priors
     from selfcal.bank.library import Bank
@@ -312,12 +311,6 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
         for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )
-
-
-def _unseen(seen: Seen, length_s: float) -> dict[str, float]:
-    """Smallest visible value of each parameter of a drift."""
-    size = UNSEEN * seen.N / math.sqrt(length_s)
-    return {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
 
 
 def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float]) -> bool:

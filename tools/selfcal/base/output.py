@@ -187,11 +187,16 @@ def console_of(*, to_stderr: bool = False, fits: bool = False) -> Console:
     return console
 
 
-def print_lines(lines: Iterable[str], *, to_stderr: bool = False) -> None:
-    """Print texts from outside, a line each: whole, and no sign in them is obeyed."""
+def print_line(console: Console, text: str, style: str | None = None) -> None:
+    """Print a text from outside: whole, and no sign in it is obeyed."""
+    console.print(printable(text), style=style, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_lines(lines: Iterable[str], *, to_stderr: bool) -> None:
+    """Print texts from outside, a line each."""
     console = console_of(to_stderr=to_stderr)
     for line in lines:
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+        print_line(console, line)
 
 
 def table_of(headings: Iterable[str], title: str | None = None, *, wraps: bool = False, **look: Any) -> Table:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -41,7 +40,22 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
         raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
     for group in model.groups:
         own = tree["groups"][group.name].get("own_priors") or {}
-        own |= {axis: {**own.get(axis, {}), **_trees(priors[axis])} for axis in group.axes if axis in priors}
+        own |= {
+            axis: {
+                **own.get(axis, {}),
+                **(
+                    {
+                        name: {
+                            key: value if isinstance(value, str) else _rounded(value)
+                            for key, value in prior_tree(prior).items()
+                        }
+                        for name, prior in priors[axis].items()
+                    }
+                ),
+            }
+            for axis in group.axes
+            if axis in priors
+        }
         if own:
             tree["groups"][group.name]["own_priors"] = own
     for law, odds in _odds(model, batch).items():
@@ -59,13 +73,6 @@ def lines_of(priors: Mapping[str, Mapping[str, Prior]], model: Model) -> Iterato
         for name, prior in own.items():
             unit = units.parameter_unit(name, model.group_of(axis).unit)
             yield f"prior of a new unit: {axis}.{name}: {prior.median:.4g} {unit}, sd of ln {prior.sd:.2g}"
-
-
-def _trees(priors: Mapping[str, Prior]) -> dict[str, Any]:
-    return {
-        name: {key: value if isinstance(value, str) else _rounded(value) for key, value in prior_tree(prior).items()}
-        for name, prior in priors.items()
-    }
 
 
 def _rounded(value: float) -> float:

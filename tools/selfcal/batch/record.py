@@ -134,14 +134,14 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     checks = axis["checks"]
     failed = {name: check for name, check in checks.items() if not check["passed"]}
     marks = [name for name in failed if name in READINGS]
-    marks += [name for name, check in failed.items() if name in INNOVATIONS and _far(check)]
+    marks += [
+        name
+        for name, check in failed.items()
+        if name in INNOVATIONS and abs(float(check["value"])) > FAR * float(check["limit"]) / CHECK_LIMIT
+    ]
     lattice = checks.get("lattice", {})
     known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= 8 else {}
     return {"marks": list(dict.fromkeys(marks)), **known}
-
-
-def _far(check: Mapping[str, Any]) -> bool:
-    return abs(float(check["value"])) > FAR * float(check["limit"]) / CHECK_LIMIT
 
 
 class ByContent:
@@ -160,10 +160,8 @@ class ByContent:
 
     def place(self, job: Job) -> Path:
         """The file of a recording."""
-        return (
-            self.folder
-            / f"{hashlib.sha256(f'{job[1]} {self.settings}'.encode('utf-8', 'surrogateescape')).hexdigest()}.json"
-        )
+        named = hashlib.sha256(f"{job[1]} {self.settings}".encode("utf-8", "surrogateescape"))
+        return self.folder / f"{named.hexdigest()}.json"
 
     def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
         """The row of a recording; None without a row, or with a damaged one."""

@@ -138,13 +138,10 @@ class _Remaining(Doing):
         self.left -= self.weights[k]
         self.jobs += self.sizes[k]
         rest_s = (time.monotonic() - self.began) * self.left / self.worked if self.worked else 0.0
-        said = f"{self.jobs} of {sum(self.sizes)}, {_spoken(rest_s)} more"
+        left = f"{rest_s:.0f} s" if rest_s < 120.0 else f"{rest_s / 60.0:.0f} min"
+        said = f"{self.jobs} of {sum(self.sizes)}, {left} more"
         self.progress.update(self.task, advance=self.weights[k], said=said)
         self.tell(said)
-
-
-def _spoken(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
 
 
 def _piece(function: Callable[[Job], list[Row]], work: Work) -> tuple[int, list[Row]]:

@@ -78,7 +78,11 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     left_out: dict[tuple[str, str], dict[str, None]] = {}
     for unit in units:
         if unit.error is None:
-            own = _in_group_units(unit, model)
+            axes = {
+                name: _converted(axis, model.group_of(name).unit, offered(model, name))
+                for name, axis in unit.axes.items()
+            }
+            own = Unit(unit.source, {**unit.record, "axes": axes})
             devices.setdefault(unit.device, []).append(own)
             for axis, reason in own.errors.items():
                 if axis not in unit.errors:
@@ -105,13 +109,8 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     return Batch(devices, fitted, dict(sorted(unlike.items())), drifts, shared, others, unidentified)
 
 
-def _in_group_units(unit: Unit, model: Model) -> Unit:
-    """The recording with each axis in the unit of its group. An axis of another kind has an `error` instead."""
-    axes = {name: _converted(axis, model.group_of(name).unit, offered(model, name)) for name, axis in unit.axes.items()}
-    return Unit(unit.source, {**unit.record, "axes": axes})
-
-
 def _converted(axis: Mapping[str, Any], to: str, regressors: Sequence[Regressor]) -> Mapping[str, Any]:
+    """A result in the unit `to`. An axis of another kind has an `error` instead."""
     if "error" in axis or axis["bias_now"]["unit"] == to:
         return axis
     bias = axis["bias_now"]
@@ -472,7 +471,9 @@ def group_lines(batch: Batch) -> Iterator[str]:
         for apart in population.apart:
             yield f"{f'{apart.kind} {apart.name}'.strip()}: {apart_words(population.measured, apart, names)}"
     for shared in batch.shared:
-        yield f"{shared.kind} {shared.name}: {_shared_words(shared)}"
+        inside, outside = shared.inside, shared.outside
+        there = f"{inside[0]} of {inside[1]} units, {outside[0]} of {outside[1]} elsewhere"
+        yield f"{shared.kind} {shared.name}: {shared.cause} in {there}: {_whose(shared.kind)}"
 
 
 def _some(names: Sequence[str]) -> str:
@@ -516,13 +517,6 @@ def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> 
     other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
     said = f"the two differ, {sd_off(apart.log_p):.1f} sd: which one is off, two alone do not show"
     return f"{measured.name} is {how} {other}, {said}{also}"
-
-
-def _shared_words(shared: Shared) -> str:
-    """How many units of a group have a cause, and whose it is."""
-    inside, outside = shared.inside, shared.outside
-    there = f"{inside[0]} of {inside[1]} units, {outside[0]} of {outside[1]} elsewhere"
-    return f"{shared.cause} in {there}: {_whose(shared.kind)}"
 
 
 def _whose(kind: str) -> str:

@@ -7,18 +7,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.document import recording_entry
 from selfcal.bank.result import HALF_90
+from selfcal.base.grid import Array
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
 from selfcal.calibration.fit import FALSE_ALARM, IDENTIFIED, Fit
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.rests import ACCEL, GYRO, Tumble
 from selfcal.logs.recording import Recording
-
-Array = NDArray[np.float64]
 
 SCHEMA = "selfcal.tumble/1"
 AXES = ("x", "y", "z")
@@ -47,7 +45,11 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
         "earth_rate_known": place.vertical is not None,
         "bias_at_s": accel.tumble.reference_s,
         "noise": {
-            name: {"N": math.sqrt(one.white), "unit": _density(name), "drift": one.words}
+            name: {
+                "N": math.sqrt(one.white),
+                "unit": "m/s^2/sqrt(Hz)" if name in ACCEL else "rad/s/sqrt(Hz)",
+                "drift": one.words,
+            }
             for name, one in tumble.noise.items()
             if one.words
         },
@@ -79,10 +81,6 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
         },
         "notes": notes,
     }
-
-
-def _density(name: str) -> str:
-    return "m/s^2/sqrt(Hz)" if name in ACCEL else "rad/s/sqrt(Hz)"
 
 
 def _entry(fit: Fit, at: int, unit: str, size: float) -> dict[str, Any]:

@@ -9,22 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from selfcal.base.errors import UserError, remark
+from selfcal.base.grid import Array
 from selfcal.base.output import write_text
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer, matrix_of
 from selfcal.calibration.gyroscope import Gyroscope, gyro_matrix
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -135,13 +134,8 @@ def _c(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
     whole = _whole(accel, gyro, document)
 
     def vector(values: Array) -> str:
-        return (
-            "{"
-            + ", ".join(
-                f"{one:.9g}F" if "." in f"{one:.9g}" or "e" in f"{one:.9g}" else f"{one:.1f}F" for one in values
-            )
-            + "}"
-        )
+        texts = (f"{value:.9g}" for value in values)
+        return f"{{{', '.join(f'{text}F' if set('.e') & set(text) else f'{text}.0F' for text in texts)}}}"
 
     def matrix(values: Array) -> str:
         return "{" + ", ".join(vector(row) for row in values) + "}"
@@ -192,21 +186,10 @@ def _kalibr(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str,
     return _head("#", whole) + note + "".join(f"#   {one}\n" for one in beside.splitlines()) + str(text)
 
 
-def _px4(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
-    """corrected = (raw - OFF) SCALE (Accelerometer::Correct), gyros raw - OFF (Gyroscope::Correct), sensor's frame."""
-    return _diagonal(
-        accel, gyro, document, "param set CAL_ACC0_{}OFF", "param set CAL_ACC0_{}SCALE", "param set CAL_GYRO0_{}OFF"
-    )
-
-
-def _ardupilot(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
-    """corrected = (raw - OFFS) SCAL (AP_InertialSensor_Backend::_rotate_and_correct_accel), gyros raw - OFFS."""
-    return _diagonal(accel, gyro, document, "INS_ACCOFFS_{}", "INS_ACCSCAL_{}", "INS_GYROFFS_{}")
-
-
 def _diagonal(
-    accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any], off: str, scale: str, gyro_off: str
+    off: str, scale: str, gyro_off: str, accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
 ) -> str:
+    """By the names of a parameter of an axis: corrected = (raw - off) scale, gyros raw - off, in the sensor's frame."""
     whole = _whole(accel, gyro, document, diagonal=True)
     lines = [f"# {one}" for one in whole.lines]
     lines.append("# for the first sensor, in the frame and of the uncorrected readings that the log is of")
@@ -223,6 +206,8 @@ FORMS: dict[str, Callable[[Accelerometer, Gyroscope | None, Mapping[str, Any]], 
     "yaml": _yaml,
     "c": _c,
     "kalibr": _kalibr,
-    "px4": _px4,
-    "ardupilot": _ardupilot,
+    # Accelerometer::Correct and Gyroscope::Correct.
+    "px4": partial(_diagonal, "param set CAL_ACC0_{}OFF", "param set CAL_ACC0_{}SCALE", "param set CAL_GYRO0_{}OFF"),
+    # AP_InertialSensor_Backend::_rotate_and_correct_accel.
+    "ardupilot": partial(_diagonal, "INS_ACCOFFS_{}", "INS_ACCSCAL_{}", "INS_GYROFFS_{}"),
 }

@@ -7,14 +7,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 #: Residuals [m], their derivatives [m, n] and their covariance [m, m] at parameters [n].
 Problem = Callable[[Array], tuple[Array, Array, Array]]
 

@@ -16,19 +16,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Mask
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import NONE, Accelerometer, forces, means_covariance, shaped
-from selfcal.calibration.fit import Fit, Mask, Problem
+from selfcal.calibration.fit import Fit, Problem
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import GYRO, Tumble, Turn
-
-Array = NDArray[np.float64]
 
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); scale; angle, rad; temperature
 #: coefficient, rad/s/degC (0.05 deg/s/degC).

@@ -12,18 +12,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.bank.priors import known, laid
 from selfcal.bank.result import Estimate
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model, Prior
 from selfcal.model.laws import Law
-
-Array = NDArray[np.float64]
 
 #: A rest of so many seconds identifies the law of the part.
 LONG_S = 1200.0

@@ -10,23 +10,22 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable
-from selfcal.base.output import console_of
+from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
+from selfcal.base.output import console_of, print_line
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import Noise, of_model
 from selfcal.calibration.rests import ACCEL, CUT_S, GYRO, PIECES, REST_S, UNITS, Rest, Tumble
 from selfcal.model.file import Model
-
-Array = NDArray[np.float64]
 
 SCHEMA = "selfcal.plan_tumble/1"
 #: Sides that are up, by rests: six flats; an edge pair in each plane as well; and the edges opposite and six corners.
@@ -160,10 +159,7 @@ def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A line for each count of rests, and the shortest."""
     console = console_of(to_stderr=to_stderr)
-
-    def line(text: str) -> None:
-        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
-
+    line = partial(print_line, console)
     line("; ".join(document["wishes"]))
     line(f"{SHARE:.0%} of placements by hand, off by {document['placed_deg']:g} deg (sd), reach it with:")
     met = [one for one in document["rows"] if one["rest_s"] is not None]

@@ -8,20 +8,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means, runs
+from selfcal.base.grid import Array, Mask, block_means, runs
 from selfcal.base.units import factor
-from selfcal.calibration.fit import Fit, Mask, Problem, fit, linearized
+from selfcal.calibration.fit import Fit, Problem, fit, linearized
 from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
 from selfcal.readings.rest import PIECE_S, rest_of
-
-Array = NDArray[np.float64]
 
 ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from rich import box
 from rich.table import Table
 
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of, plotter, save_picture
+from selfcal.base.output import console_of, plotter, print_line, save_picture
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration.document import side_of
 
@@ -33,10 +34,7 @@ SHEET = {
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The tables of both sensors, what is not identified, and what the residuals say."""
     console = console_of(to_stderr=to_stderr)
-
-    def line(text: str) -> None:
-        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
-
+    line = partial(print_line, console)
     turns = [one for one in document["turns"] if one["left_out"] is None]
     line(f"{len(document['rests'])} rests, {len(turns)} turns")
     line(f"up, rest by rest: {', '.join(side_of(np.array(one['up'])) for one in document['rests'])}")

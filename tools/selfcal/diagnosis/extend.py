@@ -73,14 +73,9 @@ def extended(
     return tree, said
 
 
-def _columns_of(entry: Mapping[str, Any]) -> int:
-    """How many a regressor has: a sine and a cosine of a line."""
-    return 2 if entry["kind"] == "periodic" else 1
-
-
 def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
     """Fewer nodes on the Cortex-M0 where its RAM needs them: beside a second column, or a law that is a sum."""
-    columns = sum(map(_columns_of, regressors))
+    columns = sum(2 if entry["kind"] == "periodic" else 1 for entry in regressors)  # a sine and a cosine of a line
     nodes = tree["nodes"]
     if "cortex-m0" in nodes and "cortex-m0-small" in nodes:
         plain = ("random_walk", "gauss_markov")

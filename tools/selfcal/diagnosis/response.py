@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from scipy.stats import binom
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, note, printable
-from selfcal.base.output import console_of, plotter, save_picture
+from selfcal.base.output import console_of, plotter, print_line, save_picture
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.record import Record
@@ -394,10 +395,7 @@ def _empirical(found: Empirical) -> dict[str, list[float]]:
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The answer in a few lines, and the table of its numbers."""
     console = console_of(to_stderr=to_stderr)
-
-    def line(text: str) -> None:
-        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
-
+    line = partial(print_line, console)
     source, axis = document["source"], document["output"]["axis"]
     given = document["input"]
     line(f"{given['column']} -> {axis}, means of {1.0 / document['judged_at_hz']:g} s")

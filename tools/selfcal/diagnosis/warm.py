@@ -114,7 +114,7 @@ class _Reader:
         from selfcal.diagnosis.document import SCHEMA  # takes long to import
 
         try:
-            text = read_text(self.path, (1 << 25), "not a diagnosis")
+            text = read_text(self.path, 1 << 25, "not a diagnosis")
         except OSError as error:
             raise UserError(f"{self.path}: cannot read the diagnosis: {error.strerror}") from error
         with reading(self.path, "not a diagnosis (the JSON that `selfcal diagnose --json` writes)"):

@@ -37,7 +37,9 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     regressors = from_time(regressors, recording.start_s)
     missing = np.ascontiguousarray(recording.missing_before, np.uint64)
     values = [
-        _varying(recording.in_unit(name, unit), missing) if by == "variance" else recording.in_unit(name, unit)
+        bridged(variance_of(recording.in_unit(name, unit), missing))
+        if by == "variance"
+        else recording.in_unit(name, unit)
         for name, unit, by in channels
     ]
     rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
@@ -51,11 +53,6 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
             columns[:, place] = as_float(curved(columns[:, place], one.knots))
         place += len(one.columns)
     return columns
-
-
-def _varying(values: NDArray[np.float64], missing: NDArray[np.uint64]) -> NDArray[np.float64]:
-    """The variance of a channel at each sample; where there is none yet, the one before or the first."""
-    return bridged(variance_of(values, missing))
 
 
 def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:

@@ -271,7 +271,7 @@ def make_tables(
                 column,
                 one.unit,
                 one.offset,
-                tuple(_coefficient_sd(model, one, name) for name in names),
+                tuple((0.0 if one.column == name else one.sd.get(model.group_of(name).name, 0.0)) for name in names),
                 _source(one, place),
                 len(names) * ((math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0),),
             )
@@ -338,8 +338,3 @@ def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, s
     channels = channels_of((regressor,))
     kind, _, number, second = sources_of(regressor, channels)[place]
     return kind, number, second, *(channels[0][:2] if channels else ("", ""))
-
-
-def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:
-    """0 where the axis does not have the regressor: no prior for its group, or it is the axis itself."""
-    return 0.0 if regressor.column == axis else regressor.sd.get(model.group_of(axis).name, 0.0)

@@ -74,6 +74,11 @@ class Panel:
         return [*self.curves, *self.bands]
 
     @property
+    def heights(self) -> list[Array]:
+        """All that lies on the vertical axis."""
+        return [curve.y for curve in self.curves] + [edge for band in self.bands for edge in (band.low, band.high)]
+
+    @property
     def alternative(self) -> str:
         """The picture in a sentence: what, over what, and how much of the measured curve the simulated band holds."""
         text = f"{self.title}: {self.y_label} over {self.x_label}."
@@ -218,21 +223,15 @@ def _x_limits(figure: Figure) -> tuple[float, float]:
     return (0.0 if not first.log_x and 0.0 < low < 0.05 * high else low), high
 
 
-def _y_limits(figure: Figure) -> tuple[float, float]:
-    values = [curve.y for panel in figure.panels for curve in panel.curves]
-    values += [edge for panel in figure.panels for band in panel.bands for edge in (band.low, band.high)]
-    return _limits(values, figure.panels[0].log_y, 0.06)
-
-
 def draw(figure: Figure) -> Markup:
     """The figure in HTML: its panels on one scale, caption, key, and a table behind them."""
-    first = figure.panels[0]
+    first, heights = figure.panels[0], [each for panel in figure.panels for each in panel.heights]
     right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
     return render(
         "panels.html",
         figure=figure,
         x=_Scale(*_x_limits(figure), first.log_x, LEFT, right - LEFT),
-        y=_Scale(*_y_limits(figure), first.log_y, bottom, TOP - bottom),
+        y=_Scale(*_limits(heights, first.log_y, 0.06), first.log_y, bottom, TOP - bottom),
         paths=_paths,
         **{"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": right, "top": TOP, "bottom": bottom},
     )
@@ -270,8 +269,7 @@ def strips(figure: Figure, marks: Sequence[tuple[float, str]]) -> Markup:
 
 def _usual(panel: Panel) -> tuple[float, float]:
     """Limits that all but a few points of a panel keep: a shock must not hide a step."""
-    values = [curve.y for curve in panel.curves] + [edge for band in panel.bands for edge in (band.low, band.high)]
-    usual = [np.nanquantile(ys, (0.02, 0.98)) for ys in values if np.isfinite(ys).any()]
+    usual = [np.nanquantile(ys, (0.02, 0.98)) for ys in panel.heights if np.isfinite(ys).any()]
     return _limits(usual, False, 0.06)
 
 

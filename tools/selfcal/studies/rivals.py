@@ -31,10 +31,9 @@ from selfcal.base.grid import runs
 from selfcal.base.output import check_writable, console_of, table_of, write_json
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
-from selfcal.logs.recording import Recording, as_float, load
+from selfcal.logs.recording import Recording, load
 from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
-from selfcal.model.tables import make_tables
 from selfcal.studies.methods import RIVALS, Rival
 from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.studies.methods.problem import Answer, Problem
@@ -176,24 +175,20 @@ def chosen_rivals(only: Sequence[str]) -> list[Rival]:
 def problem_of(recording: Recording, name: str, model: Model, decimate: float | None) -> tuple[Problem, int]:
     """The longest stretch of the axis' block means without a gap, and how many means lie outside it. Most methods take
     no gaps, and all must see the same samples."""
-    from selfcal.bank.blocks import usable_blocks
+    from selfcal.bank.blocks import bank_means
 
     laws = tuple(law for law in model.hypotheses if law in PLAIN)
     if not laws:
         raise UserError(f"{model.path}: rivals knows the laws {', '.join(PLAIN)}: the model has none of them")
-    recording = recording.along(name)
-    group = model.group_of(name)
-    tables = make_tables(replace(model, regressors=()), recording.rate_hz, (name,), bank_rate_hz=decimate)
-    samples = as_float(recording.in_unit(name, group.unit))
-    mean = usable_blocks(samples, recording.missing_before, tables, group).mean
+    mean, dt_s = bank_means(recording, model, name, decimate)
     y = longest_stretch(mean)
     if y.size < FEWEST:
         raise UserError(
-            f"{recording.path}: {name}: {y.size} averages of {tables.dt_s:g} s without a gap are too few, "
+            f"{recording.path}: {name}: {y.size} averages of {dt_s:g} s without a gap are too few, "
             f"{FEWEST} are needed: record longer, or give --decimate HZ"
         )
-    alone = replace(group, axes=(name,))
-    return Problem(y, tables.dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
+    alone = replace(model.group_of(name), axes=(name,))
+    return Problem(y, dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
 
 
 def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ from selfcal.base.errors import UserError, printable
 from selfcal.base.output import console_of, table_of
 from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
 from selfcal.batch.spread import Row
-from selfcal.logs.recording import Recording, as_float, load
+from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Group, Model
 from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
 from selfcal.model.tables import make_tables
@@ -168,15 +168,12 @@ def simulated(model: Model, job: Job) -> list[Row]:
 
 def _means(recording: Recording, model: Model, name: str) -> Floats:
     """Means of 1 s of a recorded axis, NaN in gaps."""
-    from selfcal.bank.blocks import usable_blocks
+    from selfcal.bank.blocks import bank_means
 
-    recording = recording.along(name)
-    group = model.group_of(name)
-    if not (same_kind(group.unit, "rad/s") or same_kind(group.unit, "m/s^2")):
+    unit = model.group_of(name).unit
+    if not (same_kind(unit, "rad/s") or same_kind(unit, "m/s^2")):
         raise UserError(f"{recording.path}: {name}: worth takes gyros and accelerometers; choose with --axis")
-    tables = make_tables(model, recording.rate_hz, (name,), bank_rate_hz=1.0)
-    samples = as_float(recording.in_unit(name, group.unit))
-    return usable_blocks(samples, recording.missing_before, tables, group).mean
+    return bank_means(recording, model, name, 1.0)[0]
 
 
 def recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:

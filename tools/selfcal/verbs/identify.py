@@ -33,9 +33,7 @@ def identify(
     axes: shared.Axes = (),
     model: shared.ModelFile = None,
     engine: Annotated[Literal["library", "reference", "fixed"], option("What computes")] = "library",
-    decimate: Annotated[
-        float | None, option("Rate of the block means instead of the model file's", metavar="HZ")
-    ] = None,
+    decimate: shared.Decimate = None,
     json: shared.Json = None,
     plot: Annotated[
         Path | str | None, option("Save the Allan deviations beside the model's (.png .pdf .svg)", metavar="FILE")

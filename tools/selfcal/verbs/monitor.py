@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
-from selfcal.verbs._shared import Axes, From, Json
+from selfcal.verbs._shared import Axes, From, Json, RunPlot
 
 if TYPE_CHECKING:
     from selfcal.logs.framelog import FrameLog
@@ -43,7 +43,7 @@ def monitor(
     bitrate: Annotated[int | None, option("Of the CAN bus, if it needs one", metavar="BIT/S")] = None,
     once: Annotated[bool, option("End when the port vanishes instead of waiting for it", "--once")] = False,
     json: Json = None,
-    plot: Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")] = None,
+    plot: RunPlot = None,
 ) -> Outcome:
     """Show what arrives by `channel`, or what the log `read` holds, until Ctrl-C, its end, or until `duration` (s) is
     over.

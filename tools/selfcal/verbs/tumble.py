@@ -74,8 +74,7 @@ def tumble(
         raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST_LOGS} at most")
     files = [path for log in each for path in list_of(log)]
     check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     if fail_on not in (None, INADEQUATE):
@@ -96,8 +95,7 @@ def tumble(
         write(form, file, accel, gyro, document)
     if plot is not None:
         picture(document, plot)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 

@@ -13,12 +13,13 @@ import os
 import re
 import shlex
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, install
@@ -397,10 +398,8 @@ class Decoder:
         """
         if self._other is None or self._ours:
             return ""
-        older = (
-            "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
-        )
-        return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {older}"
+        step = "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
+        return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {step}"
 
     @property
     def twins(self) -> str:
@@ -416,7 +415,8 @@ class Decoder:
     def feed(self, message: can.Message) -> list[AxisReport]:
         """Take a frame; return the reports that it closes (none, one or two)."""
         kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
-        if kind is None or not _is_plain(message):
+        special = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
+        if kind is None or special or not message.dlc == 8 == len(message.data):
             return self._refused()
         data = bytes(message.data)
         bits = int.from_bytes(data, "little")
@@ -451,18 +451,16 @@ class Decoder:
             return self.flush()
         if self.foreign:
             return []
-        if name == CORRECTED:
-            if "time_ms" in values:
+        if not kind.axis:
+            if name == CORRECTED and "time_ms" in values:
                 self.corrected = {}  # an axis that is no longer sent has no part in it
                 self._corrects = True
-            if self._corrects:
+            if name == CORRECTED and self._corrects:
                 self.corrected.update(values)
-            return self.flush()
-        if name == TUMBLE:
-            self.tumble = values if "time_ms" in values else self.tumble | values
-            return self.flush()
-        if name == ANSWER:
-            self.answer.update(values)
+            elif name == TUMBLE:
+                self.tumble = values if "time_ms" in values else self.tumble | values
+            elif name == ANSWER:
+                self.answer.update(values)
             return self.flush()
         order = _order(kind, item)
         named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
@@ -609,12 +607,6 @@ def _order(kind: _Kind, item: int) -> int:
     return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
 
 
-def _is_plain(message: can.Message) -> bool:
-    """Whether a frame is a classic one of 8 bytes with an identifier of 11 bits."""
-    special = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
-    return not special and message.dlc == 8 == len(message.data)
-
-
 def _values(kind: _Kind, data: bytes) -> dict[str, float] | None:
     """Signals of a frame; None where the DBC has no such item, or a value cannot be."""
     try:
@@ -705,17 +697,14 @@ class Streams:
     def statistics(self) -> Statistics:
         """Of all together. Frames of a passing stranger count as refused."""
         known = self.known
-        total = Statistics(**vars(self.strangers))
+        total = Counter(vars(self.strangers))
         for node, decoder in list(self.decoders.items()):
-            counted = decoder.statistics
-            total.damaged += counted.damaged
-            total.foreign += counted.foreign
-            if node in known:
-                total.received, total.lost = total.received + counted.received, total.lost + counted.lost
-                total.refused += counted.refused
-            else:
-                total.refused += counted.refused + counted.received
-        return total
+            counted = Counter(vars(decoder.statistics))
+            if node not in known:
+                counted["refused"] += counted.pop("received")
+                del counted["lost"]
+            total.update(counted)
+        return Statistics(**total)
 
 
 #: Bytes of a serial line without an end that are kept: a frame's line has 22.
@@ -780,15 +769,8 @@ class Link:
         self.closed = False
         return True
 
-    def open_again(self) -> None:
-        """Open the channel of a serial line once more; on other buses nothing happens."""
-        self._order("open")
-
-    def close_channel(self) -> None:
-        """Close the channel of a serial line, not the line; on other buses nothing happens."""
-        self._order("close")
-
-    def _order(self, name: str) -> None:
+    def order(self, name: Literal["open", "close"]) -> None:
+        """Open the channel of a serial line once more, or close it, not the line; on other buses nothing happens."""
         import can
         from can.interfaces.slcan import slcanBus
 

@@ -316,7 +316,8 @@ class View:
             return wrong
         if contact is not None and contact.lost and not module.decoder.finished:
             return "contact lost: check cable and power"
-        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if _told(status, name) == text), "")
+        told = {name: status_text(name, status[name]) for name in TROUBLE if name in status}
+        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if told.get(name) == text), "")
         if trouble:
             return f"{trouble}: see port/README.md"
         if said := tumble_text(module.decoder.tumble):
@@ -355,15 +356,9 @@ class View:
     def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
         """What the record is too short for."""
         judgements = [report.adequacy for report, _ in last.values()]
-        moved = max(
-            (
-                judgement.temperature_moved
-                for judgement in judgements
-                if judgement and judgement.temperature_moved is not None
-            ),
-            default=None,
-        )
-        if moved is None or moved >= TEMPERATURE_NEEDED:
+        known = [judged.temperature_moved for judged in judgements if judged and judged.temperature_moved is not None]
+        moved = max(known, default=TEMPERATURE_NEEDED)
+        if moved >= TEMPERATURE_NEEDED:
             return []
         said = f"temperature has moved {moved:.1f} of the {TEMPERATURE_NEEDED:g} degC that a temperature law needs"
         return [_line(Text(said, "dim"))]
@@ -465,10 +460,6 @@ def _calibration(values: Mapping[str, float]) -> list[str]:
         elif name.startswith("g_"):
             said.append(f"G {name[2:]} {value:.4f} deg/s/g")
     return said
-
-
-def _told(status: Mapping[str, float], name: str) -> str:
-    return status_text(name, status[name]) if name in status else ""
 
 
 def counted(s: Statistics) -> str:

@@ -103,7 +103,7 @@ class Run:
             return frame, reports
         # A module that saves is deaf for 1 to 2 s; a restarted one waits for the channel to be opened.
         if self.contact is not None and min(self.contact.silent_s, time.monotonic() - self.opened_s) > 3.0:
-            cast(Link, self.source).open_again()  # a module that has restarted waits for that
+            cast(Link, self.source).order("open")  # a module that has restarted waits for that
             self.opened_s = time.monotonic()
         return None
 

@@ -193,10 +193,13 @@ def _make(name: str, target: str, root: Path, folder: Path) -> None:
     try:
         command.append(f"CORE={target}")
         done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
+    except OSError as failure:
+        raise UserError(f"cannot build the firmware: make: {failure.strerror}") from failure
     if done.returncode != 0:
-        complaint = _complaint(done.stderr)
+        # The compiler's first error, else the first line: a linker's, or make's own.
+        error = re.search(r":\d+: (?:fatal )?error: (.+)", done.stderr)
+        lines = (line for line in done.stderr.splitlines() if line.strip())
+        complaint = error[1] if error else next(lines, "make failed")
         remedy = ": take fewer axes (--axis), laws or nodes" if "does not fit the RAM" in complaint else ""
         raise UserError(f"cannot build the firmware: {complaint}{remedy}")
 
@@ -213,12 +216,6 @@ def check_programs(target: str) -> None:
             f"{what} is compiled, and there is no {' and no '.join(missing)} here: on Debian `apt install {packages}`; "
             "plain `replay` compiles nothing"
         )
-
-
-def _complaint(said: str) -> str:
-    """The compiler's first error in what `make` said, else the first line: a linker's, or make's own."""
-    error = re.search(r":\d+: (?:fatal )?error: (.+)", said)
-    return error[1] if error else next((line for line in said.splitlines() if line.strip()), "make failed")
 
 
 def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Path) -> None:
@@ -273,7 +270,7 @@ def run(
                 link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
             if link is not None and wire:
                 _watch(link, decoder, recording, model, history, module, TARGETS[target].patience_s)
-                link.close_channel()  # the emulator forgets what it holds of a line that is closed
+                link.order("close")  # the emulator forgets what it holds of a line that is closed
             said = before + _ending(module)
         if module.returncode != 0 or not decoder.finished:
             said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
