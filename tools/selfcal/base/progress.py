@@ -11,6 +11,12 @@ from rich.progress import Progress, ProgressColumn
 from selfcal.base.errors import note
 
 
+def bar() -> Progress:
+    """A bar on stderr, in a terminal alone."""
+    console = Console(stderr=True)
+    return Progress(console=console, transient=True, disable=not console.is_terminal)
+
+
 class Doing:
     """`with Doing("diagnose") as doing:`, then `doing.now("gx: round 2")` whenever the work changes, from any thread,
     and `doing.tick()` from the main one."""

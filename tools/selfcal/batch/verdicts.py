@@ -338,9 +338,11 @@ def write(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | s
 
 
 def add_verdicts(
-    document: dict[str, Any], limits: Limits, junit: Path | str | None, verdicts: Path | str | None
+    document: dict[str, Any], limits: Limits | None, junit: Path | str | None, verdicts: Path | str | None
 ) -> None:
-    """Judge a document of `identify` or `diagnose`: its key `limits`, and the files that are asked for."""
+    """Judge a document of `identify` or `diagnose` by limits, if there are any: its key `limits`, and the files."""
+    if limits is None:
+        return
     axes, recording = document["axes"], document["recording"]
     judged = judge(limits.of(axes), axes, recording["duration_s"])
     document["limits"] = [verdict.entry() for verdict in judged]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ import yaml
 from selfcal.adequacy.part import read_out, rounding, without
 from selfcal.bank.priors import state_own
 from selfcal.base.ending import Stopped
-from selfcal.base.errors import UserError, remark
+from selfcal.base.errors import UserError, note, remark
+from selfcal.base.output import write_text
 from selfcal.diagnosis.cause import Cause, Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.causes.vibration import WIDTHS_S
@@ -32,6 +33,8 @@ from selfcal.model.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0
+#: Why a module leaves a finding out.
+NO_ROOM = f"a bank has {MOST_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
 #: Begins each file that is written here.
 HEAD = "# Written by `selfcal diagnose`"
 
@@ -323,17 +326,27 @@ def _of_columns(one: Diagnosed) -> Iterator[_Effect]:
             yield _Effect(cause, strength, cause.written.of_column(column, c), _channel_of(column))
 
 
-def check_not_by_hand(path: Path | str) -> None:
+def check_not_by_hand(path: Path | str | None) -> None:
     """Raise UserError for an older file that `as_text` has not made: its author wants to keep it."""
-    path = Path(path)
-    if not path.is_file() or path.stat().st_size == 0:
+    if path is None or not Path(path).is_file() or Path(path).stat().st_size == 0:
         return
-    with path.open("rb") as file:
+    with Path(path).open("rb") as file:
         if not file.read(len(HEAD)) == HEAD.encode():
             raise UserError(
                 f"{path}: `selfcal diagnose` did not write this file and does not write over it: give --write-model "
                 "another name, or delete the file"
             )
+
+
+def write_extended(
+    path: Path | str, tree: Mapping[str, Any], source: Path | str, said: str, out: Sequence[tuple[str, Finding]]
+) -> None:
+    """Write the file. `said`: of its read-out; `out`: findings that a module leaves out. Notes name both."""
+    write_text(path, as_text(tree, source, said))
+    note(f"{path}: {said}")
+    if out:
+        causes = ", ".join(f"{name} {finding.look.cause} ({finding.look.gain:.1f} nats)" for name, finding in out)
+        note(f"{path}: a module leaves out {causes}: {NO_ROOM}")
 
 
 def as_text(tree: Mapping[str, Any], source: Path | str, said: str) -> str:

@@ -18,8 +18,6 @@ from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from selfcal.adequacy.document import recording_entry
@@ -29,6 +27,7 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
 from selfcal.base.grid import runs
 from selfcal.base.output import check_writable, console_of, table_of, write_json
+from selfcal.base.progress import bar
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
 from selfcal.logs.recording import Recording, load
@@ -76,8 +75,7 @@ def of_recording(
     names = chosen_axes(recording, loaded, axes)
     loaded = for_record(loaded, recording, names)
     answers: dict[str, Any] = {}
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with bar() as progress:
         task = progress.add_task("rivals", total=len(names) * len(chosen))
         for name in names:
             problem, left_out = problem_of(recording, name, loaded, decimate)
