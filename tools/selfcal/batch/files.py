@@ -14,7 +14,7 @@ from glob import glob
 from pathlib import Path
 from typing import Any
 
-from selfcal.base.errors import UserError, note, short
+from selfcal.base.errors import UserError, few, note, short
 from selfcal.base.limits import read_text
 from selfcal.logs.recording import meta_place
 
@@ -220,7 +220,8 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
         )
     unknown = [cell.strip() for cell, name in zip(rows[0], header, strict=True) if name not in TABLE_COLUMNS]
     if unknown:
-        note(f"{table}: does not read {_few(unknown, 'columns')} (known: {', '.join(TABLE_COLUMNS)})")
+        named = few(list(map(short, unknown)), MOST_ROWS_NAMED, "more columns")
+        note(f"{table}: does not read {named} (known: {', '.join(TABLE_COLUMNS)})")
     by_place: dict[Path, list[str]] = {}
     by_name: dict[str, list[str]] = {}
     for path in paths:
@@ -257,12 +258,5 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
                     f"{table}: line {number}: '{short(row['file'])}' is there twice, with different entries"
                 )
     if without:
-        note(f"{table}: no recording of the batch is {_few(without, 'rows')}")
+        note(f"{table}: no recording of the batch is {few(list(map(short, without)), MOST_ROWS_NAMED, 'more rows')}")
     return units
-
-
-def _few(names: Sequence[str], what: str) -> str:
-    """The first of the names, and how many more `what` there are."""
-    more = len(names) - MOST_ROWS_NAMED
-    shown = ", ".join(short(name) for name in names[:MOST_ROWS_NAMED])
-    return shown if more <= 0 else f"{shown} and {more} more {what}"

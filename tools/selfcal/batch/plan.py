@@ -98,24 +98,26 @@ class Wish:
         return Wish(plain, match[1], float(match[2]) * units.factor(unit, own), unit)
 
 
-def refusal(model: Model, axis: str, one: Regressor) -> str:
+def refusal(model: Model, axis: str, regressor: Regressor) -> str:
     """Why the coefficient of a regressor cannot be planned: plan swings a channel, in proportion to which the column
     moves. Empty if it can."""
-    if one not in offered(model, axis):
-        return f"{axis} has no regressor {one.name}"
-    if one.kind not in ("column", "rate"):
-        return f"{one.name} is of kind {one.kind}, and has no channel that could be swung: leave this wish out"
-    if one.input == "value" and one.form in LINEAR:
+    if regressor not in offered(model, axis):
+        return f"{axis} has no regressor {regressor.name}"
+    if regressor.kind not in ("column", "rate"):
+        return (
+            f"{regressor.name} is of kind {regressor.kind}, and has no channel that could be swung: leave this wish out"
+        )
+    if regressor.input == "value" and regressor.form in LINEAR:
         return ""
-    what = f"form: {one.form}" if one.input == "value" else f"input: {one.input}"
-    return f"{one.name} has `{what}`, which is not in proportion to {one.column}: leave this wish out"
+    what = f"form: {regressor.form}" if regressor.input == "value" else f"input: {regressor.input}"
+    return f"{regressor.name} has `{what}`, which is not in proportion to {regressor.column}: leave this wish out"
 
 
-def column_of(one: Regressor, channel: Array, rate_hz: float) -> Array:
+def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
     """float64[n]: the column that a channel [n] at this rate makes. The window of a rate is of whole intervals."""
-    if one.kind == "rate":
-        one = replace(one, window_s=max(1, round(one.window_s * rate_hz)) / rate_hz)
-    return made(sources_of(one, channels_of((one,))), 1.0 / rate_hz, channel[:, None])[:, 0]
+    if regressor.kind == "rate":
+        regressor = replace(regressor, window_s=max(1, round(regressor.window_s * rate_hz)) / rate_hz)
+    return made(sources_of(regressor, channels_of((regressor,))), 1.0 / rate_hz, channel[:, None])[:, 0]
 
 
 class Ensemble:
@@ -144,7 +146,7 @@ class Ensemble:
             self.typical = {
                 law: (
                     self.model.laws[law],
-                    {key: float(np.exp(np.mean(np.log([one[key] for one in truths])))) for key in truths[0]},
+                    {key: float(np.exp(np.mean(np.log([truth[key] for truth in truths])))) for key in truths[0]},
                 )
                 for law, truths in by_law.items()
             }
@@ -290,7 +292,7 @@ def rates(
         if rate > model.sensor_rate_hz:
             break
         for wish, samples in zip(wishes, lengths, strict=True):
-            law = next((one for one in typical.values() if wish.parameter in one[0].parameters), None)
+            law = next((entry for entry in typical.values() if wish.parameter in entry[0].parameters), None)
             if samples is None or law is None:
                 continue
             duration_s = samples / own
@@ -327,8 +329,8 @@ def picture(document: Mapping[str, Any], path: Path | str) -> None:
     size = (7.0, 2.9 * len(wishes))
     figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)
     for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
-        hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
-        q10, q50, q90 = (np.maximum([one[key] for one in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
+        hours = np.array([point["duration_s"] for point in wish["curve"]]) / 3600.0
+        q10, q50, q90 = (np.maximum([point[key] for point in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
         panel.fill_between(hours, q10, q90, color=color, alpha=0.25, linewidth=0.0, label="four records of five")
         panel.plot(hours, q50, color=color, label="median")
         panel.axhline(wish["most"], color="black", linewidth=1.0, linestyle="--", label="wanted")
@@ -354,7 +356,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 def steady(curve: Sequence[Mapping[str, float]]) -> float | None:
     """What nine records of ten keep at the longest length, if half of that length has it too, but for STEADY."""
     longest = curve[-1]
-    half = [one for one in curve if one["duration_s"] <= 0.5 * longest["duration_s"]]
+    half = [point for point in curve if point["duration_s"] <= 0.5 * longest["duration_s"]]
     return longest["q90"] if half and half[-1]["q90"] < STEADY * longest["q90"] else None
 
 
@@ -376,13 +378,13 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"{wish['wish']}: {_swings(wish) if 'cycling' in wish else said}")
         if wish["wish"].startswith("bias") and (least := steady(wish["curve"])):
             lines.append(f"  nine of ten such parts know it within {least:.2g} at any length: longer does not help")
-        for one in document["rates"]:
-            times = math.nan if there is None or one["wish"] != wish["wish"] else one["duration_s"] / there
-            factor = one["rate_hz"] / document["rate_hz"]
+        for rate in document["rates"]:
+            times = math.nan if there is None or rate["wish"] != wish["wish"] else rate["duration_s"] / there
+            factor = rate["rate_hz"] / document["rate_hz"]
             if abs(factor / FASTER - 1.0) < 1e-6 and times < WORTH:
-                lines.append(f"  by means at {one['rate_hz']:g} Hz: {duration_words(one['duration_s'])}")
+                lines.append(f"  by means at {rate['rate_hz']:g} Hz: {duration_words(rate['duration_s'])}")
             if abs(factor * FASTER - 1.0) < 1e-6 and times < 1.0 / WORTH:
-                lines.append(f"  means at {one['rate_hz']:g} Hz suffice: {duration_words(one['duration_s'])}")
+                lines.append(f"  means at {rate['rate_hz']:g} Hz suffice: {duration_words(rate['duration_s'])}")
     if document["duration_s"] is not None:
         lines.append(
             f"in all: record {duration_words(document['duration_s'])} at {document['rate_hz']:g} Hz or faster: "

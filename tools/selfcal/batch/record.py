@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from selfcal.adequacy.checks import CHECK_LIMIT
-from selfcal.base.errors import UserError, first_line, printable
+from selfcal.base.errors import UserError, first_line
 from selfcal.base.output import whole
-from selfcal.batch.spread import Job, Row, spread
+from selfcal.batch.spread import Job, Row, make_folder, spread
 from selfcal.batch.unit_table import Unit
 from selfcal.readings.tests import TESTS
 
@@ -153,10 +153,7 @@ class ByContent:
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
         self.settings = json.dumps(settings, sort_keys=True, default=str)
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
+        make_folder(folder)
 
     def place(self, job: Job) -> Path:
         """The file of a recording."""

@@ -279,6 +279,14 @@ def check_results(folder: Path | str | None) -> None:
         raise UserError(f"--results needs pyarrow: {install('pyarrow')}")
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder unless it is there. Raises UserError."""
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
+
+
 class Store:
     """A folder of finished pieces, each a Parquet file that is whole or absent.
 
@@ -289,10 +297,7 @@ class Store:
         check_results(folder)
         self.folder = folder
         self.key = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{folder}: cannot be made a folder: {error.strerror}") from error
+        make_folder(folder)
 
     def place(self, k: int) -> Path:
         return self.folder / f"part-{k:06}.parquet"

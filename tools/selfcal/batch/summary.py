@@ -12,7 +12,7 @@ from scipy.special import gammaln
 
 from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
-from selfcal.base.errors import UserError
+from selfcal.base.errors import UserError, few
 from selfcal.batch.drift import Drift, Series, drifts_of
 from selfcal.batch.population import (
     FALSE_ALARM,
@@ -460,7 +460,7 @@ def lines_of(batch: Batch) -> Iterator[str]:
         )
     yield from unidentified_lines(batch)
     for (axis, reason), names in batch.left_out.items():
-        yield f"left out of the population: {axis} of {_some(names)}: {reason}"
+        yield f"left out of the population: {axis} of {few(names, MOST_NAMED)}: {reason}"
     yield from group_lines(batch)
 
 
@@ -474,11 +474,6 @@ def group_lines(batch: Batch) -> Iterator[str]:
         inside, outside = shared.inside, shared.outside
         there = f"{inside[0]} of {inside[1]} units, {outside[0]} of {outside[1]} elsewhere"
         yield f"{shared.kind} {shared.name}: {shared.cause} in {there}: {_whose(shared.kind)}"
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"{', '.join(names[:MOST_NAMED])}{more}"
 
 
 def unidentified_lines(batch: Batch) -> Iterator[str]:
@@ -512,7 +507,7 @@ def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> 
     if apart.against is None:
         return f"{measured.name} is {how} the other units', {sd_off(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
     if apart.kind == TWO_GROUPS:
-        of = _some([names[device] for device in apart.members])
+        of = few([names[device] for device in apart.members], MOST_NAMED)
         return f"{measured.name} of {of} is {how} the others': no column of the batch explains it"
     other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
     said = f"the two differ, {sd_off(apart.log_p):.1f} sd: which one is off, two alone do not show"

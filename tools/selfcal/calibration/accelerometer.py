@@ -73,7 +73,7 @@ def matrix_of(theta: Array) -> Array:
 def means_covariance(tumble: Tumble, axis: int, bias: float, square_sd: float = SQUARE_SD) -> Array:
     """Covariance [n, n] of an axis' means of the rests: drift, white noise, rounding, a square beyond the `bias`."""
     noise = tumble.noise[ACCEL[axis]]
-    own = np.array([noise.white / one.seconds + one.rounded[axis] for one in tumble.rests])
+    own = np.array([noise.white / rest.seconds + rest.rounded[axis] for rest in tumble.rests])
     square = square_sd * (tumble.accel[:, axis] - bias) ** 2
     return drift(noise, tumble.begin_s, tumble.end_s, tumble.reference_s) + np.diag(own) + np.outer(square, square)
 

@@ -37,31 +37,31 @@ OF_GYRO = (
 def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyroscope | str | None) -> dict[str, Any]:
     """The whole answer, in SI units and degrees. `gyro`: None without gyros, a line where they have no answer."""
     place, tumble = accel.place, accel.tumble
-    notes = [*tumble.notes, *(f"{one}: left out" for one in tumble.left_out), *_told_of_turns(accel)]
+    notes = [*tumble.notes, *(f"{text}: left out" for text in tumble.left_out), *_told_of_turns(accel)]
     return {
         "schema": SCHEMA,
-        "recordings": [recording_entry(one) for one in recordings],
+        "recordings": [recording_entry(recording) for recording in recordings],
         "gravity": {"value": place.gravity, "sd": place.sd, "unit": "m/s^2", "source": place.words},
         "earth_rate_known": place.vertical is not None,
         "bias_at_s": accel.tumble.reference_s,
         "noise": {
             name: {
-                "N": math.sqrt(one.white),
+                "N": math.sqrt(noise.white),
                 "unit": "m/s^2/sqrt(Hz)" if name in ACCEL else "rad/s/sqrt(Hz)",
-                "drift": one.words,
+                "drift": noise.words,
             }
-            for name, one in tumble.noise.items()
-            if one.words
+            for name, noise in tumble.noise.items()
+            if noise.words
         },
         "rests": _rests(accel),
         "turns": [
             {
-                "start_s": tumble.rests[one.first].at_s[1],
-                "end_s": tumble.rests[one.first + 1].at_s[0],
-                "log": tumble.rests[one.first].log,
-                "left_out": one.reason or None,
+                "start_s": tumble.rests[turn.first].at_s[1],
+                "end_s": tumble.rests[turn.first + 1].at_s[0],
+                "log": tumble.rests[turn.first].log,
+                "left_out": turn.reason or None,
             }
-            for one in tumble.turns
+            for turn in tumble.turns
         ],
         "accelerometer": {
             **_entries(accel.fit, 0, OF_ACCEL),
@@ -132,15 +132,15 @@ def _rests(accel: Accelerometer) -> list[dict[str, Any]]:
     sd = np.sqrt(np.diag(fit.root @ fit.root.T))
     return [
         {
-            "log": one.log,
-            "start_s": one.at_s[0],
-            "end_s": one.at_s[1],
+            "log": rest.log,
+            "start_s": rest.at_s[0],
+            "end_s": rest.at_s[1],
             "up": (f[k] / size[k]).tolist(),
             "residual": float(residual[k]),
             "sd": float(sd[k]),
             "unit": "m/s^2",
         }
-        for k, one in enumerate(tumble.rests)
+        for k, rest in enumerate(tumble.rests)
     ]
 
 
@@ -155,7 +155,7 @@ def _positions(accel: Accelerometer) -> list[str]:
     if fit.identified[own].all():
         return []
     rests = accel.tumble.rests
-    seconds = float(np.median([one.seconds for one in rests]))
+    seconds = float(np.median([rest.seconds for rest in rests]))
     white = max(accel.tumble.noise[name].white for name in ACCEL) / seconds
     noise = white + max(np.diag(accel.fit.root @ accel.fit.root.T).mean(), 0.0)
     covariance, named = fit.widened(), []
@@ -204,13 +204,13 @@ def _told_of_turns(accel: Accelerometer) -> list[str]:
     tumble, told = accel.tumble, []
     f = accel.force(tumble.accel, tumble.warmth)
     u = f / np.linalg.norm(f, axis=1)[:, None]
-    for one in tumble.turns:
-        where = f"turn of {tumble.rests[one.first].at_s[1]:.6g} to {tumble.rests[one.first + 1].at_s[0]:.6g} s"
-        if one.reason:
-            told.append(f"{where}: {one.reason}: left out")
+    for turn in tumble.turns:
+        where = f"turn of {tumble.rests[turn.first].at_s[1]:.6g} to {tumble.rests[turn.first + 1].at_s[0]:.6g} s"
+        if turn.reason:
+            told.append(f"{where}: {turn.reason}: left out")
             continue
-        way = float(np.linalg.norm(one.gyro - tumble.rests[one.first].gyro, axis=1).sum()) * one.dt
-        apart = math.acos(float(np.clip(u[one.first] @ u[one.first + 1], -1.0, 1.0)))
+        way = float(np.linalg.norm(turn.gyro - tumble.rests[turn.first].gyro, axis=1).sum()) * turn.dt
+        apart = math.acos(float(np.clip(u[turn.first] @ u[turn.first + 1], -1.0, 1.0)))
         # A turn of more than 30 deg that ends within 15 deg of where it began tells little.
         if way > math.radians(30.0) and apart < math.radians(15.0):
             told.append(f"{where}: {math.degrees(way):.0f} deg, and the same side is up: it tells little")

@@ -116,13 +116,13 @@ def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: 
     block = np.ix_(free, free)
     unit = np.sqrt(np.diag(prior))[free]
     r, J, R = problem(theta)
-    if not all(np.isfinite(one).all() for one in (r, J, R)):
+    if not all(np.isfinite(part).all() for part in (r, J, R)):
         raise UserError(UNSETTLED)
     apart = (theta - mean)[free] / unit
     try:
         inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
         root = np.asarray(np.linalg.cholesky(R))
-        white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
+        white, columns = (solve_triangular(root, part, lower=True) for part in (r, J * free))
         own = columns[:, free] * unit
         covariance = np.linalg.inv(own.T @ own + inverse)
     except np.linalg.LinAlgError:

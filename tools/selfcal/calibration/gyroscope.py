@@ -180,11 +180,11 @@ class _Problem:
         rests = self.tumble.rests
         self.count, self.temp = len(rests), float(self.tumble.temp.mean())
         self.turns = tuple(one for one in self.tumble.turns if not one.reason)
-        self.behind = {one.first + 1: k for k, one in enumerate(self.turns)}  # turn that leads to a rest
+        self.behind = {turn.first + 1: k for k, turn in enumerate(self.turns)}  # turn that leads to a rest
         self.chain = np.cumsum([k not in self.behind for k in range(self.count)]) - 1
         self.y = np.nan_to_num([one.gyro for one in rests])  # one that is not recorded weighs nothing
         self.white = np.array([self.tumble.noise[name].white for name in GYRO])
-        self.of_rests = [self.white / one.seconds + one.rounded[3:] for one in rests]
+        self.of_rests = [self.white / rest.seconds + rest.rounded[3:] for rest in rests]
         self.of_accel_means = [means_covariance(self.tumble, k, float(accel.fit.theta[k])) for k in range(3)]
         self.begin_s = np.concatenate([self.tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
         self.end_s = np.concatenate([self.tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])

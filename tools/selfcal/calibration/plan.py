@@ -151,7 +151,7 @@ def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
         "schema": SCHEMA,
         "model": str(model.path),
         "placed_deg": math.degrees(PLACED),
-        "wishes": [one.text for one in wishes],
+        "wishes": [wish.text for wish in wishes],
         "rows": rows,
     }
 
@@ -162,7 +162,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     line = partial(print_line, console)
     line("; ".join(document["wishes"]))
     line(f"{SHARE:.0%} of placements by hand, off by {document['placed_deg']:g} deg (sd), reach it with:")
-    met = [one for one in document["rows"] if one["rest_s"] is not None]
+    met = [row for row in document["rows"] if row["rest_s"] is not None]
     for one in document["rows"]:
         lost = f"; not identified: {', '.join(one['not_identified'])}" if one["not_identified"] else ""
         if one["rest_s"] is None:

@@ -142,18 +142,18 @@ class Tumble:
     @property
     def accel(self) -> Array:
         """Means [n, 3] of the accelerometers, m/s^2."""
-        return np.array([one.accel for one in self.rests])
+        return np.array([rest.accel for rest in self.rests])
 
     @property
     def temp(self) -> Array:
         """[n], degC; 0 where not all rests have one."""
-        temp = np.array([one.temp for one in self.rests])
+        temp = np.array([rest.temp for rest in self.rests])
         return temp if np.isfinite(temp).all() else np.zeros(temp.size)
 
     @property
     def has_temp(self) -> bool:
         """All rests have a temperature."""
-        return all(math.isfinite(one.temp) for one in self.rests)
+        return all(math.isfinite(rest.temp) for rest in self.rests)
 
     @property
     def warmth(self) -> Array:
@@ -168,12 +168,12 @@ class Tumble:
     @property
     def begin_s(self) -> Array:
         """[n], s."""
-        return np.array([one.begin_s for one in self.rests])
+        return np.array([rest.begin_s for rest in self.rests])
 
     @property
     def end_s(self) -> Array:
         """[n], s."""
-        return np.array([one.end_s for one in self.rests])
+        return np.array([rest.end_s for rest in self.rests])
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class _Log:
 def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: bool) -> Tumble:
     """Rests and turns of logs in order of time. `part_stated`: the model is the part's own, and so is its range.
     Raises UserError where accelerometers are missing, or too many rests are there."""
-    gyros = tuple(name for name in GYRO if all(name in one.columns for one in recordings))
+    gyros = tuple(name for name in GYRO if all(name in recording.columns for recording in recordings))
     axes = ACCEL + gyros
     begins, notes = _begins(recordings)
     logs = [_log(one, begin_s, axes) for one, begin_s in zip(recordings, begins, strict=True)]
@@ -291,8 +291,8 @@ def _begins(recordings: Sequence[Recording]) -> tuple[list[float], list[str]]:
     """When each log begins on one clock, s, and what is assumed of it."""
     if len(recordings) == 1:
         return [0.0], []
-    stamps = [one.started_s for one in recordings]
-    if all(one is not None for one in stamps):
+    stamps = [recording.started_s for recording in recordings]
+    if all(stamp is not None for stamp in stamps):
         known = [float(one) for one in stamps if one is not None]
         ends = [begin + one.duration_s for begin, one in zip(known, recordings, strict=True)]
         if all(end <= begin for end, begin in zip(ends, known[1:], strict=False)):

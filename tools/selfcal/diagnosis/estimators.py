@@ -239,7 +239,7 @@ def _likeliest(tried: Mapping[int, Tried], n: int) -> Estimate:
         if math.isfinite(rss)
     }
     best = max(score, key=lambda order: score[order])
-    evidence = {order: one - score[best] for order, one in score.items()}
+    evidence = {order: value - score[best] for order, value in score.items()}
     return Estimate(best, evidence, {order: tried[order][2] for order in score})
 
 

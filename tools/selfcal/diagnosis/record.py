@@ -83,7 +83,9 @@ class Record:
 
     def other_axes(self, axis: str) -> dict[str, Array]:
         """The other axes about their level, bridged where missing."""
-        return {name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis}
+        return {
+            name: bridged(state.y) - float(np.nanmedian(state.y)) for name, state in self.axes.items() if name != axis
+        }
 
     def variances(self, axis: str) -> dict[str, Array]:
         """Short-term variance of the other axes that have any, bridged where an axis is missing or left out."""
@@ -336,7 +338,7 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
     own = recording.clock_of(name).rate_hz
     if own < SLOWEST * recording.rate_hz:
         return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"
-    if told := copied(recording, name, [one for one in model.axes if one in recording.columns and one != name]):
+    if told := copied(recording, name, [axis for axis in model.axes if axis in recording.columns and axis != name]):
         return told
     if _varies(values):
         return "too few of its readings are none that stick or are clipped"
@@ -357,13 +359,13 @@ def _beyond(values: Array, group: Group) -> str:
     return mostly_beyond(values, group)
 
 
-def _cause(one: Stated, model: Model) -> str:
+def _cause(regressor: Stated, model: Model) -> str:
     """The cause that a regressor of the model file stands for."""
-    if one.kind not in ("column", "rate"):
-        return {"time": "ramp"}.get(one.kind, one.kind)
-    if one.column in model.axes:
-        return "vibration" if one.input == "variance" else "cross_axis"
-    return _channel(one.column)
+    if regressor.kind not in ("column", "rate"):
+        return {"time": "ramp"}.get(regressor.kind, regressor.kind)
+    if regressor.column in model.axes:
+        return "vibration" if regressor.input == "variance" else "cross_axis"
+    return _channel(regressor.column)
 
 
 def _channel(column: str) -> str:

@@ -172,7 +172,7 @@ def _best(state: State, inputs: Sequence[Input]) -> tuple[float, Array]:
 
 def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
     """Every structure of the input as it acts likeliest, and that input."""
-    each = [[transfer.tried(state, Drive(u.values, state.dt), one) for one in STRUCTURES] for u in inputs]
+    each = [[transfer.tried(state, Drive(u.values, state.dt), structure) for structure in STRUCTURES] for u in inputs]
     # Of two that explain a record alike, the first is meant.
     best = [max(one.score for one in tried) for tried in each]
     place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
@@ -269,12 +269,12 @@ def _misfits(left_over: float, held_out: float, methods: Mapping[str, Any]) -> l
         said.append("the residuals still go with the input")
     if held_out < -math.log(MISFIT):
         said.append("by the part before, the last third is predicted worse with the input than without")
-    for name, one in methods.get("methods", {}).items():
-        if not one["agrees"]:
-            key = next(key for key in ("gain", "delay_s") if not one["within"][key])
-            low, high = one["if_answer_holds"][key]
+    for name, method in methods.get("methods", {}).items():
+        if not method["agrees"]:
+            key = next(key for key in ("gain", "delay_s") if not method["within"][key])
+            low, high = method["if_answer_holds"][key]
             what = {"gain": "a static gain", "delay_s": "a delay"}[key]
-            said.append(f"{name} finds {what} of {one[key]:.3g}, where {low:.3g} to {high:.3g} was due")
+            said.append(f"{name} finds {what} of {method[key]:.3g}, where {low:.3g} to {high:.3g} was due")
     spectra = methods.get("spectra")
     if spectra and spectra["hold_answer"] < binom.ppf(1.0 / MISFIT, spectra["bands"], PROBABILITY):
         said.append(f"{spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")

@@ -29,7 +29,7 @@ def added_by(
 ) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
     """Adds the effects that a cause forms by itself, and the quantity that moves several axes, to `values` [axes, n]
     before the read-out; None without any."""
-    own = [(form, one["axes"]) for one in applied if (form := CAUSES[one["id"]].simulated.add) is not None]
+    own = [(form, effect["axes"]) for effect in applied if (form := CAUSES[effect["id"]].simulated.add) is not None]
     hidden = model.hidden_input
     if not own and hidden is None:
         return None

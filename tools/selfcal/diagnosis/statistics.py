@@ -421,7 +421,7 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
         Statistic(name, float(value[k]), float(mean[k] - half[k]), float(mean[k] + half[k]), math.exp(ln_p[k]))
         for k, name in enumerate(names)
     ]
-    return Judged(sorted(found_all, key=lambda one: one.p), _family(ln_p, sample, least))
+    return Judged(sorted(found_all, key=lambda statistic: statistic.p), _family(ln_p, sample, least))
 
 
 def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) -> Array:

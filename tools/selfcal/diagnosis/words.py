@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from selfcal.base.errors import few
 from selfcal.base.units import duration_words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import ROUNDS
@@ -20,8 +21,6 @@ def verdict(axis: Mapping[str, Any]) -> str:
     return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
 
 
-#: Stretches of time that a sentence names.
-INTERVALS_SHOWN = 3
 #: How an estimate's key is read out.
 LABELS = {
     "other": "other axis",
@@ -109,9 +108,7 @@ def rounded(value: float, half: float) -> str:
 
 def intervals(stretches: Sequence[Sequence[float]]) -> str:
     """The first few stretches of time, and how many more there are."""
-    shown = ", ".join(f"{start:.6g} s to {end:.6g} s" for start, end in stretches[:INTERVALS_SHOWN])
-    more = len(stretches) - INTERVALS_SHOWN
-    return f"from {shown}" + (f" and {more} more" if more > 0 else "")
+    return f"from {few([f'{start:.6g} s to {end:.6g} s' for start, end in stretches], 3)}"
 
 
 def sizes(estimate: Mapping[str, Any]) -> str:
@@ -178,10 +175,10 @@ def what(finding: Mapping[str, Any]) -> str:
 def how_much(finding: Mapping[str, Any]) -> str:
     """Its leading size on each axis."""
     found = []
-    for axis, one in finding["axes"].items():
-        value = next((value for value in one["estimate"].values() if isinstance(value, Mapping)), None)
-        if "share" in one["estimate"] and not isinstance(one["estimate"]["share"], Mapping):
-            found.append((axis, one["estimate"]["share"], "of the drift"))
+    for axis, side in finding["axes"].items():
+        value = next((value for value in side["estimate"].values() if isinstance(value, Mapping)), None)
+        if "share" in side["estimate"] and not isinstance(side["estimate"]["share"], Mapping):
+            found.append((axis, side["estimate"]["share"], "of the drift"))
         elif value is not None and value["median"] is not None:
             found.append((axis, value["median"], value["unit"]))
     return _by_unit(found)
@@ -210,7 +207,7 @@ def effects(finding: Mapping[str, Any]) -> str:
         own = [one for one in changes.values() if name in one["material"]]
         own = [one for one in own if name != "B" or "K" not in one["material"]]
         factors = [math.inf if one[name] is None else one[name] for one in own]
-        known = sorted(float(ratio(one)) for one in factors if 0.0 < one < math.inf)
+        known = sorted(float(ratio(factor)) for factor in factors if 0.0 < factor < math.inf)
         parts = [f"× {' to '.join(dict.fromkeys(f'{end:g}' for end in (known[0], known[-1])))}"] if known else []
         parts += ["not identified without it"] if math.inf in factors else []
         parts += ["hidden without it"] if 0.0 in factors else []
@@ -218,7 +215,7 @@ def effects(finding: Mapping[str, Any]) -> str:
     moved = [(axis, abs(one["bias"]), one["unit"]) for axis, one in changes.items() if "bias" in one["material"]]
     if moved:
         told.append(f"bias by {_by_unit(moved)}")
-    rows = [one["bias_error"] for one in changes.values() if "bias_error" in one["material"]]
+    rows = [change["bias_error"] for change in changes.values() if "bias_error" in change["material"]]
     less = [(1.0 - row["after"] / row["before"], horizon) for one in rows for horizon, row in one.items()]
     if less:
         most, horizon = max(less)
@@ -236,7 +233,7 @@ def action(finding: Mapping[str, Any]) -> str:
     if finding.get("next_record") and finding.get("confirmed_on") is not None:
         seen = "Apply it: the second recording shows it too. --write-model states it."
         return seen if finding["confirmed_on"] else "Leave it out of the model: the second recording does not show it."
-    known = [one["estimate"].get("coefficient") for one in finding["axes"].values()]
+    known = [axis["estimate"].get("coefficient") for axis in finding["axes"].values()]
     if not finding.get("next_record") and "source" not in finding["estimate"] and all(map(_sure, known)):
         return f"Apply it: it is known to {100.0 * APPLIED:.0f} %. --write-model states it."
     return str(finding["record_next"])
@@ -270,7 +267,7 @@ def small(findings: Sequence[Mapping[str, Any]]) -> str:
     """One line on the findings that matter little: they move no number by more than it is known."""
     several = len(findings) > 1
     count = f"{len(findings)} small findings" if several else "1 small finding"
-    causes = ", ".join(dict.fromkeys(str(one["cause"]).replace("_", " ") for one in findings))
+    causes = ", ".join(dict.fromkeys(str(finding["cause"]).replace("_", " ") for finding in findings))
     none = "none moves" if several else "it moves none of"
     return f"{count} ({causes}): {none} N, K, B or the bias by more than half of its interval"
 
@@ -305,10 +302,11 @@ def navigation(document: Mapping[str, Any]) -> list[str]:
     """What the findings mean for a GPS/INS filter, a line each, and what that rests on; none where nobody asked."""
     if "navigation" not in document:
         return []
-    flown = [one for one in document["findings"] if "navigation" in one]
     lines = [
-        f"{what(one)}: {one['navigation']['words'] if one['navigation'] else 'no flight: ' + one['navigation_reason']}"
-        for one in flown
+        f"{what(finding)}: "
+        + (flight["words"] if (flight := finding["navigation"]) else f"no flight: {finding['navigation_reason']}")
+        for finding in document["findings"]
+        if "navigation" in finding
     ]
     told = document["navigation"]
     return [*lines, told["words"]] if told else [*lines, *([] if lines else ["no flight: no finding matters"])]

@@ -43,7 +43,7 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
         for name, unit, by in channels
     ]
     rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
-    sources = [source for one in regressors for source in sources_of(one, channels)]
+    sources = [source for regressor in regressors for source in sources_of(regressor, channels)]
     columns = made(sources, 1.0 / recording.rate_hz, rows, missing, recording.powered)
     place = 0
     for one in regressors:
@@ -65,14 +65,14 @@ def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regresso
             return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(1e-6, one.end_s - start_s))
         return one
 
-    return tuple(moved(one) for one in regressors)
+    return tuple(moved(regressor) for regressor in regressors)
 
 
 def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
     """Raise UserError for a channel of the regressors that the recording has not."""
     for name, *_ in channels_of(regressors):
         if name not in recording.columns:
-            needs = next(one.name for one in regressors if one.column == name)
+            needs = next(regressor.name for regressor in regressors if regressor.column == name)
             raise UserError(
                 f"{recording.path}: there is no column '{name}', which the model's regressor '{needs}' needs "
                 f"(there are {', '.join(recording.columns)})"
@@ -125,7 +125,7 @@ def choices_of(regressors: Choice) -> list[Choice]:
 
 def mask_of(regressors: Choice, choice: Choice) -> int:
     """A bit for every column in use, in the order of `regressors`."""
-    names = [column for one in regressors for column in one.columns]
+    names = [column for regressor in regressors for column in regressor.columns]
     return sum(1 << names.index(column) for one in choice for column in one.columns)
 
 

@@ -160,7 +160,7 @@ class Tables:
         """Name and unit of what the regressors take beside the readings of these axes."""
         axes = {(axis.name, axis.unit) for axis in self.axes}
         taken = dict.fromkeys(column.source[3:] for column in self.regressors if column.source[3])
-        return tuple(one for one in taken if one not in axes)
+        return tuple(channel for channel in taken if channel not in axes)
 
     def source_of(self, column: RegressorTable) -> tuple[int, int, float, float]:
         """`selfcal_source_t` of a column: kind, place of its channel (the axes' readings, then `channels`), numbers."""

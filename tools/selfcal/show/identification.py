@@ -16,7 +16,7 @@ from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.bank.result import likeliest
 from selfcal.base import units
-from selfcal.base.errors import called, printable
+from selfcal.base.errors import called, few, printable
 from selfcal.base.output import TABLE_WIDTH, console_of, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
@@ -176,10 +176,7 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
 
 
 def _times(intervals: Sequence[Sequence[float]]) -> str:
-    """The first few stretches, and how many more there are."""
-    times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in intervals[:MOST_LISTED])
-    more = len(intervals) - MOST_LISTED
-    return f"{times}{f' and {more} more' if more > 0 else ''}"
+    return few([f"{a:.6g} to {b:.6g} s" for a, b in intervals], MOST_LISTED)
 
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:

@@ -233,7 +233,11 @@ def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
             groups[key].append({name: errors[name] for name in TITLES})
     worst: dict[str, dict[str, Any]] = {}
     for name in TITLES:
-        ratios = {key: [one[name] / min(one.values()) for one in group] for key, group in groups.items() if group}
+        ratios = {
+            key: [errors_of[name] / min(errors_of.values()) for errors_of in group]
+            for key, group in groups.items()
+            if group
+        }
         spread = {key: {"worst": max(all_), "median": float(np.median(all_))} for key, all_ in ratios.items()}
         worst[name] = {**spread.pop("bias"), **spread}
     return worst

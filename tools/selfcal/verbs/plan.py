@@ -102,8 +102,10 @@ def plan(
         return answer
     name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
     group = loaded.group_of(name)
-    columns = {one.name: one for one in loaded.regressors}
-    sizes = {key: (coefficient_unit(group.unit, one.unit), one.sd.get(group.name, 1.0)) for key, one in columns.items()}
+    columns = {regressor.name: regressor for regressor in loaded.regressors}
+    sizes = {
+        key: (coefficient_unit(group.unit, known.unit), known.sd.get(group.name, 1.0)) for key, known in columns.items()
+    }
     if response is not None:
         return _response(
             loaded, name, want, response, levels, input_lag_s, input, drive, records, seed, json, scheduler
@@ -121,7 +123,7 @@ def plan(
     plain = replace(loaded, regressors=())
     ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
     lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
-    samples = max((one for one in lengths if one is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
+    samples = max((known for known in lengths if known is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
     entries = []
     for k, wish in enumerate(wishes):
         column = columns.get(wish.parameter)
@@ -136,7 +138,7 @@ def plan(
             swings = cycling(loaded, name, wish, column, samples, seeds, scheduler)
             entry |= {"channel": column.column, "unit": column.channel_unit, "cycling": swings}
         entries.append(entry)
-    all_known = all(one["duration_s"] is not None for one in entries)
+    all_known = all(known["duration_s"] is not None for known in entries)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "model": str(loaded.path),

@@ -57,9 +57,9 @@ class _Bytes:
         """Seven bits a byte, the lowest first."""
         value = shift = 0
         while shift < 35:
-            one = self.byte()
-            value |= (one & 0x7F) << shift
-            if one < 0x80:
+            byte = self.byte()
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
                 return value & 0xFFFFFFFF
             shift += 7
         raise _Damaged
@@ -111,9 +111,9 @@ def _four(data: _Bytes) -> list[int]:
         if held >= 0:
             value, held = held, -1
             return value
-        one = data.byte()
-        held = one & 0xF
-        return one >> 4
+        byte = data.byte()
+        held = byte & 0xF
+        return byte >> 4
 
     for k in range(4):
         count = (0, 1, 2, 4)[tag >> 2 * k & 3]

@@ -42,7 +42,7 @@ _SIZE = struct.Struct("=Q")
 Start = Callable[[Format, Path, Hints, int, str], int]
 
 
-def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None) -> list[Table]:
+def tables_of(path: Path, form: Format, hints: Hints, start: Start | None = None) -> list[Table]:
     """The tables of a file, by a child process. `start` starts it. Raises UserError."""
     ends = time.monotonic() + _seconds(path)
     pipe, its_end = os.pipe()
@@ -50,7 +50,7 @@ def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None)
     with temporary_folder() as folder:
         try:
             try:
-                number = (start or _spawned)(one, path, hints, its_end, folder)
+                number = (start or _spawned)(form, path, hints, its_end, folder)
             finally:
                 os.close(its_end)
             return _answered(pipe, ends)
@@ -68,10 +68,10 @@ def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None)
         raise UserError(f"{path}: reading it takes more than {_seconds(path):.0f} s: it is damaged, or too long")
     if code >= 0:
         raise UserError(
-            f"{path}: not {'a' if one.name[1] != 'n' else 'an'}{one.name[one.name.index(' ') :]} that reads"
+            f"{path}: not {'a' if form.name[1] != 'n' else 'an'}{form.name[form.name.index(' ') :]} that reads"
         )
-    what = one.name.split(" ", 1)[1]
-    raise UserError(f"{path}: not a sound {what}: {one.library or 'its reader'} fails at it (signal {-code})")
+    what = form.name.split(" ", 1)[1]
+    raise UserError(f"{path}: not a sound {what}: {form.library or 'its reader'} fails at it (signal {-code})")
 
 
 def _answered(pipe: int, ends: float) -> list[Table]:
@@ -80,13 +80,15 @@ def _answered(pipe: int, ends: float) -> list[Table]:
     if "error" in found:
         raise UserError(found["error"])
     tables = []
-    for one in found["tables"]:
+    for table in found["tables"]:
         arrays = {}
-        for name, kind, shape in one["columns"]:
+        for name, kind, shape in table["columns"]:
             dtype = np.dtype(kind)
             data = _received(pipe, math.prod(shape) * dtype.itemsize, ends)
             arrays[name] = np.frombuffer(data, dtype).reshape(shape)
-        tables.append(of_arrays(one["source"], arrays, one["meta"], tuple(one["notes"]), Damaged(**one["damaged"])))
+        tables.append(
+            of_arrays(table["source"], arrays, table["meta"], tuple(table["notes"]), Damaged(**table["damaged"]))
+        )
     return tables
 
 
@@ -109,16 +111,16 @@ def _received(pipe: int, size: int, ends: float) -> bytearray:
 def _bytes(path: Path) -> int:
     """Bytes of a file, or of a folder's files. A hole has none; a disk that packs files does so to a sixteenth."""
     found = [part.stat() for part in parts_of(path)]
-    return sum(min(one.st_size, 16 * 512 * one.st_blocks) for one in found)
+    return sum(min(status.st_size, 16 * 512 * status.st_blocks) for status in found)
 
 
 def _seconds(path: Path) -> float:
     return _LEAST_S + _S_PER_BYTE * _bytes(path)
 
 
-def _spawned(one: Format, path: Path, hints: Hints, answer: int, folder: str) -> int:
+def _spawned(form: Format, path: Path, hints: Hints, answer: int, folder: str) -> int:
     # -P: no module is imported from the folder that the user is in, where files of strangers may lie.
-    what = [one.module, str(path), json.dumps(dict(hints)), str(os.getpid())]
+    what = [form.module, str(path), json.dumps(dict(hints)), str(os.getpid())]
     command = [sys.executable, "-P", "-m", "selfcal.logs.loaders.child", *what]
     streams = [
         (os.POSIX_SPAWN_DUP2, answer, 1),

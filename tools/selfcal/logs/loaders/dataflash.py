@@ -56,7 +56,7 @@ class _Rows:
         """The table. A temperature of 0 throughout is none."""
         values = np.array(self.values).reshape(-1, len(self.headings))
         columns = {name: values[:, place] for place, name in enumerate(self.headings)}
-        return of_arrays(source, {name: one for name, one in columns.items() if name[:4] != "temp" or one.any()})
+        return of_arrays(source, {name: part for name, part in columns.items() if name[:4] != "temp" or part.any()})
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -76,7 +76,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: no message {', '.join(_SOURCES if binary else _TLOG)}")
     order = list(_DATAFLASH if binary else _TLOG)
     tables = [rows[kind].table(source) for source, rows in found.items() for kind in sorted(rows, key=order.index)]
-    return [replace(one, damaged=sum(lost, damaged)) for one in tables]
+    return [replace(part, damaged=sum(lost, damaged)) for part in tables]
 
 
 def _ends(data: Bytes) -> Callable[[int], int]:

@@ -52,8 +52,8 @@ def _text(dataset: Any) -> str:
     value = dataset[()]
     if isinstance(value, np.ndarray) and value.dtype.kind in "iu":
         return "".join(map(chr, value.ravel().tolist()))
-    one = value.ravel()[0] if isinstance(value, np.ndarray) else value
-    return one.decode() if isinstance(one, bytes) else str(one)
+    first = value.ravel()[0] if isinstance(value, np.ndarray) else value
+    return first.decode() if isinstance(first, bytes) else str(first)
 
 
 def _columns(label: str, dataset: Any) -> Iterator[tuple[str, NDArray[Any]]]:

@@ -348,14 +348,14 @@ def _matching(pattern: str | tuple[str, ...], keys: Sequence[str]) -> Iterator[t
         ending = match.groupdict().get("unit")
         if ending is not None:
             named = _ENDINGS.get(ending.lower(), units.plain(ending))
-            if named == units.LSB or not units.known(named) or not any(units.same_kind(named, one) for one in _KINDS):
+            if named == units.LSB or not units.known(named) or not any(units.same_kind(named, kind) for kind in _KINDS):
                 continue
             unit = unit or named
         yield key, match, unit
 
 
 def _first(patterns: Sequence[str], text: str) -> re.Match[str] | None:
-    return next(filter(None, (re.fullmatch(one, text, re.IGNORECASE) for one in patterns)), None)
+    return next(filter(None, (re.fullmatch(pattern, text, re.IGNORECASE) for pattern in patterns)), None)
 
 
 def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:

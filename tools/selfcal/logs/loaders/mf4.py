@@ -70,5 +70,5 @@ def _formula(conversion: Any) -> str:
     kind = v4_constants.CONVERSION_TYPE_ALG if new else v2_v3_constants.CONVERSION_TYPE_FORMULA
     if conversion.conversion_type == kind:
         return str(conversion.formula) or "''"
-    inner = (_formula(one) for one in conversion.referenced_blocks.values() if not isinstance(one, bytes | str))
+    inner = (_formula(block) for block in conversion.referenced_blocks.values() if not isinstance(block, bytes | str))
     return next(filter(None, inner), "")

@@ -69,7 +69,7 @@ def chosen(path: object, parts: Sequence[Part], wanted: Sequence[str]) -> tuple[
         near = _nearest(kept, sides)
         found += [part for source in near for part in sources[source]]
         if len(near) < len(sides):
-            notes.append(f"left out, add it by --source: {', '.join(one for one in sides if one not in near)}")
+            notes.append(f"left out, add it by --source: {', '.join(side for side in sides if side not in near)}")
     return found, of_dropped, notes
 
 
@@ -80,7 +80,7 @@ def _by_rate(
     sensors: Sequence[str],
 ) -> tuple[list[str], list[str]]:
     """The sources to read, and those left out for their lower rates. Raises UserError."""
-    if all(not axes[one] & axes[other] for k, one in enumerate(sensors) for other in sensors[:k]):
+    if all(not axes[sensor] & axes[other] for k, sensor in enumerate(sensors) for other in sensors[:k]):
         return list(sensors), []
     rate = {source: max(part.rate_hz for part in sources[source] if part.axes) for source in sensors}
     kept: list[str] = []

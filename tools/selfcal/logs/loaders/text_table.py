@@ -138,7 +138,7 @@ class TextReader:
         #: The column that numbers the sensors, and the cell of the one that is read.
         self._only: tuple[int, str] | None = None
         self.where = f"line {number}: "
-        headings = self._stated(self._headings(header))
+        headings = self._stated(_words(header) if self._separator == " " else header.split(self._separator))
         if len(headings) == len(self._cells(self._batch[0])) + 1 and headings[-1].strip().lower() == _COMMENT_OF_ROWS:
             del headings[-1]  # of LabVIEW, which writes the comment of a row only where there is one
         cells = self._cells(self._batch[0])
@@ -313,9 +313,6 @@ class TextReader:
         if self._separator == "," and _THOUSANDS.search(line):
             line = _THOUSANDS.sub(lambda cell: cell[0].replace(",", ""), line)
         return line.split() if self._separator == " " else line.split(self._separator)
-
-    def _headings(self, line: str) -> list[str]:
-        return _words(line) if self._separator == " " else line.split(self._separator)
 
     def _stated(self, headings: list[str]) -> list[str]:
         """The headings with the units that the cells of the first row have after their numbers: `0.02 sec`."""

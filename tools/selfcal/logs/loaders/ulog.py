@@ -50,7 +50,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         found.setdefault((_SOURCES[one.name], one.multi_id), {})[one.name] = one.data
     if not found:
         raise UserError(f"{path}: no topic {', '.join(_SOURCES)}")
-    lost = [one.duration for one in log.dropouts]
+    lost = [dropout.duration for dropout in log.dropouts]
     notes = (f"the logger dropped out {len(lost)} times, {sum(lost) / 1000:.3g} s together",) if lost else ()
     serial = log.msg_info_dict.get("sys_uuid", "")
     meta = {"serial": serial} if isinstance(serial, str) and serial else {}

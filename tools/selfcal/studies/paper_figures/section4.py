@@ -177,7 +177,7 @@ def _far_off(titles: Iterable[str], last_of: Mapping[str, Sequence[Estimate]]) -
     still have medians far apart."""
     said = []
     for name, estimates in last_of.items():
-        times = np.array([one.median for one in estimates]) / np.median([one.median for one in estimates])
+        times = np.array([estimate.median for estimate in estimates]) / np.median([one.median for one in estimates])
         k = int(np.argmax(np.abs(np.log(times))))
         if max(times[k], 1.0 / times[k]) > FAR_OFF:
             factor = f"{times[k]:.2g} times" if times[k] > 1.0 else f"1/{1.0 / times[k]:.2g} of"
