@@ -18,8 +18,8 @@ from selfcal.bank.priors import prior_tree
 from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.base.output import write_text
+from selfcal.batch.batch_summary import Batch, axes_of, sound_of
 from selfcal.batch.population import TWO_GROUPS, Population
-from selfcal.batch.summary import Batch, axes_of, sound_of
 from selfcal.model.file import LOG_NORMAL_SD, Model, Prior, read_yaml
 
 

@@ -14,9 +14,9 @@ import numpy as np
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask
 from selfcal.calibration.earth import Place
-from selfcal.calibration.fit import FALSE_ALARM, Fit, Problem, fit
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import ACCEL, REST_S, Tumble
+from selfcal.calibration.tumble_fit import FALSE_ALARM, Fit, Problem, fit
 
 #: Stated priors, sd: bias, m/s^2 (100 mg); scale; angle, rad; temperature coefficient, m/s^2/degC (1 mg/degC).
 BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01

@@ -24,9 +24,9 @@ from selfcal.base.grid import Array, Mask
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import NONE, Accelerometer, forces, means_covariance, shaped
-from selfcal.calibration.fit import Fit, Problem
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import GYRO, Tumble, Turn
+from selfcal.calibration.tumble_fit import Fit, Problem
 
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); scale; angle, rad; temperature
 #: coefficient, rad/s/degC (0.05 deg/s/degC).

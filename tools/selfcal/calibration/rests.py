@@ -13,8 +13,8 @@ from scipy.stats import chi2
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask, block_means, runs
 from selfcal.base.units import factor
-from selfcal.calibration.fit import Fit, Problem, fit, linearized
 from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
+from selfcal.calibration.tumble_fit import Fit, Problem, fit, linearized
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of

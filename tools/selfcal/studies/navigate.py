@@ -15,7 +15,7 @@ from scipy import optimize
 from selfcal.base.output import console_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
-from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from selfcal.base.units import STANDARD_GRAVITY, convert
-from selfcal.model.parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
+from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
 
 #: Lengths of the rest, and of the flight with GPS and after its outage, s; the longest outage that is flown.
 REST_S, GPS_S, OUTAGE_S, LONGEST_S = 1800, 300, 60, 300

@@ -30,8 +30,8 @@ from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model
-from selfcal.model.parts import AXES, SHEET_N, Floats
 from selfcal.model.regressors import columns_of, mask_of, offered
+from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
 from selfcal.model.tables import make_tables
 from selfcal.readings.readings import look
 from selfcal.studies.navigate import noise_of

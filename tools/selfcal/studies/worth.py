@@ -17,7 +17,7 @@ from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
 from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Group, Model
-from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
 from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"

@@ -77,13 +77,13 @@ def fleet(
 
     import selfcal
     from selfcal.base.output import check_writable, write_json
+    from selfcal.batch.batch_summary import document_of, lines_of, summed_up
     from selfcal.batch.fail_on import check
     from selfcal.batch.fleet import document_with, judged_units
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
-    from selfcal.batch.record import KILLED, ByContent, Options, Verbs, examined, own_pages, settings_of
     from selfcal.batch.spread import spread
-    from selfcal.batch.summary import document_of, lines_of, summed_up
+    from selfcal.batch.unit_record import KILLED, ByContent, Options, Verbs, examined, own_pages, settings_of
     from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
     from selfcal.batch.verdicts import Limits, check_options, write
     from selfcal.model.file import Model

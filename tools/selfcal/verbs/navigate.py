@@ -26,7 +26,7 @@ def navigate(
 
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.spread import record_seeds, spread
-    from selfcal.model.parts import LAWS
+    from selfcal.model.simulated_parts import LAWS
     from selfcal.studies.navigate import SCHEMA, TOGETHER, Job, rows_of, summary
     from selfcal.studies.navigation import JUDGED
 

@@ -70,7 +70,7 @@ def plan(
     other options are the recording's. `axis`: the first that the `simulate` entry states, else the first of all. A wish
     of a parameter is of the records whose law has it. `plot`: a picture of what is reached over the length.
     `tumble`: how many rests of which length `selfcal tumble` takes: document `selfcal.plan_tumble/1`; wishes are those
-    of `calibration/plan.py`.
+    of `calibration/tumble_plan.py`.
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
     it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
     prior's sd.
@@ -93,7 +93,7 @@ def plan(
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
     if tumble:
-        from selfcal.calibration.plan import plan_of
+        from selfcal.calibration.tumble_plan import plan_of
 
         if plot is not None or axis is not None:
             raise UserError("--tumble plans all axes together, and has no picture: leave --axis and --plot out")
@@ -246,7 +246,7 @@ def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     if "levels" in document:
         from selfcal.batch.design import show as table
     elif given.get("tumble"):
-        from selfcal.calibration.plan import show as table
+        from selfcal.calibration.tumble_plan import show as table
     else:
         from selfcal.batch.plan import show as table
     table(document, to_stderr=to_stderr(given))

@@ -15,7 +15,7 @@ from rich.table import Table
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, plotter, print_line, save_picture
 from selfcal.base.units import STANDARD_GRAVITY
-from selfcal.calibration.document import side_of
+from selfcal.calibration.tumble_document import side_of
 
 #: By group of parameters, in data sheets' units: word, unit, factor, and what is taken off before.
 SHEET = {

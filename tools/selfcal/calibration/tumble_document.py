@@ -13,9 +13,9 @@ from selfcal.bank.result import HALF_90
 from selfcal.base.grid import Array
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
-from selfcal.calibration.fit import FALSE_ALARM, IDENTIFIED, Fit
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.rests import ACCEL, GYRO, Tumble
+from selfcal.calibration.tumble_fit import FALSE_ALARM, IDENTIFIED, Fit
 from selfcal.logs.recording import Recording
 
 SCHEMA = "selfcal.tumble/1"
