@@ -27,7 +27,7 @@ class Stopped(Exception):
 
 
 class _State:
-    """What came while signals are held."""
+    """The signal that came while signals are held."""
 
     holding = False
     came: int | None = None

@@ -153,7 +153,7 @@ def drawn_rows(model: Model, axis: str, experiment: Experiment, bit_s: float, sa
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """What to record, in words."""
+    """The record to take, in words."""
     print_lines(_lines(document), to_stderr=to_stderr)
 
 

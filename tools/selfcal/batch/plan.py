@@ -131,7 +131,7 @@ class Ensemble:
         self.typical: dict[str, tuple[Law, dict[str, float]]] = {}
 
     def metrics(self, samples: int) -> Array:
-        """Of records of so many bank samples."""
+        """Metrics of records of `samples` bank samples."""
         if samples not in self.at:
             rows = spread(
                 partial(rows_of, self.model, self.axis, tuple(self.wishes), samples),
@@ -221,7 +221,7 @@ def cycling(
 
 
 def swung(samples: int, cycles: float, swing: float) -> Array:
-    """[n]: so many cycles of a channel about 0."""
+    """`cycles` of a channel about 0 [n]."""
     return np.asarray(0.5 * swing * np.cos(2.0 * math.pi * cycles * (np.arange(samples) + 0.5) / samples))
 
 
@@ -324,7 +324,7 @@ def _half_interval(
 
 
 def picture(document: Mapping[str, Any], path: Path | str) -> None:
-    """What is reached over the length: median and middle four fifths of the records, and the wish."""
+    """Draw the metrics over the length: median and middle four fifths of the records, and the wish."""
     wishes = [wish for wish in document["wishes"] if wish["curve"]]
     size = (7.0, 2.9 * len(wishes))
     figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)

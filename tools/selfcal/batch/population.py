@@ -67,7 +67,7 @@ class Interval:
     q95: float
 
     def through(self, function: Callable[[float], float]) -> Interval:
-        """Of a rising function of it."""
+        """The interval of a rising function of the quantity."""
         return Interval(function(self.median), function(self.q05), function(self.q95))
 
 
@@ -234,7 +234,7 @@ def populations(
 
 
 def _is_group(inside: int, units: int) -> bool:
-    """Whether so many of the units are a group among the others: not the larger part, and neither too few."""
+    """Whether `inside` of the units are a group among the others: at most half, and neither side too small."""
     return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
 
 

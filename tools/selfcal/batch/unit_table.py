@@ -55,7 +55,7 @@ class Unit:
         return causes
 
     def small(self, axis: str) -> set[str]:
-        """Those of them that change no number by as much as matters."""
+        """Causes that change no number by as much as matters."""
         return set(self.causes(axis)) - {
             "unexplained",
             *self.record.get("diagnosis", {}).get(axis, {}).get("material", []),

@@ -235,7 +235,7 @@ def _rest_s(
         return None
 
     def chance(times: float) -> float:
-        """That the verdict is there at so many times the length."""
+        """Probability of a verdict at `times` the length."""
         left, moves = sd / math.sqrt(times), sd * math.sqrt(1.0 - 1.0 / times)
         return _normal((abs(middle) - HALF_90 * left) / moves) + _normal((-abs(middle) - HALF_90 * left) / moves)
 

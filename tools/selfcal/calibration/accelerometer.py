@@ -28,7 +28,7 @@ BIAS, SCALE, ANGLE, GRAVITY, THERMAL = slice(0, 3), slice(3, 6), slice(6, 9), 9,
 PLACES = ((0, 1), (0, 2), (1, 2))
 #: sd of a parameter that the logs do not have.
 NONE = 1e-12
-#: A parameter beyond so many sd of its prior is none of an accelerometer.
+#: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
 REACH = 10.0
 #: Rests without which there is no answer.
 FEWEST = 3

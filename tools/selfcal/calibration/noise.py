@@ -23,7 +23,7 @@ from selfcal.logs.recording import Recording
 from selfcal.model.file import Model, Prior
 from selfcal.model.laws import Law
 
-#: A rest of so many seconds identifies the law of the part.
+#: Shortest rest that identifies the law of the part, s.
 LONG_S = 1200.0
 #: Differences of piece means that measure N: fewer leave it to the model.
 FEWEST = 30
@@ -80,7 +80,7 @@ def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Arr
 
 
 def mean_square(prior: Prior) -> float:
-    """Of a parameter under its prior."""
+    """Mean square of a parameter under its prior."""
     if prior.law == "log_normal":
         return prior.median**2 * math.exp(2.0 * prior.sd**2)
     low, high = prior.min, prior.max

@@ -228,7 +228,7 @@ class Cause:
 
 
 def shown(*names: str) -> Callable[[Look], Sequence[str]]:
-    """The same pictures for every look."""
+    """Pictures that every look has alike."""
     return lambda look: names
 
 

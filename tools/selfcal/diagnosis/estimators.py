@@ -203,7 +203,7 @@ METHODS: Mapping[str, Callable[[Array, Array], Estimate]] = MappingProxyType(
         "subspace": subspace,
     }
 )
-#: Those that take the input as it was read.
+#: Methods that take the input as it was read.
 AS_READ = ("instruments",)
 
 
@@ -244,7 +244,7 @@ def _likeliest(tried: Mapping[int, Tried], n: int) -> Estimate:
 
 
 def _delayed(values: Array, steps: Iterable[int]) -> Array:
-    """[n, k]: values [n] so many steps late, 0 before their begin."""
+    """Values [n] late by each of `steps` [k]: [n, k], 0 before their begin."""
     late = [np.concatenate([np.zeros(k), values[: values.size - k]]) for k in steps]
     return np.array(late).reshape(len(late), values.size).T
 

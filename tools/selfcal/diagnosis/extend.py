@@ -301,7 +301,7 @@ def _channel_of(column: Column) -> tuple[str, ...]:
 
 
 def _of_findings(axis: Diagnosed) -> Iterator[_Effect]:
-    """Of the findings, also of those that the model file states. The lattice and the range are in the groups."""
+    """Effects of findings, also of those that the model file states. Groups have the lattice and the range."""
     for finding in (*axis.findings, *axis.stated):
         cause = CAUSES[finding.look.cause]
         keys = cause.effect(finding.look)
@@ -311,7 +311,7 @@ def _of_findings(axis: Diagnosed) -> Iterator[_Effect]:
 
 
 def _of_columns(axis: Diagnosed) -> Iterator[_Effect]:
-    """Of the columns that the model file had."""
+    """Effects of the columns that the model file had."""
     fit = axis.state.best
     sizes: dict[str, list[int]] = {}
     for k, column in enumerate(axis.state.regressors):

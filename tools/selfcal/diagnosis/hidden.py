@@ -37,7 +37,7 @@ from selfcal.likelihood.joint import (
 from selfcal.likelihood.state import EVIDENT, NET_LEAST, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import Array
 
-#: Its name in the document.
+#: Name of the quantity in the document.
 ID = "hidden_input"
 #: Samples of which an error ahead is taken, at least.
 LEAST = 60
@@ -164,7 +164,7 @@ class Hidden:
         return bins_of(self.y)
 
     def correlation(self, one: str, two: str) -> float:
-        """Of the white noise of two axes."""
+        """Correlation of the white noise of two axes."""
         at = [self.names.index(name) for name in (one, two)]
         return float(self.model.correlation[at[0], at[1]])
 

@@ -35,7 +35,7 @@ from selfcal.readings.readings import (
 
 #: Samples that a diagnosis needs at least, and takes at most, gaps included.
 LEAST, MOST = 200, 10_000_000
-#: Readings so many times beyond the sensor's range are no readings: the unit is wrong, or the file.
+#: Largest reading over the sensor's range: beyond, the unit is wrong, or the file.
 BEYOND = 100.0
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
 SLOWEST = 0.99

@@ -36,11 +36,11 @@ SCHEMA = "selfcal.response/1"
 SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 #: Records that the answer makes. Of 20 records the next one is within their range with 90 %.
 RECORDS = 20
-#: Several inputs are each looked at beside the others so many times before they are answered.
+#: Rounds in which each of several inputs is searched beside the others.
 ROUNDS = 2
-#: Of so many readings of an input one may be wild on either side.
+#: Readings of an input for each wild one on either side.
 WILD = 1000
-#: A misfit is named that chance makes once in so many records.
+#: Records for each false misfit.
 MISFIT = 500.0
 #: Quantiles of an interval.
 ENDS = tuple(0.5 + end * PROBABILITY / 2.0 for end in (-1.0, 0.0, 1.0))

@@ -24,7 +24,7 @@ Indices = NDArray[np.int64]
 
 #: Simulated records a band rests on.
 ENSEMBLE = 48
-#: Of which so many have a statistic at least.
+#: Fewest simulated records that have a statistic.
 FEWEST = 8
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
 LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}

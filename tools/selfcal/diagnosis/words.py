@@ -15,7 +15,7 @@ from selfcal.logs.recording import SIDE_CHANNELS
 
 
 def verdict(axis: Mapping[str, Any]) -> str:
-    """The verdict on an axis of the document; one that is not finished is none."""
+    """The verdict on an axis of the document, or that its diagnosis is not finished."""
     if not axis.get("unfinished"):
         return str(axis["verdict"])
     return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
@@ -147,7 +147,7 @@ def _size(key: str, value: Any) -> str:
 
 
 def statistic(name: str) -> str:
-    """What stands out, by the name of a statistic or of a check."""
+    """The meaning of a statistic or a check, by its name."""
     return next((told for begin, told in STATISTICS if name.startswith(begin)), name.replace("_", " "))
 
 
@@ -227,7 +227,7 @@ def effects(finding: Mapping[str, Any]) -> str:
 
 
 def action(finding: Mapping[str, Any]) -> str:
-    """What to do. A coefficient that is known well enough is applied, and not measured again."""
+    """The next step. A coefficient that is known well enough is applied, and not measured again."""
     if "readings_hz" in finding["estimate"]:
         return f"Look for what turns or switches at {finding['estimate']['readings_hz']['median']:.3g} Hz."
     if finding.get("next_record") and finding.get("confirmed_on") is not None:
@@ -287,7 +287,7 @@ def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f
 
 
 def carried(finding: Mapping[str, Any]) -> list[str]:
-    """What a finding gains on a second recording, in a line; none without one."""
+    """The gain of a finding on a second recording, in a line; no line without one."""
     if finding.get("gain_on"):
         score = finding["gain_on"]["log_score_per_sample"]
         more = score["after"] - score["before"]

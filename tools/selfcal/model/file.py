@@ -58,7 +58,7 @@ SMALLEST = 1e-20
 LN_LIMIT = 46.0
 #: sd from the middle of a log-normal prior to its limits: SELFCAL_LOG_NORMAL in lib/selfcal_tables.h.
 LOG_NORMAL_REACH = 4.0
-#: Its sd: below, a float no longer tells the limits of large logarithms apart.
+#: sd of a log-normal prior: below, the limits of large logarithms are equal floats.
 LOG_NORMAL_SD = (1e-4, 5.0)
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
@@ -200,7 +200,7 @@ class Regressor:
         return (f"{self.name}.sin", f"{self.name}.cos") if self.kind == "periodic" else (self.name,)
 
 
-#: Nearer than so many standard deviations too much of the noise itself would be kept out.
+#: Least distance of an outlier, sd: below, too much of the noise itself would be kept out.
 LEAST_OUTLIER_SD = 4.0
 
 
@@ -231,7 +231,7 @@ class Handling:
         return self.outlier_sd, self.steps, self.variance_changes
 
 
-#: Of a model that says nothing of it.
+#: Handling of a model that states none.
 NOT_HANDLED = Handling()
 
 
@@ -290,7 +290,7 @@ class Model:
 
     @property
     def left_out(self) -> str:
-        """What a bank leaves out, in words; "" for nothing."""
+        """Regressors that a bank leaves out, in words; "" for none."""
         names = ", ".join(regressor.name for regressor in self.beyond)
         said = f"a bank has {MOST_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
         return f"{self.path}: {said}" if names else ""
@@ -311,12 +311,12 @@ class Model:
 
     @staticmethod
     def of_tree(tree: Mapping[str, Any], path: Path) -> Model:
-        """The same of a tree that is read already, from the file `path`."""
+        """Check a tree that is read already, from the file `path`."""
         return _Reader(path, tree).model()
 
 
 def with_room(regressors: Sequence[Regressor]) -> tuple[Regressor, ...]:
-    """Those that a bank has columns for: in their order, each whole or not at all."""
+    """Regressors that a bank has columns for: in their order, each whole or not at all."""
     kept: list[Regressor] = []
     for regressor in regressors:
         if sum(len(other.columns) for other in (*kept, regressor)) <= MOST_COLUMNS:

@@ -89,7 +89,7 @@ def _channel(one: Regressor) -> tuple[str, str, str]:
 
 
 def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
-    """Of each of its columns."""
+    """`selfcal_source_t` of each column of a regressor."""
     if one.kind == "time":
         return [(KIND["TIME"], 0, 0.0, 0.0)]
     if one.kind == "step":

@@ -147,7 +147,7 @@ class Tables:
 
     @property
     def rate_hz(self) -> float:
-        """Of the samples."""
+        """Rate of the samples."""
         return self.block / self.dt_s
 
     @property
@@ -334,7 +334,7 @@ def _law(prior: Prior) -> PriorLaw:
 
 
 def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, str]:
-    """Of a column by its place in the regressor."""
+    """Source of a column by its place in the regressor."""
     channels = channels_of((regressor,))
     kind, _, number, second = sources_of(regressor, channels)[place]
     return kind, number, second, *(channels[0][:2] if channels else ("", ""))

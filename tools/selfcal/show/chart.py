@@ -70,7 +70,7 @@ class Panel:
 
     @property
     def drawn(self) -> list[Curve | Band]:
-        """What the key and the tables name."""
+        """All curves and bands, as the key and the tables name them."""
         return [*self.curves, *self.bands]
 
     @property

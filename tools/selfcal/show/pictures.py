@@ -331,7 +331,7 @@ def _lattice(finding: Finding, factor: float, unit: str) -> Compared:
 
 
 def _limit(finding: Finding, factor: float, unit: str) -> Compared:
-    """The same; before, the model reads out without a limit."""
+    """Histogram of the readings; before, the model reads out without a limit."""
     before = finding.before
     # The state after saturation holds clipped readings drawn anew: the readings are the record's own.
     states = (before, replace(finding.after, y=before.y))
@@ -418,7 +418,7 @@ def _missing(finding: Finding, record: Record) -> Figure:
 
 
 def _effect(finding: Finding) -> Array:
-    """What the finding's columns add to a reading [n], in the inner unit."""
+    """Sum of the finding's columns in a reading [n], in the inner unit."""
     known = {column.name for column in finding.before.regressors}
     effect = np.zeros(finding.after.y.size)
     for k, column in enumerate(finding.after.regressors):

@@ -140,7 +140,7 @@ def _told(
     recording: Recording,
     second: Recording | None,
 ) -> Told:
-    """What a filter is told of an axis by a model with these terms."""
+    """Noise and errors of an axis by a model with these terms."""
     own = with_terms(model, record, found, name, terms, [column for term in terms for column in term.columns])
     stays = {column.name for term in terms if why_stays(term.finding) for column in term.columns}
     anew = {column.name for term in terms if term.anew for column in term.columns} - stays

@@ -225,7 +225,7 @@ def _alone(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
 
 
 def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
-    """What the document says of an answer, in the unit `to`."""
+    """The document's entry of an answer, in the unit `to`."""
     factor = units.factor(unit, to)
     return {
         "parameters": {

@@ -30,7 +30,7 @@ CORNER_HZ = 0.02
 #: Length of dead reckoning, s, and its seconds after a rest.
 RECKONED_S = 60
 SECONDS = (*range(1, RECKONED_S + 1), *(h for h in HORIZONS_S if h > RECKONED_S))
-#: Its errors in the document, and in the table.
+#: Errors of dead reckoning in the document, and in the table.
 RECKONED = {"heading_deg": "heading, deg", "position_m": "position, m"}
 #: The gyro that turns each horizontal accelerometer out of the level.
 ACROSS = {"ax": "gy", "ay": "gx"}
@@ -125,7 +125,7 @@ class After:
         return cls(model.group_of(axis).unit, *predictions(model, axis, y[:rest]), y[rest : rest + RECKONED_S])
 
     def errors(self, unit: str) -> dict[str, Floats]:
-        """Of the minute's corrected readings, by method."""
+        """Errors of the minute's corrected readings, by method."""
         errors = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
         return {name: convert(error, self.unit, unit) for name, error in errors.items()}
 

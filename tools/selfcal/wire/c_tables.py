@@ -67,7 +67,7 @@ def bank_bytes(tables: Tables, axes: int = 0) -> int:
 
 
 def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
-    """What of the model comes to nothing."""
+    """Parts of the model that have no effect."""
     if model.left_out:
         yield model.left_out
     if model.hidden_input is not None:
@@ -84,7 +84,7 @@ def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
 
 
 def assumption(tables: Tables) -> str:
-    """What the tables take for granted of the samples that they are fed with."""
+    """The rate and the interval that the tables assume of their samples."""
     samples = "1 sample" if tables.block == 1 else f"{tables.block} samples"
     make = "makes" if tables.block == 1 else "make"
     return f"{samples} at {tables.rate_hz:.7g} Hz {make} a bank sample of {tables.dt_s:.7g} s"
@@ -147,7 +147,7 @@ def core_of(target: str) -> str:
 
 
 def _values(model: Model, tables: Tables, target: str, start: str, hold: bool) -> dict[str, Any]:
-    """What the templates show."""
+    """Values of the templates."""
     return {
         "model": model,
         "tables": tables,

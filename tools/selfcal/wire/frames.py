@@ -158,7 +158,7 @@ def crc12(data: bytes) -> int:
 
 
 def frame_crc(frame_id: int, data: bytes) -> int:
-    """What bits 52 to 63 of a frame with this id and these 8 bytes must be."""
+    """Checksum of a frame with this id and these 8 bytes: its bits 52 to 63."""
     return crc12(bytes((frame_id >> 8, frame_id & 0xFF, len(data))) + data[:6] + bytes((data[6] & 0x0F,)))
 
 
@@ -369,7 +369,7 @@ class Decoder:
         self._corrects = False  # what comes belongs to that sample
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
-        #: The same of the calibration by rests in several positions, since the last that came of one.
+        #: Last value of each signal of the calibration by rests in several positions.
         self.tumble: dict[str, float] = {}
         #: Latest module time of a frame, unwrapped, ms. It goes back only if the module starts anew.
         self.time_ms = 0
@@ -695,7 +695,7 @@ class Streams:
 
     @property
     def statistics(self) -> Statistics:
-        """Of all together. Frames of a passing stranger count as refused."""
+        """Counts of all nodes together. Frames of a passing stranger count as refused."""
         known = self.known
         total = Counter(vars(self.strangers))
         for node, decoder in list(self.decoders.items()):

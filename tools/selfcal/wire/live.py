@@ -263,7 +263,7 @@ class View:
         self._console.print(self.renderable(whole=True))
 
     def renderable(self, *, whole: bool = False) -> RenderableType:
-        """What is to be seen now; unless `whole`, no higher than the terminal."""
+        """The view now; unless `whole`, no higher than the terminal."""
         width = self._console.width
         modules = {node: self._module(node) for node in self.streams.known}
         first = next(iter(modules.values()), None)
@@ -310,7 +310,7 @@ class View:
         return Text(f"{said}, {step}", "green" if done else "yellow")
 
     def _next_step(self, module: Module, shown: Sequence[str]) -> str:
-        """What to do about a module; "" where there is nothing."""
+        """The next step for a module; "" without one."""
         contact, status = self._contact_of(module), module.decoder.status
         if wrong := module.decoder.foreign or module.decoder.twins:
             return wrong
@@ -328,7 +328,7 @@ class View:
         return f"{names}: {REASONS.get(word, word)}" if word else ""
 
     def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
-        """What is to be seen of a module, below its title; `height` lines at most."""
+        """The lines of a module below its title, `height` at most."""
         foreign = module.decoder.foreign
         if foreign:
             return [*_flow([Text(word, "bold red") for word in foreign.split()], width, 1), self._counts(module)]
@@ -354,7 +354,7 @@ class View:
 
     @staticmethod
     def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
-        """What the record is too short for."""
+        """The law that the record is too short for."""
         judgements = [report.adequacy for report, _ in last.values()]
         known = [judged.temperature_moved for judged in judgements if judged and judged.temperature_moved is not None]
         moved = max(known, default=TEMPERATURE_NEEDED)
@@ -388,7 +388,7 @@ class View:
         return Text.assemble((f"{name}   module time {time_s:.1f} s   ", "bold"), self._state(module))
 
     def _state(self, module: Module | None) -> Text:
-        """What the module is doing, as far as it is heard."""
+        """State of the module, as far as it is heard."""
         contact = self._contact_of(module)
         status = module.decoder.status if module is not None else {}
         finished = module is not None and module.decoder.finished
@@ -463,7 +463,7 @@ def _calibration(values: Mapping[str, float]) -> list[str]:
 
 
 def counted(s: Statistics) -> str:
-    """What became of the frames of a stream."""
+    """Counts of a stream's frames, in words."""
     foreign = f", {s.foreign} foreign" if s.foreign else ""
     return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused{foreign}"
 

@@ -169,7 +169,7 @@ class Run:
         return {"schema": MODULES, "modules": {str(node): entry for node, entry in documents.items()}}
 
     def farewell(self) -> list[str]:
-        """What went wrong at the end, if anything did."""
+        """Faults at the end, a line each."""
         if isinstance(self.source, FrameLog):
             damage = self.source.damage
             return [f"{self.name}: the log is damaged and ends early: {damage}"] if damage else []

@@ -78,7 +78,7 @@ class Target:
 
     @property
     def programs(self) -> tuple[str, ...]:
-        """Of PROGRAMS, those that it takes."""
+        """Members of PROGRAMS that build and run it."""
         return ("make", "arm-none-eabi-gcc", "qemu-system-arm") if self.board else ("make", "cc")
 
     @property
@@ -96,7 +96,7 @@ TARGETS = {
 
 
 def tables_of(model: Model, rate_hz: float, axes: Sequence[str], target: str, start: Start | None) -> Tables:
-    """Of a firmware, with measured priors from `start`."""
+    """Tables of a firmware, with measured priors from `start`."""
     return warmed(make_tables(model, rate_hz, tuple(axes), target), start)
 
 
@@ -331,7 +331,7 @@ def can_bus(channel: str) -> tuple[str, Link]:
 
 
 def _ending(module: subprocess.Popen[str]) -> str:
-    """What the firmware says from here on, its channel being closed."""
+    """Output of the firmware from here on, its channel being closed."""
     try:
         return module.communicate(timeout=TIMEOUT_S)[0]
     except subprocess.TimeoutExpired:

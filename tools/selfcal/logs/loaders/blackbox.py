@@ -31,7 +31,7 @@ _EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30
 
 
 class _Damaged(Exception):
-    """A frame that is none."""
+    """The bytes are no frame."""
 
 
 @dataclass

@@ -166,7 +166,7 @@ def _bound(kind: int, soft: int, hard: int) -> None:
 
 
 def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[str, Any]:
-    """What the JSON says of a table, the bytes of whose columns join `arrays`."""
+    """The JSON of a table; the bytes of its columns join `arrays`."""
     if len(table.members) > MOST_COLUMNS:
         raise UserError(f"{path}: {table.source}: more than {MOST_COLUMNS} columns")
     columns = []

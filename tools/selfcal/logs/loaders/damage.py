@@ -1,4 +1,4 @@
-"""What of a file could not be read. Loaders count it, `recording.py` tells it.
+"""Damage of a file. Loaders count it, `recording.py` reports it.
 
 A log is a row of messages. A loader says where a sound message ends; `walk` finds the stretches between sound messages.
 """
@@ -110,7 +110,7 @@ def walk(
 def sifted(
     data: Bytes, at: int, end_of: Callable[[int], int], *, checked: bool = False
 ) -> tuple[Damaged, bytes | None]:
-    """What is damaged of the messages from `at` on, and the file without it; None where all is sound."""
+    """The damage of the messages from `at` on, and the file without it; None where all is sound."""
     damaged, kept, since = SOUND, list[bytes](), 0
     for begin, end, sound in walk(data, at, end_of, checked=checked):
         if not sound:

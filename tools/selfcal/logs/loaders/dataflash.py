@@ -53,7 +53,7 @@ class _Rows:
         self.headings, self.values = headings, array("d")
 
     def table(self, source: str) -> Table:
-        """The table. A temperature of 0 throughout is none."""
+        """The table. Drop a temperature that is 0 throughout."""
         values = np.array(self.values).reshape(-1, len(self.headings))
         columns = {name: values[:, place] for place, name in enumerate(self.headings)}
         return of_arrays(source, {name: part for name, part in columns.items() if name[:4] != "temp" or part.any()})

@@ -64,9 +64,9 @@ class _Form:
     file: str = ""
     needs: str = ""
     before: str = ""
-    """What a line before the headings begins with."""
+    """How a line before the headings begins."""
     count: float = 1.0
-    """Of the time: units of one count."""
+    """Units of one count of the time."""
 
 
 _AXIS = r"(?P<axis>[xyz])"
@@ -86,7 +86,7 @@ _ACCEL = r"(?:acc|accl|accel|accelerometer|acceleration|lin(?:ear)?[_ ]?acc(?:el
 _FIRST = rf"{_BEFORE}(?P<axis>[xyz])(?:[ _-]axis)?[ _-]?"
 #: A rate of turn by the axis of a vehicle.
 _VEHICLE = {"roll": "x", "pitch": "y", "yaw": "z"}
-#: Any heading with an axis: its unit tells of which sensor.
+#: Any heading with an axis: its unit decides which sensor.
 _ANY = (
     r"(?P<source>.*?)[ ._/-]*(?P<axis>[xyz])(?:[ _-]?axis)?",
     r"(?P<axis>[xyz])(?:[ _-]axis)?[ ._/-]+(?P<source>[^[(]*)",
@@ -207,7 +207,7 @@ def number_of(keys: Sequence[str]) -> str | None:
 
 
 def sides_of(keys: Iterable[str]) -> Sensor | None:
-    """The temperature, with its time, of a table without axes; None where there is none."""
+    """The temperature, with its time, of a table without axes; None without one."""
     form = FORMS[-1]
     listed = list(keys)
     meant = _temperature(form, listed, "")

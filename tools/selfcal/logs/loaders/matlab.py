@@ -48,7 +48,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _mat4(data: bytes) -> _Variables:
-    """Of a file of version 4. Raises ValueError, and EOFError where it is cut off."""
+    """Variables of a file of version 4. Raises ValueError, and EOFError where it is cut off."""
     at = 0
     while at < len(data):
         order = "<" if 0 <= struct.unpack_from("<i", data, at)[0] < 5000 else ">"
@@ -68,7 +68,7 @@ def _mat4(data: bytes) -> _Variables:
 
 
 def _mat5(data: memoryview, order: str) -> _Variables:
-    """Of a file of version 5 to 7, unpacked. Raises ValueError, and EOFError where it is cut off."""
+    """Variables of a file of version 5 to 7, unpacked. Raises ValueError, and EOFError where it is cut off."""
     at = _MAT_HEADER
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)

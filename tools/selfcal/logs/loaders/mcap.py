@@ -195,7 +195,7 @@ def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
 
 
 def _end(data: Bytes, at: int) -> int:
-    """The end that a record at a place states; 0 where there is none."""
+    """The end that a record at a place states; 0 without a record."""
     if at + _HEAD.size > len(data):
         return 0
     kind, length = _HEAD.unpack_from(data, at)
@@ -231,7 +231,7 @@ def _summary(data: Bytes) -> list[Any]:
 
 
 def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
-    """What makes a mapping of a message in JSON or protobuf."""
+    """The function that makes a mapping of a message in JSON or protobuf."""
     if channel.message_encoding == "json":
         return lambda data: value if isinstance(value := json.loads(data), dict) else {}
     from mcap_protobuf.decoder import DecoderFactory

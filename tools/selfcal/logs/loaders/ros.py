@@ -127,6 +127,6 @@ def _has_wal(path: Path) -> bool:
 
 
 def no_topic(path: Path, kinds: object) -> UserError:
-    """What to raise for a bag without a topic that is read."""
+    """The error for a bag without a topic that is read."""
     there = ", ".join(sorted({str(kind) for kind in kinds})[:6]) or "none"  # type: ignore[attr-defined]
     return UserError(f"{path}: no message of sensor_msgs/Imu or sensor_msgs/Temperature (there are: {there})")

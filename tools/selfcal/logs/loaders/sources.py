@@ -109,7 +109,7 @@ def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
 
 
 def _listed(sources: dict[str, list[Part]], axes: dict[str, frozenset[str]], names: Sequence[str]) -> str:
-    """What to type for each source, with its axes, rate and length."""
+    """The option to type for each source, with its axes, rate and length."""
     lines = []
     for name in names[:_MOST_LISTED]:
         part = max(sources[name], key=lambda one: (bool(one.axes), one.rate_hz))

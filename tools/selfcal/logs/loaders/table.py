@@ -103,7 +103,7 @@ class Table:
 
     @property
     def where(self) -> str:
-        """What a message puts after the path."""
+        """The place that a message names after the path."""
         return self.line or (f"{self.source}: " if self.source else "")
 
     def rows(self, path: Path, fields: Sequence[Field]) -> Rows:

@@ -297,7 +297,7 @@ class TextReader:
         return text, header + 1, row + 1
 
     def _separated(self, header: str, row: str, number: int) -> str:
-        """What separates columns: the one sign of the header that splits the first row in as many cells."""
+        """The separator of columns: the one sign of the header that splits the first row in as many cells."""
         found = [sign for sign in _SEPARATORS if sign in header]
         if len(found) > 1:
             fitting = [sign for sign in found if row.count(sign) == header.count(sign)]

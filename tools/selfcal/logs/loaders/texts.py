@@ -37,7 +37,7 @@ class Text:
     open: Opened | None = None
 
 
-#: Of a line of headings whether one of them is known.
+#: Whether a line of headings has a known one.
 Knows = Callable[[Sequence[str]], bool]
 
 

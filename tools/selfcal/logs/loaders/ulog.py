@@ -129,7 +129,7 @@ def _triad(letter: str, values: Sequence[NDArray[Any]]) -> Columns:
 
 
 def _rate(data: Mapping[str, NDArray[Any]], name: str, place: int) -> NDArray[np.float64]:
-    """An increment over the interval that it was summed over, us; NaN where that is none."""
+    """An increment over the interval that it was summed over, us; NaN for an interval of 0."""
     interval = np.asarray(data[f"{name}_dt"], np.float64) * 1e-6
     increment = np.asarray(data[f"{name}[{place}]"], np.float64)
     return np.asarray(np.where(interval > 0.0, increment / np.where(interval > 0.0, interval, 1.0), np.nan))
