@@ -21,7 +21,7 @@ import yaml
 
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import DEFAULT
-from selfcal.model.parts import Floats
+from selfcal.model.simulated_parts import Floats
 from selfcal.studies import outage
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.simulate import simulate

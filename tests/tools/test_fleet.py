@@ -24,11 +24,11 @@ import pytest
 
 from selfcal.base.errors import UserError
 from selfcal.base.units import factor
+from selfcal.batch.batch_summary import document_of, lines_of, summed_up
 from selfcal.batch.files import Source
 from selfcal.batch.fleet import document_with, judged_units
 from selfcal.batch.fleet_page import page
 from selfcal.batch.spread import DEATHS, Row, spread
-from selfcal.batch.summary import document_of, lines_of, summed_up
 from selfcal.batch.unit_table import COLUMNS, Unit
 from selfcal.batch.verdicts import Limits
 from selfcal.logs.recording import save

@@ -17,7 +17,7 @@ from scipy import stats
 from selfcal.bank.library import Bank
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.model.file import Model
-from selfcal.model.parts import AXES, LAWS, Floats
+from selfcal.model.simulated_parts import AXES, LAWS, Floats
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigate import FIGURES, HORIZONS_S, TIMES, TITLES, identified_noise, matched, sheet_noise, show
 from selfcal.studies.navigation import (

@@ -25,8 +25,8 @@ from selfcal.diagnosis.carried import Term, with_terms
 from selfcal.diagnosis.finding import Finding
 from selfcal.likelihood.state import Look
 from selfcal.model.file import DEFAULT, Model
-from selfcal.model.parts import AXES, SHEET_N, Floats
 from selfcal.model.regressors import offered
+from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import (
     GPS_S,

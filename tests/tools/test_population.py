@@ -23,9 +23,9 @@ from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.library import Bank
 from selfcal.bank.result import HALF_90
 from selfcal.base.units import factor
+from selfcal.batch.batch_summary import apart_words, seen_from_words
 from selfcal.batch.drift import Series, drifts_of
 from selfcal.batch.population import FALSE_ALARM, FALSE_NAME, TWO_GROUPS, Measured, Population, populations
-from selfcal.batch.summary import apart_words, seen_from_words
 from selfcal.logs.recording import save
 from selfcal.model.file import DEFAULT, Model, read_yaml
 from selfcal.model.tables import make_tables

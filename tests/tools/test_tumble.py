@@ -27,14 +27,14 @@ import selfcal.verbs.tumble as verb
 from selfcal.base.errors import UserError
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
-from selfcal.calibration.document import OF_ACCEL, OF_GYRO
 from selfcal.calibration.earth import gravity_at, place
-from selfcal.calibration.export import FORMS
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.noise import Noise, Term, drift
-from selfcal.calibration.plan import plan_of
 from selfcal.calibration.rests import tumble_of
-from selfcal.calibration.show import show
+from selfcal.calibration.tumble_document import OF_ACCEL, OF_GYRO
+from selfcal.calibration.tumble_export import FORMS
+from selfcal.calibration.tumble_plan import plan_of
+from selfcal.calibration.tumble_show import show
 from selfcal.logs.recording import Recording
 from selfcal.model.file import DEFAULT, Model
 

@@ -13,7 +13,7 @@ import pytest
 from selfcal.base.errors import UserError
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.model.file import Model
-from selfcal.model.parts import SHEET_N, TURN_ON, simulate
+from selfcal.model.simulated_parts import SHEET_N, TURN_ON, simulate
 from selfcal.studies.worth import (
     CORNER_HZ,
     LAST_S,

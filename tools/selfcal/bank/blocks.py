@@ -12,13 +12,12 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
-from selfcal.base.grid import equal_runs
-from selfcal.model.file import Group
-from selfcal.model.tables import Tables
+from selfcal.base.grid import Array, equal_runs
+from selfcal.logs.recording import Recording, as_float
+from selfcal.model.file import Group, Model
+from selfcal.model.tables import Tables, make_tables
 from selfcal.readings.readings import mostly_beyond
 
-#: Fewest whole averages, and the share of readings in them: too few, if other averages have lost most of their samples.
-FEWEST_WHOLE, WHOLE_SHARE = 20, 0.25
 #: Bank intervals, gaps included, that the checks and the reference compute one by one.
 MOST_DENSE = 10_000_000
 
@@ -69,12 +68,21 @@ def usable_blocks(
     if present.size < needed:
         more = alone if tables.block > 1 and each >= needed else ""
         raise UserError(f"too short: {averages}, {needed} are needed (samples kept out: {kept}){more}")
-    if present.size < FEWEST_WHOLE and whole < WHOLE_SHARE * each:
+    # Other averages have lost most of their samples.
+    if present.size < 20 and whole < 0.25 * each:
         raise UserError(f"too few whole averages: {averages} hold {whole:.0f} of the {each} readings{alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"
         raise UserError(f"{equal}: a stuck or too coarse reading (samples kept out: {kept})")
     return blocks
+
+
+def bank_means(recording: Recording, model: Model, name: str, rate_hz: float | None) -> tuple[Array, float]:
+    """The bank's means [m] of an axis at a rate (None: the model's), NaN in gaps, and their interval, s."""
+    recording, group = recording.along(name), model.group_of(name)
+    tables = make_tables(replace(model, regressors=()), recording.rate_hz, (name,), bank_rate_hz=rate_hz)
+    samples = as_float(recording.in_unit(name, group.unit))
+    return usable_blocks(samples, recording.missing_before, tables, group).mean, tables.dt_s
 
 
 def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDArray[np.bool_]]:

@@ -3,6 +3,7 @@ the package's build, and the model's tables are handed over at run time."""
 
 from __future__ import annotations
 
+import struct
 from collections import deque
 from dataclasses import astuple
 from pathlib import Path
@@ -16,8 +17,6 @@ from selfcal.model.tables import Tables, gate_table
 if TYPE_CHECKING:
     import can
 
-#: Bytes of a frame's identifier and of the whole frame, as the module hands it over.
-IDENTIFIER, FRAME = 4, 12
 #: Rows between two reads of the frames.
 ROWS = 4096
 
@@ -52,10 +51,7 @@ class Played:
         import can
 
         if not self._frames and not self._module.ended:
-            sent: bytes = self._module.play(ROWS)
-            for start in range(0, len(sent), FRAME):
-                identifier = int.from_bytes(sent[start : start + IDENTIFIER], "little")
-                self._frames.append((identifier, sent[start + IDENTIFIER : start + FRAME]))
+            self._frames.extend(struct.iter_unpack("<I8s", self._module.play(ROWS)))
         if not self._frames:
             return None
         identifier, data = self._frames.popleft()

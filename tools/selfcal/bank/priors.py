@@ -21,38 +21,22 @@ from numpy.typing import NDArray
 from selfcal.bank.result import AxisResult
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import Recording, as_float
-from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Gate, Group, Model, Prior
+from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.readings.rest import BIAS_SD, rest_of
 
-#: Own prior of N: factor to each side of the record's N; of a drift: factor beyond the default ratio to N.
-DECADES, DRIFT_MARGIN = 100.0, 10.0
+#: Factor of the own prior of N to each side of the record's N.
+DECADES = 100.0
 #: Narrowest range of N, a factor, that is replaced: a narrower one is knowledge of the part (warm start, own model).
 NARROW = 10.0
-#: Distance of the record's N beyond a limit, in sd of ln N; the sd of ln N times sqrt(n).
-OUTSIDE_SD, MEDIAN_SD = 2.0, 1.2
-#: Factor of the Allan deviation above the largest that the priors allow, from which on the drift is outside.
-DRIFT_ABOVE = 1.5
 #: Largest difference of equal means, a share of the largest mean: a counter's differences are rounded by that.
 SAME = 1e-10
-#: Differences of neighbouring means that show a deviation.
-FEWEST, FEWEST_OF_DRIFT = 8, 24
-#: Median of the square of a normal value over its variance.
-MEDIAN_SQUARE = 0.4549364
-#: Greatest Allan deviation of a Gauss-Markov drift over its sigma_m.
-MARKOV_PEAK = 0.62
+#: Differences of neighbouring means that show a deviation; of a drift they are 24.
+FEWEST = 8
 #: Level over the sd of the own bias prior.
 LEVEL_SD = 2.0
-#: A posterior leans on an end that lies within two of its deviations of its median: this share of the way from the
-#: median to the nearer quantile is left to the end. The farther quantile is within a factor of e of it: beyond that the
-#: record leaves the parameter open, and its prior holds it.
-LEANS_LEFT, LEANS_WITHIN = 0.2, 1.0
-#: Step of limits that a posterior leans on, a share of their width, and the most steps.
-LEANS_MOVE, LEANS_MOST = 2.0 / 3.0, 4
 #: Nats by which a law must gain: of records that a model's limits hold, at most 1 in 20 gain so much (Markov's bound).
 LEANS_GAIN = math.log(20.0)
-#: Least probability of a law that counts.
-LEANS_LAW = 0.01
 #: Most bank intervals in the search for leaning.
 LEANS_INTERVALS = 20_000
 #: Smallest visible drift over a record of T: K in N / T, sigma_m in N / sqrt(T); of alpha 1 / T.
@@ -93,7 +77,12 @@ def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model
             if moved != group.priors:
                 own[name] = moved
                 noise[group.name] = max(noise.get(group.name, 0.0), GATE_NOISE * seen.N)
-    return replace(_with_own(model, own), gate=_gate(model.gate, noise)) if own else model
+    if not own:
+        return model
+    gate = model.gate
+    if gate is not None:  # its noise is a bound: a noisier axis raises it
+        gate = replace(gate, N={name: max(N, rounded(noise.get(name, 0.0))) for name, N in gate.N.items()})
+    return replace(_with_own(model, own), gate=gate)
 
 
 def _with_own(model: Model, own: Mapping[str, Mapping[str, Prior]]) -> Model:
@@ -131,13 +120,6 @@ def prior_tree(prior: Prior) -> dict[str, Any]:
     if prior.law == "log_normal":
         return {"law": prior.law, "median": prior.median, "sd": prior.sd}
     return {"law": prior.law, "min": prior.min, "max": prior.max}
-
-
-def _gate(gate: Gate | None, noise: Mapping[str, float]) -> Gate | None:
-    """The gate's noise is a bound: a noisier axis raises it."""
-    if gate is None:
-        return None
-    return replace(gate, N={name: max(N, rounded(noise.get(name, 0.0))) for name, N in gate.N.items()})
 
 
 def at_rest(recording: Recording, name: str, model: Model) -> Seen | None:
@@ -186,10 +168,11 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             level = level if tau else float(np.median(mean))
             step = np.diff(mean)[np.diff(interval[whole]) == 1]
             step[np.abs(step) < SAME * np.abs(mean).max()] = 0.0
-            if step.size < (FEWEST_OF_DRIFT if tau else FEWEST):
+            if step.size < (24 if tau else FEWEST):
                 break
             square = step * step
-            typical, all_of_them = float(np.median(square)) / MEDIAN_SQUARE, float(square.mean())
+            # The median of the square of a normal value is 0.455 of its variance.
+            typical, all_of_them = float(np.median(square)) / 0.4549364, float(square.mean())
             # On a coarse lattice the median is of its steps: never more than the mean square.
             deviations.append(math.sqrt(0.5 * (min(typical, all_of_them) or all_of_them)))
             tau.append(tau_s)
@@ -212,7 +195,8 @@ def outside(group: Group, seen: Seen) -> bool:
     N = group.priors["N"]
     if known(group):
         return False
-    margin = math.exp(OUTSIDE_SD * MEDIAN_SD / math.sqrt(float(seen.differences[0])))
+    # Two sd of ln N beyond a limit: 1.2 over sqrt(n) each.
+    margin = math.exp(2.0 * 1.2 / math.sqrt(float(seen.differences[0])))
     beyond = not N.min / margin <= seen.N <= N.max * margin
     return beyond or _drifts(group, seen) or abs(seen.level) > BIAS_SD * group.priors["bias"].sd
 
@@ -220,8 +204,9 @@ def outside(group: Group, seen: Seen) -> bool:
 def _drifts(group: Group, seen: Seen) -> bool:
     """Whether the deviation over some time is above all that the priors allow."""
     N, K, sigma_m = (group.priors[key].max for key in ("N", "K", "sigma_m"))
-    most = np.sqrt(N**2 / seen.tau_s + K**2 * seen.tau_s / 3.0 + (MARKOV_PEAK * sigma_m) ** 2)
-    return bool((seen.deviation > DRIFT_ABOVE * most).any())
+    # The greatest Allan deviation of a Gauss-Markov drift is 0.62 of its sigma_m.
+    most = np.sqrt(N**2 / seen.tau_s + K**2 * seen.tau_s / 3.0 + (0.62 * sigma_m) ** 2)
+    return bool((seen.deviation > 1.5 * most).any())
 
 
 def about(group: Group, seen: Seen) -> dict[str, Prior]:
@@ -248,7 +233,7 @@ def laid(
     own = {"bias": Prior("normal", sd=sd), "N": _limits(priors["N"].law, least, DECADES * N)}
     for key, prior in priors.items():
         if key not in ("bias", "N", "alpha", *RATIOS):
-            most = max(scale * prior.max, DRIFT_MARGIN * (reach or {}).get(key, 0.0))
+            most = max(scale * prior.max, 10.0 * (reach or {}).get(key, 0.0))
             own[key] = _limits(prior.law, scale * prior.min, most)
     return {**priors, **own}
 
@@ -262,7 +247,8 @@ def moved_along(
     The laws are those of one drift term, without regressors, on the means of LEANS_INTERVALS intervals at most."""
     recording = recording.along(name)
     length_s = recording.duration_s
-    least = _unseen(seen, length_s)
+    size = UNSEEN * seen.N / math.sqrt(length_s)
+    least = {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
     if not _may_lean(priors, seen, least):
         return priors
     from selfcal.bank.library import Bank
@@ -283,7 +269,7 @@ def moved_along(
 
     first = result = report(priors)
     moved, gaining = priors, priors != model.group_of(name).priors  # only the model's own have to be outdone
-    for _ in range(LEANS_MOST):
+    for _ in range(4):
         further = {key: _moved(key, moved[key], end, least) for key, end in leaning(result, moved).items()}
         further = {key: prior for key, prior in further.items() if prior != moved[key]}
         if not further:
@@ -308,7 +294,9 @@ def leaning(result: AxisResult, priors: Mapping[str, Prior]) -> dict[str, int]:
             ):
                 middle = estimate.median / prior.min if end < 0 else prior.max / estimate.median
                 left = math.log(max(near, 1.0))
-                if left < LEANS_LEFT * (math.log(middle) - left) and math.log(far) < LEANS_WITHIN:
+                # A fifth of the way to the nearer quantile is left to the end. Beyond a factor of e the record leaves
+                # the parameter open.
+                if left < 0.2 * (math.log(middle) - left) and math.log(far) < 1.0:
                     ends[key] = end
     return ends
 
@@ -319,16 +307,10 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
     gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
     whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
     return whole[1] > whole[0] + LEANS_GAIN or any(
-        gain[law] > LEANS_GAIN and second.probability[law] > LEANS_LAW
+        gain[law] > LEANS_GAIN and second.probability[law] > 0.01
         for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )
-
-
-def _unseen(seen: Seen, length_s: float) -> dict[str, float]:
-    """Smallest visible value of each parameter of a drift."""
-    size = UNSEEN * seen.N / math.sqrt(length_s)
-    return {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
 
 
 def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float]) -> bool:
@@ -345,7 +327,7 @@ def _moved(key: str, prior: Prior, end: int, least: Mapping[str, float]) -> Prio
     if key == "alpha" and end > 0:
         return prior
     width = prior.max / prior.min
-    low = prior.min * width ** (end * LEANS_MOVE)
+    low = prior.min * width ** (end * (2.0 / 3.0))
     if end < 0:
         low = min(prior.min, max(low, least.get(key, 0.0)))
     return _limits(prior.law, low, low * width) if low != prior.min else prior

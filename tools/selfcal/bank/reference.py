@@ -31,13 +31,8 @@ _DEPTH = 16.0
 _STEP = 0.75
 #: Steps a direction has at least between its limits.
 _FEWEST = 24
-#: Changes allowed when every second node is left out: of ln evidence, and of mean and sd in posterior sd. A probability
-#: moves by a quarter of the first at most, 1e-4, and the full lattice is many times better than the halved one.
-_LN_EVIDENCE, _MOMENT = 4e-4, 5e-3
 #: Most nodes of a hypothesis: a larger posterior is out of this engine's reach.
 _MOST = 1_000_000
-#: Scan for modes: points in each drift parameter, by the number of those.
-_SCAN = {0: (), 1: (25,), 2: (11, 9)}
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -227,7 +222,8 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
     """
     from scipy.optimize import minimize  # half a second to import, and every engine needs textbook_node()
 
-    points = _SCAN[len(low) - 1]
+    # Points of the scan in each drift parameter, by the number of those.
+    points = {0: (), 1: (25,), 2: (11, 9)}[len(low) - 1]
     axes = [np.linspace(low[d + 1], high[d + 1], count) for d, count in enumerate(points)]
     rest = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, len(points)) if axes else np.empty((1, 0))
     left, right = np.full(len(rest), low[0]), np.full(len(rest), high[0])
@@ -339,7 +335,8 @@ class _Lattice:
                 half = self._summary(d)
                 sd = full[1 + len(self.low) :]
                 moments = np.abs(half - full)[1:] / np.concatenate([sd, sd])
-                excess.append(max(abs(half[0] - full[0]) / _LN_EVIDENCE, float(moments.max()) / _MOMENT))
+                # ln evidence may change by 4e-4, which moves a probability by 1e-4, and a moment by 5e-3 posterior sd.
+                excess.append(max(abs(half[0] - full[0]) / 4e-4, float(moments.max()) / 5e-3))
             worst = int(np.argmax(excess))
             if excess[worst] <= 1.0 or self.count[worst] >= 2**20:
                 return

@@ -30,7 +30,7 @@ def bias_of(axis: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def sd_of(estimate: Mapping[str, Any]) -> float:
-    """Of a normal quantity of a document, by its 90 % interval."""
+    """sd of a normal quantity of a document, by its 90 % interval."""
     return float((estimate["q95"] - estimate["q05"]) / (2.0 * HALF_90))
 
 
@@ -73,7 +73,7 @@ class Estimate:
         return math.log(self.q95 / self.q05) / (2.0 * HALF_90)
 
     def scaled(self, factor: float) -> Estimate:
-        """The same estimate with its unit changed by `factor`."""
+        """The estimate in a unit that differs by `factor`."""
         numbers = {name: factor * getattr(self, name) for name in ("mean", "median", "sd", "q05", "q95")}
         return replace(self, **numbers)
 

@@ -11,8 +11,6 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import NoReturn
 
-#: Time for results after a signal, s.
-GRACE_S = 0.6
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -29,7 +27,7 @@ class Stopped(Exception):
 
 
 class _State:
-    """What came while signals are held."""
+    """The signal that came while signals are held."""
 
     holding = False
     came: int | None = None
@@ -91,8 +89,8 @@ class Held:
 
     @property
     def overdue(self) -> bool:
-        """One came GRACE_S ago."""
-        return _state.came is not None and time.monotonic() > _state.came_at + GRACE_S
+        """One came 0.6 s ago: results have to be written."""
+        return _state.came is not None and time.monotonic() > _state.came_at + 0.6
 
     def check(self) -> None:
         """Raise Ended if one came."""

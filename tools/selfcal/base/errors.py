@@ -7,6 +7,7 @@ import reprlib
 import shlex
 import shutil
 import sys
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -57,6 +58,12 @@ def short(text: str) -> str:
     """At most 60 printable characters of something found in a file."""
     clean = "".join(letter if letter.isprintable() else "?" for letter in text[:61])
     return clean if len(clean) <= 60 else clean[:57] + "..."
+
+
+def few(names: Sequence[str], most: int, more: str = "more") -> str:
+    """The first of the names, and how many more there are."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} {more}" if rest > 0 else "")
 
 
 def shown(value: object) -> str:

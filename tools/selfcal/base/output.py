@@ -164,7 +164,6 @@ def finite(value: Any) -> Any:
 
 #: Columns of a table at most, and of an output that is not a terminal.
 TABLE_WIDTH = 140
-_NO_WIDTH = 1000
 #: Suffixes of pictures.
 PICTURES = (".png", ".pdf", ".svg", ".jpg")
 
@@ -182,17 +181,22 @@ def console_of(*, to_stderr: bool = False, fits: bool = False) -> Console:
 
     console = Console(stderr=to_stderr)
     if not console.is_terminal:
-        console.width = _NO_WIDTH
+        console.width = 1000
     elif not fits:
         console.width = max(console.width, TABLE_WIDTH)
     return console
 
 
-def print_lines(lines: Iterable[str], *, to_stderr: bool = False) -> None:
-    """Print texts from outside, a line each: whole, and no sign in them is obeyed."""
+def print_line(console: Console, text: str, style: str | None = None) -> None:
+    """Print a text from outside: whole, and no sign in it is obeyed."""
+    console.print(printable(text), style=style, highlight=False, markup=False, soft_wrap=True)
+
+
+def print_lines(lines: Iterable[str], *, to_stderr: bool) -> None:
+    """Print texts from outside, a line each."""
     console = console_of(to_stderr=to_stderr)
     for line in lines:
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+        print_line(console, line)
 
 
 def table_of(headings: Iterable[str], title: str | None = None, *, wraps: bool = False, **look: Any) -> Table:

@@ -10,8 +10,11 @@ from rich.progress import Progress, ProgressColumn
 
 from selfcal.base.errors import note
 
-#: Interval of lines without a terminal, and time before the first line, s.
-EVERY_S = 10.0
+
+def bar() -> Progress:
+    """A bar on stderr, in a terminal alone."""
+    console = Console(stderr=True)
+    return Progress(console=console, transient=True, disable=not console.is_terminal)
 
 
 class Doing:
@@ -37,9 +40,9 @@ class Doing:
         self.tell(f"{self.text} ({time.monotonic() - self.began:.0f} s)")
 
     def tell(self, text: str) -> None:
-        """Write this line if one is due."""
+        """Write this line if the last was 10 s ago."""
         now = time.monotonic()
-        if self.verb and not self.terminal and now - self.told >= EVERY_S:
+        if self.verb and not self.terminal and now - self.told >= 10.0:
             self.told = now
             note(f"{self.verb}: {text}")
 

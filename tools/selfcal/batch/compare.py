@@ -164,9 +164,9 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         console.print(f"{', '.join(which)}{': ' if which else ''}nothing changed beyond what the recordings leave open")
     for log, verdicts in document["verdicts"].items():
         on: dict[str, list[str]] = {}
-        for name, one in verdicts.items():
-            for cause in one.get("causes", ()):
-                if cause in (*one["material"], "unexplained"):
+        for name, judged in verdicts.items():
+            for cause in judged.get("causes", ()):
+                if cause in (*judged["material"], "unexplained"):
                     on.setdefault(cause.replace("_", " "), []).append(name)
         told = "; ".join(f"{cause} on {' '.join(names)}" for cause, names in on.items())
         line = f"{printable(Path(log).name)}: {told or 'no finding that matters'}"

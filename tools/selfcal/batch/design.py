@@ -33,8 +33,8 @@ from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Terms
 from selfcal.model.file import Model
 
-#: Lengths of a bit over the lag that is expected, and stages of the register that makes them.
-BITS, STAGES = (0.5, 1.0, 2.0, 4.0), 9
+#: Stages of the register that makes the bits.
+STAGES = 9
 #: Records that a length is tried with, how exact the predicted one is, and how much longer the next is.
 DRAWN, STEP, LONGER = 20, 1.1, 1.2
 LAG = Structure("lag", ("gain",), ("lag_s",))
@@ -97,13 +97,15 @@ def designed(
         {key: value for key, value in truth.items() if key in model.laws[law].parameters}
         for law, truth in (part_of(model, axis, seed) for seed in seeds)
     ]
-    most = {one.parameter: one.most for one in wishes}
+    most = {each_wish.parameter: each_wish.most for each_wish in wishes}
 
     def lacks(bit_s: float, samples: int) -> bool:
         """Whether fewer than SHARE of the parts have it."""
         u = experiment.input(bit_s, samples, dt)
         each = [halves(experiment, truth, u, dt) for truth in parts]
-        return any(float(np.quantile([one[key] for one in each], SHARE)) > wish for key, wish in most.items())
+        return any(
+            float(np.quantile([each_wish[key] for each_wish in each], SHARE)) > wish for key, wish in most.items()
+        )
 
     def length(bit_s: float) -> int | None:
         """Samples of the record."""
@@ -117,7 +119,7 @@ def designed(
             low, high = (middle, high) if lacks(bit_s, middle) else (low, middle)
         return high
 
-    bits = [max(one * experiment.lag_s, 2.0 * dt) for one in BITS]
+    bits = [max(each_wish * experiment.lag_s, 2.0 * dt) for each_wish in (0.5, 1.0, 2.0, 4.0)]
     reached = {bit_s: samples for bit_s in bits if (samples := length(bit_s)) is not None}
     if not reached:
         return {"bit_s": None, "duration_s": None}
@@ -151,7 +153,7 @@ def drawn_rows(model: Model, axis: str, experiment: Experiment, bit_s: float, sa
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """What to record, in words."""
+    """The record to take, in words."""
     print_lines(_lines(document), to_stderr=to_stderr)
 
 

@@ -36,7 +36,7 @@ def check(wanted: str | None, more: Collection[str] = ()) -> None:
 
 
 def outcome(document: Mapping[str, Any], wanted: str) -> Outcome:
-    """Of the document of `identify`, `diagnose` or `compare`."""
+    """Exit code for a document of `identify`, `diagnose` or `compare`."""
     judged = list(_judged(document, wanted))
     lines = [line for applies, line in judged if not applies and line]
     return Outcome(1 if any(applies for applies, _ in judged) else 2 if lines else 0, lines)

@@ -14,12 +14,10 @@ from glob import glob
 from pathlib import Path
 from typing import Any
 
-from selfcal.base.errors import UserError, note, short
+from selfcal.base.errors import UserError, few, note, short
 from selfcal.base.limits import read_text
 from selfcal.logs.recording import meta_place
 
-#: Bytes of a table of units: 10 000 lines of 100 letters are 1 MB.
-MOST_TABLE_BYTES = 1 << 26
 #: Columns of a table of units; the first two must be there.
 TABLE_COLUMNS = ("file", "device", "station", "lot", "date")
 #: Sources of a serial number.
@@ -207,7 +205,8 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
     """Device, station, lot and date by path. A file is named as the pattern names it, from the table's folder on, or by
     its bare name."""
     try:
-        text = read_text(table, MOST_TABLE_BYTES, "not a table of units")
+        # 10 000 lines of 100 letters are 1 MB.
+        text = read_text(table, 1 << 26, "not a table of units")
     except FileNotFoundError as error:
         raise UserError(f"{table}: there is no such file") from error
     try:
@@ -221,7 +220,8 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
         )
     unknown = [cell.strip() for cell, name in zip(rows[0], header, strict=True) if name not in TABLE_COLUMNS]
     if unknown:
-        note(f"{table}: does not read {_few(unknown, 'columns')} (known: {', '.join(TABLE_COLUMNS)})")
+        named = few(list(map(short, unknown)), MOST_ROWS_NAMED, "more columns")
+        note(f"{table}: does not read {named} (known: {', '.join(TABLE_COLUMNS)})")
     by_place: dict[Path, list[str]] = {}
     by_name: dict[str, list[str]] = {}
     for path in paths:
@@ -258,12 +258,5 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
                     f"{table}: line {number}: '{short(row['file'])}' is there twice, with different entries"
                 )
     if without:
-        note(f"{table}: no recording of the batch is {_few(without, 'rows')}")
+        note(f"{table}: no recording of the batch is {few(list(map(short, without)), MOST_ROWS_NAMED, 'more rows')}")
     return units
-
-
-def _few(names: Sequence[str], what: str) -> str:
-    """The first of the names, and how many more `what` there are."""
-    more = len(names) - MOST_ROWS_NAMED
-    shown = ", ".join(short(name) for name in names[:MOST_ROWS_NAMED])
-    return shown if more <= 0 else f"{shown} and {more} more {what}"

@@ -31,7 +31,7 @@ def judged_units(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
 
 
 def document_with(batch: Sequence[Unit], fail_on: str | None, judged: Sequence[Judged]) -> dict[str, Any]:
-    """What the batch comes to, by device."""
+    """The outcome of the batch, by device."""
     failed: dict[str, list[str]] = {}
     open_: dict[str, list[str]] = {}
     for unit in batch:

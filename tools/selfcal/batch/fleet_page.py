@@ -14,8 +14,8 @@ from markupsafe import Markup
 from selfcal.base import units as unit_module
 from selfcal.base.grid import Array
 from selfcal.base.output import write_text
+from selfcal.batch.batch_summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
 from selfcal.batch.population import Population
-from selfcal.batch.summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
 from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, draw
 from selfcal.show.template import render
 

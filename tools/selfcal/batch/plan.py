@@ -46,18 +46,12 @@ SCHEMA = "selfcal.plan/1"
 LEAST, MOST = 64, 200_000
 #: Halvings of the last step of the length, in its logarithm.
 HALVINGS = 3
-#: A law is there in so many of the records at least.
-LEAST_SHARE = 0.1
 #: A bank so many times faster or slower is worth a line if it shortens the length to this share, or lengthens it less.
 FASTER, WORTH = 10.0, 0.8
-#: Smallest number of a metric: an interval of no width has no logarithm.
-TINY = 1e-12
-#: Readings at least of which an information is taken.
-_FEWEST = 8
 #: A bias is in its steady state where half the length has an interval that is wider by less than this factor.
 STEADY = 1.1
-#: Cycles of a regressor's channel over the record: one sweep is half of one. Record without another wish, s.
-CYCLES, SWEEP_S = (0.5, 1.0, 4.0), 3600.0
+#: Record without another wish, s.
+SWEEP_S = 3600.0
 #: Forms whose column is in proportion to the channel.
 LINEAR = ("static", "lag", "rate")
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
@@ -104,24 +98,26 @@ class Wish:
         return Wish(plain, match[1], float(match[2]) * units.factor(unit, own), unit)
 
 
-def refusal(model: Model, axis: str, one: Regressor) -> str:
+def refusal(model: Model, axis: str, regressor: Regressor) -> str:
     """Why the coefficient of a regressor cannot be planned: plan swings a channel, in proportion to which the column
     moves. Empty if it can."""
-    if one not in offered(model, axis):
-        return f"{axis} has no regressor {one.name}"
-    if one.kind not in ("column", "rate"):
-        return f"{one.name} is of kind {one.kind}, and has no channel that could be swung: leave this wish out"
-    if one.input == "value" and one.form in LINEAR:
+    if regressor not in offered(model, axis):
+        return f"{axis} has no regressor {regressor.name}"
+    if regressor.kind not in ("column", "rate"):
+        return (
+            f"{regressor.name} is of kind {regressor.kind}, and has no channel that could be swung: leave this wish out"
+        )
+    if regressor.input == "value" and regressor.form in LINEAR:
         return ""
-    what = f"form: {one.form}" if one.input == "value" else f"input: {one.input}"
-    return f"{one.name} has `{what}`, which is not in proportion to {one.column}: leave this wish out"
+    what = f"form: {regressor.form}" if regressor.input == "value" else f"input: {regressor.input}"
+    return f"{regressor.name} has `{what}`, which is not in proportion to {regressor.column}: leave this wish out"
 
 
-def column_of(one: Regressor, channel: Array, rate_hz: float) -> Array:
+def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
     """float64[n]: the column that a channel [n] at this rate makes. The window of a rate is of whole intervals."""
-    if one.kind == "rate":
-        one = replace(one, window_s=max(1, round(one.window_s * rate_hz)) / rate_hz)
-    return made(sources_of(one, channels_of((one,))), 1.0 / rate_hz, channel[:, None])[:, 0]
+    if regressor.kind == "rate":
+        regressor = replace(regressor, window_s=max(1, round(regressor.window_s * rate_hz)) / rate_hz)
+    return made(sources_of(regressor, channels_of((regressor,))), 1.0 / rate_hz, channel[:, None])[:, 0]
 
 
 class Ensemble:
@@ -135,7 +131,7 @@ class Ensemble:
         self.typical: dict[str, tuple[Law, dict[str, float]]] = {}
 
     def metrics(self, samples: int) -> Array:
-        """Of records of so many bank samples."""
+        """Metrics of records of `samples` bank samples."""
         if samples not in self.at:
             rows = spread(
                 partial(rows_of, self.model, self.axis, tuple(self.wishes), samples),
@@ -150,7 +146,7 @@ class Ensemble:
             self.typical = {
                 law: (
                     self.model.laws[law],
-                    {key: float(np.exp(np.mean(np.log([one[key] for one in truths])))) for key in truths[0]},
+                    {key: float(np.exp(np.mean(np.log([truth[key] for truth in truths])))) for key in truths[0]},
                 )
                 for law, truths in by_law.items()
             }
@@ -160,13 +156,14 @@ class Ensemble:
         """ln of the metric that SHARE of the records keep, over the wish's: 0 or less is reached."""
         metric = self.metrics(samples)[:, k]
         metric = metric[~np.isnan(metric)]
-        if metric.size < LEAST_SHARE * len(self.seeds):
+        if metric.size < 0.1 * len(self.seeds):
             raise UserError(
                 f"--want '{self.wishes[k].text}': hardly a part of {self.model.path} has a law with "
                 f"{self.wishes[k].parameter} on {self.axis}: state `hypothesis` under simulate.axes.{self.axis}, "
                 "of a recording in the file that `part` writes"
             )
-        return math.log(max(float(np.quantile(metric, SHARE)), TINY) / self.wishes[k].most)
+        # An interval of no width has no logarithm.
+        return math.log(max(float(np.quantile(metric, SHARE)), 1e-12) / self.wishes[k].most)
 
     def length(self, k: int) -> int | None:
         """Bank samples at which the wish is reached; None beyond MOST."""
@@ -201,7 +198,8 @@ def cycling(
     bare, found = replace(model, regressors=()), []
     parts = [part_of(bare, axis, seed) for seed in seeds]
     needed = (HALF_90 / wish.most) ** 2 - regressor.sd[model.group_of(axis).name] ** -2
-    for cycles in CYCLES:
+    # One sweep is half a cycle.
+    for cycles in (0.5, 1.0, 4.0):
         omega = np.array([2.0 * math.pi * cycles / samples])
         one_swing = column_of(regressor, swung(samples, cycles, 1.0), model.bank_rate_hz)
         power = [
@@ -223,7 +221,7 @@ def cycling(
 
 
 def swung(samples: int, cycles: float, swing: float) -> Array:
-    """[n]: so many cycles of a channel about 0."""
+    """`cycles` of a channel about 0 [n]."""
     return np.asarray(0.5 * swing * np.cos(2.0 * math.pi * cycles * (np.arange(samples) + 0.5) / samples))
 
 
@@ -294,7 +292,7 @@ def rates(
         if rate > model.sensor_rate_hz:
             break
         for wish, samples in zip(wishes, lengths, strict=True):
-            law = next((one for one in typical.values() if wish.parameter in one[0].parameters), None)
+            law = next((entry for entry in typical.values() if wish.parameter in entry[0].parameters), None)
             if samples is None or law is None:
                 continue
             duration_s = samples / own
@@ -315,7 +313,7 @@ def _half_interval(
 ) -> float | None:
     """Half of the 90 % interval of ln of a parameter, by the Fisher information; None where the record has none."""
     n = duration_s * rate_hz
-    if n < _FEWEST:
+    if n < 8:
         return None
     try:
         covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))
@@ -326,13 +324,13 @@ def _half_interval(
 
 
 def picture(document: Mapping[str, Any], path: Path | str) -> None:
-    """What is reached over the length: median and middle four fifths of the records, and the wish."""
+    """Draw the metrics over the length: median and middle four fifths of the records, and the wish."""
     wishes = [wish for wish in document["wishes"] if wish["curve"]]
     size = (7.0, 2.9 * len(wishes))
     figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)
     for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
-        hours = np.array([one["duration_s"] for one in wish["curve"]]) / 3600.0
-        q10, q50, q90 = (np.maximum([one[key] for one in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
+        hours = np.array([point["duration_s"] for point in wish["curve"]]) / 3600.0
+        q10, q50, q90 = (np.maximum([point[key] for point in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
         panel.fill_between(hours, q10, q90, color=color, alpha=0.25, linewidth=0.0, label="four records of five")
         panel.plot(hours, q50, color=color, label="median")
         panel.axhline(wish["most"], color="black", linewidth=1.0, linestyle="--", label="wanted")
@@ -358,7 +356,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 def steady(curve: Sequence[Mapping[str, float]]) -> float | None:
     """What nine records of ten keep at the longest length, if half of that length has it too, but for STEADY."""
     longest = curve[-1]
-    half = [one for one in curve if one["duration_s"] <= 0.5 * longest["duration_s"]]
+    half = [point for point in curve if point["duration_s"] <= 0.5 * longest["duration_s"]]
     return longest["q90"] if half and half[-1]["q90"] < STEADY * longest["q90"] else None
 
 
@@ -380,13 +378,13 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         lines.append(f"{wish['wish']}: {_swings(wish) if 'cycling' in wish else said}")
         if wish["wish"].startswith("bias") and (least := steady(wish["curve"])):
             lines.append(f"  nine of ten such parts know it within {least:.2g} at any length: longer does not help")
-        for one in document["rates"]:
-            times = math.nan if there is None or one["wish"] != wish["wish"] else one["duration_s"] / there
-            factor = one["rate_hz"] / document["rate_hz"]
+        for rate in document["rates"]:
+            times = math.nan if there is None or rate["wish"] != wish["wish"] else rate["duration_s"] / there
+            factor = rate["rate_hz"] / document["rate_hz"]
             if abs(factor / FASTER - 1.0) < 1e-6 and times < WORTH:
-                lines.append(f"  by means at {one['rate_hz']:g} Hz: {duration_words(one['duration_s'])}")
+                lines.append(f"  by means at {rate['rate_hz']:g} Hz: {duration_words(rate['duration_s'])}")
             if abs(factor * FASTER - 1.0) < 1e-6 and times < 1.0 / WORTH:
-                lines.append(f"  means at {one['rate_hz']:g} Hz suffice: {duration_words(one['duration_s'])}")
+                lines.append(f"  means at {rate['rate_hz']:g} Hz suffice: {duration_words(rate['duration_s'])}")
     if document["duration_s"] is not None:
         lines.append(
             f"in all: record {duration_words(document['duration_s'])} at {document['rate_hz']:g} Hz or faster: "

@@ -32,24 +32,16 @@ from selfcal.base.grid import Array
 FEWEST, FEWEST_OF_GROUP = 5, 3
 #: Points of the grid of spreads, and its reach from the spread of the estimates: of five units the tail weighs.
 _POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
-#: Smallest weight: it counts for nothing, and has a logarithm.
-_NO_WEIGHT = 1e-300
 #: Probability that a quantity calls any unit of a sound batch unlike.
 FALSE_NAME = 0.03
 #: Probability of a false group in a batch, and of a false drift of a unit.
 FALSE_ALARM = 1e-3
-#: Standard deviation over the median absolute deviation, and of a median over that of a mean, of a normal.
-_MAD, _MEDIAN = 1.4826, 1.2533
-#: Least probability of a unit's deviation at which it is in the population although it is odd in another quantity.
-_ORDINARY = 0.01
 #: Largest share of odd units, and the most numbers of odd units that are tried.
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
 #: Rounds of fit and choice at most.
 _ROUNDS = 20
 #: Evidence of two groups over one, nats: 1 in 1000 normal batches of 8 to 24 units exceeds it.
 _SPLIT = 8.0
-#: Distance of two groups in standard deviations of a unit: nearer ones, as of a uniform population, share units.
-_BETWEEN = 4.5
 
 
 @dataclass(frozen=True)
@@ -75,7 +67,7 @@ class Interval:
     q95: float
 
     def through(self, function: Callable[[float], float]) -> Interval:
-        """Of a rising function of it."""
+        """The interval of a rising function of the quantity."""
         return Interval(function(self.median), function(self.q05), function(self.q95))
 
 
@@ -141,7 +133,7 @@ def _on_grid(y: Array, s: Array, sides: NDArray[np.bool_]) -> tuple[Array, Array
 
 def _tail(weight: Array, off: Array) -> Array:
     """ln of the two-sided probability [...] of being `off` [..., p] standard deviations away, over weighted spreads."""
-    tail = math.log(2.0) + log_ndtr(-np.abs(off)) + np.log(np.maximum(weight, _NO_WEIGHT))
+    tail = math.log(2.0) + log_ndtr(-np.abs(off)) + np.log(np.maximum(weight, 1e-300))
     high = tail.max(axis=-1)
     mixed: Array = np.minimum(high + np.log(np.exp(tail - high[..., None]).sum(axis=-1)), 0.0)
     return mixed
@@ -204,7 +196,7 @@ class Population:
 def robust(y: Array, s: Array) -> tuple[float, float]:
     """Median and spread beyond the errors, which a few odd units do not move."""
     middle = float(np.median(y))
-    scale = _MAD * float(np.median(np.abs(y - middle)))
+    scale = 1.4826 * float(np.median(np.abs(y - middle)))
     return middle, math.sqrt(max(scale**2 - float(np.median(s**2)), (0.1 * scale) ** 2))
 
 
@@ -242,7 +234,7 @@ def populations(
 
 
 def _is_group(inside: int, units: int) -> bool:
-    """Whether so many of the units are a group among the others: not the larger part, and neither too few."""
+    """Whether `inside` of the units are a group among the others: at most half, and neither side too small."""
     return FEWEST_OF_GROUP <= inside <= 0.5 * units and units - inside >= FEWEST_OF_GROUP
 
 
@@ -286,7 +278,7 @@ def _population(measured: Measured, apart: Sequence[Apart], others: Set[int], li
         own = ~np.isin(measured.at, list(others))
         if own.sum() < FEWEST:
             own[:] = True
-        own |= fit(centred[own], measured.s[own]).log_p(centred, measured.s) > math.log(_ORDINARY)
+        own |= fit(centred[own], measured.s[own]).log_p(centred, measured.s) > math.log(0.01)
         kept = own.copy()
         kept[own] = _kept(centred[own], measured.s[own], limit)
         split = None if apart and apart[-1].kind == TWO_GROUPS else _split(measured, centred, kept)
@@ -352,7 +344,8 @@ def _split(measured: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | Non
     low_ones = int(below[cut])
     apart = float(np.mean(x[low_ones:]) - np.mean(x[:low_ones]))
     unit = math.hypot(spread[np.argmax(two[:, cut])], float(np.median(s)))
-    if gain[cut] < _SPLIT or apart < _BETWEEN * unit:
+    # Nearer groups, as of a uniform population, share units.
+    if gain[cut] < _SPLIT or apart < 4.5 * unit:
         return None
     smaller, off = (order[low_ones:], apart) if 2 * low_ones > n else (order[:low_ones], -apart)
     members = tuple(sorted(measured.at[smaller].tolist()))
@@ -386,7 +379,8 @@ def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
     """ln of the probability that the medians of two sides differ as they do, by robust spreads of many units."""
     spread = max(robust(y[side], s[side])[1] for side in (inside, ~inside))
     difference = float(np.median(y[inside]) - np.median(y[~inside]))
-    variance = [_MEDIAN**2 * float(np.mean(spread**2 + s[side] ** 2)) / int(side.sum()) for side in (inside, ~inside)]
+    # The sd of a median is 1.2533 of that of a mean, of a normal.
+    variance = [1.2533**2 * float(np.mean(spread**2 + s[side] ** 2)) / int(side.sum()) for side in (inside, ~inside)]
     return math.log(2.0) + float(log_ndtr(-abs(difference) / math.sqrt(sum(variance))))
 
 

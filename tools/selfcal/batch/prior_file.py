@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import yaml
@@ -19,12 +18,9 @@ from selfcal.bank.priors import prior_tree
 from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.base.output import write_text
+from selfcal.batch.batch_summary import Batch, axes_of, sound_of
 from selfcal.batch.population import TWO_GROUPS, Population
-from selfcal.batch.summary import Batch, axes_of, sound_of
 from selfcal.model.file import LOG_NORMAL_SD, Model, Prior, read_yaml
-
-#: Significant digits of a prior.
-DIGITS = 4
 
 
 def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[str, Prior]]:
@@ -44,7 +40,22 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
         raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
     for group in model.groups:
         own = tree["groups"][group.name].get("own_priors") or {}
-        own |= {axis: {**own.get(axis, {}), **_trees(priors[axis])} for axis in group.axes if axis in priors}
+        own |= {
+            axis: {
+                **own.get(axis, {}),
+                **(
+                    {
+                        name: {
+                            key: value if isinstance(value, str) else _rounded(value)
+                            for key, value in prior_tree(prior).items()
+                        }
+                        for name, prior in priors[axis].items()
+                    }
+                ),
+            }
+            for axis in group.axes
+            if axis in priors
+        }
         if own:
             tree["groups"][group.name]["own_priors"] = own
     for law, odds in _odds(model, batch).items():
@@ -64,15 +75,8 @@ def lines_of(priors: Mapping[str, Mapping[str, Prior]], model: Model) -> Iterato
             yield f"prior of a new unit: {axis}.{name}: {prior.median:.4g} {unit}, sd of ln {prior.sd:.2g}"
 
 
-def _trees(priors: Mapping[str, Prior]) -> dict[str, Any]:
-    return {
-        name: {key: value if isinstance(value, str) else _rounded(value) for key, value in prior_tree(prior).items()}
-        for name, prior in priors.items()
-    }
-
-
 def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
+    return float(f"{value:.4g}")
 
 
 def _prior(population: Population, batch: Batch) -> Prior:

@@ -138,13 +138,10 @@ class _Remaining(Doing):
         self.left -= self.weights[k]
         self.jobs += self.sizes[k]
         rest_s = (time.monotonic() - self.began) * self.left / self.worked if self.worked else 0.0
-        said = f"{self.jobs} of {sum(self.sizes)}, {_spoken(rest_s)} more"
+        left = f"{rest_s:.0f} s" if rest_s < 120.0 else f"{rest_s / 60.0:.0f} min"
+        said = f"{self.jobs} of {sum(self.sizes)}, {left} more"
         self.progress.update(self.task, advance=self.weights[k], said=said)
         self.tell(said)
-
-
-def _spoken(seconds: float) -> str:
-    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
 
 
 def _piece(function: Callable[[Job], list[Row]], work: Work) -> tuple[int, list[Row]]:
@@ -282,6 +279,14 @@ def check_results(folder: Path | str | None) -> None:
         raise UserError(f"--results needs pyarrow: {install('pyarrow')}")
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder unless it is there. Raises UserError."""
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
+
+
 class Store:
     """A folder of finished pieces, each a Parquet file that is whole or absent.
 
@@ -292,10 +297,7 @@ class Store:
         check_results(folder)
         self.folder = folder
         self.key = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{folder}: cannot be made a folder: {error.strerror}") from error
+        make_folder(folder)
 
     def place(self, k: int) -> Path:
         return self.folder / f"part-{k:06}.parquet"

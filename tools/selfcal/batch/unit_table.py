@@ -23,7 +23,7 @@ SUFFIXES = (".csv", ".parquet")
 
 
 class Unit:
-    """One recording of the batch with its answer: `record` (batch/record.py), or `error`."""
+    """One recording of the batch with its answer: `record` (batch/unit_record.py), or `error`."""
 
     def __init__(self, source: Source, record: Mapping[str, Any]) -> None:
         known = record.get("recording", {})
@@ -55,7 +55,7 @@ class Unit:
         return causes
 
     def small(self, axis: str) -> set[str]:
-        """Those of them that change no number by as much as matters."""
+        """Causes that change no number by as much as matters."""
         return set(self.causes(axis)) - {
             "unexplained",
             *self.record.get("diagnosis", {}).get(axis, {}).get("material", []),

@@ -29,12 +29,8 @@ from selfcal.model.laws import PLACES, RATIOS
 
 SCHEMA = "selfcal.limits/1"
 PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
-#: Least probability of a law of the axis.
-LEAST_PROBABILITY = 0.05
 #: Probability of a verdict after the rest that is asked for; longest such rest, in times the record.
 CHANCE, MOST_TIMES = 0.8, 1000.0
-#: Power of the record's length by which the upper bound of an unidentified quantity falls.
-FALLS = {"K": 1.0, "sigma_m": 0.5, "B": 0.5}
 
 
 @dataclass(frozen=True)
@@ -206,7 +202,7 @@ def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
     if not having:
         return f"no law of the model has {parameter}"
     law = best if best in having else max(having, key=lambda one: probability[one])
-    if law != best and not constant and probability[law] < LEAST_PROBABILITY:
+    if law != best and not constant and probability[law] < 0.05:
         there = ", ".join(name for name in axis["parameters"][best] if name != "N")
         return f"its drift is {best}, which has no {parameter}: limit {there}"
     return {**axis["parameters"][law][parameter], "sharpens": True}
@@ -224,7 +220,8 @@ def _rest_s(
     if not estimate["sharpens"]:
         return None
     if not estimate["identified"]:
-        power = FALLS.get(limit.parameter)
+        # Power of the length by which the upper bound of an unidentified quantity falls.
+        power = {"K": 1.0, "sigma_m": 0.5, "B": 0.5}.get(limit.parameter)
         if power is None or limit.side == "min":
             return None
         return duration_s * (max(q95 / limit.value, 1.0) ** (1.0 / power) - 1.0) if limit.value > 0.0 else None
@@ -238,7 +235,7 @@ def _rest_s(
         return None
 
     def chance(times: float) -> float:
-        """That the verdict is there at so many times the length."""
+        """Probability of a verdict at `times` the length."""
         left, moves = sd / math.sqrt(times), sd * math.sqrt(1.0 - 1.0 / times)
         return _normal((abs(middle) - HALF_90 * left) / moves) + _normal((-abs(middle) - HALF_90 * left) / moves)
 
@@ -341,9 +338,11 @@ def write(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | s
 
 
 def add_verdicts(
-    document: dict[str, Any], limits: Limits, junit: Path | str | None, verdicts: Path | str | None
+    document: dict[str, Any], limits: Limits | None, junit: Path | str | None, verdicts: Path | str | None
 ) -> None:
-    """Judge a document of `identify` or `diagnose`: its key `limits`, and the files that are asked for."""
+    """Judge a document of `identify` or `diagnose` by limits, if there are any: its key `limits`, and the files."""
+    if limits is None:
+        return
     axes, recording = document["axes"], document["recording"]
     judged = judge(limits.of(axes), axes, recording["duration_s"])
     document["limits"] = [verdict.entry() for verdict in judged]

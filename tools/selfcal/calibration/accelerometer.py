@@ -10,16 +10,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Mask
 from selfcal.calibration.earth import Place
-from selfcal.calibration.fit import FALSE_ALARM, Fit, Problem, fit
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import ACCEL, REST_S, Tumble
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
+from selfcal.calibration.tumble_fit import FALSE_ALARM, Fit, Problem, fit
 
 #: Stated priors, sd: bias, m/s^2 (100 mg); scale; angle, rad; temperature coefficient, m/s^2/degC (1 mg/degC).
 BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
@@ -31,7 +28,7 @@ BIAS, SCALE, ANGLE, GRAVITY, THERMAL = slice(0, 3), slice(3, 6), slice(6, 9), 9,
 PLACES = ((0, 1), (0, 2), (1, 2))
 #: sd of a parameter that the logs do not have.
 NONE = 1e-12
-#: A parameter beyond so many sd of its prior is none of an accelerometer.
+#: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
 REACH = 10.0
 #: Rests without which there is no answer.
 FEWEST = 3
@@ -76,7 +73,7 @@ def matrix_of(theta: Array) -> Array:
 def means_covariance(tumble: Tumble, axis: int, bias: float, square_sd: float = SQUARE_SD) -> Array:
     """Covariance [n, n] of an axis' means of the rests: drift, white noise, rounding, a square beyond the `bias`."""
     noise = tumble.noise[ACCEL[axis]]
-    own = np.array([noise.white / one.seconds + one.rounded[axis] for one in tumble.rests])
+    own = np.array([noise.white / rest.seconds + rest.rounded[axis] for rest in tumble.rests])
     square = square_sd * (tumble.accel[:, axis] - bias) ** 2
     return drift(noise, tumble.begin_s, tumble.end_s, tumble.reference_s) + np.diag(own) + np.outer(square, square)
 

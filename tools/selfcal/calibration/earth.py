@@ -10,11 +10,8 @@ from selfcal.base.units import STANDARD_GRAVITY
 
 #: Earth's rate, rad/s; semi-major axis, m; flattening; gravity at the equator, m/s^2; Somigliana's constant; m.
 RATE, MAJOR, FLATTENING = 7.292115e-5, 6378137.0, 1.0 / 298.257223563
-EQUATOR, SOMIGLIANA, RATIO = 9.7803253359, 0.00193185265241, 0.00344978650684
-#: sd of gravity about the formula's, m/s^2: anomalies of some 30 mGal. Height that is not stated: sd, m.
-ANOMALY, HEIGHT_SD = 3e-4, 500.0
-#: Free-air gradient, 1/s^2. sd of gravity over the inhabited Earth about the standard one, m/s^2.
-GRADIENT, ANYWHERE = 3.086e-6, 0.015
+#: Height that is not stated: sd, m.
+HEIGHT_SD = 500.0
 #: Heights that are taken, m; gravity that is taken, m/s^2.
 HEIGHTS, GRAVITIES = (-500.0, 10_000.0), (9.7, 9.9)
 
@@ -37,8 +34,9 @@ def gravity_at(latitude_deg: float, height_m: float) -> float:
     """Normal gravity, m/s^2: Somigliana's formula and its expansion in the height (NIMA TR8350.2, 4-1 and 4-3)."""
     sine2 = math.sin(math.radians(latitude_deg)) ** 2
     e2 = FLATTENING * (2.0 - FLATTENING)
-    ground = EQUATOR * (1.0 + SOMIGLIANA * sine2) / math.sqrt(1.0 - e2 * sine2)
-    first = 2.0 / MAJOR * (1.0 + FLATTENING + RATIO - 2.0 * FLATTENING * sine2)
+    # Gravity at the equator, m/s^2, and Somigliana's constant.
+    ground = 9.7803253359 * (1.0 + 0.00193185265241 * sine2) / math.sqrt(1.0 - e2 * sine2)
+    first = 2.0 / MAJOR * (1.0 + FLATTENING + 0.00344978650684 - 2.0 * FLATTENING * sine2)
     return ground * (1.0 - first * height_m + 3.0 * (height_m / MAJOR) ** 2)
 
 
@@ -61,8 +59,10 @@ def place(latitude_deg: float | None, height_m: float | None, gravity: float | N
     if gravity is not None:
         return Place(gravity, 0.0, *of_earth, "stated")
     if latitude_deg is None:
-        return Place(STANDARD_GRAVITY, ANYWHERE, *of_earth, "standard: neither --latitude nor --gravity is given")
+        # sd of gravity over the inhabited Earth about the standard one, m/s^2.
+        return Place(STANDARD_GRAVITY, 0.015, *of_earth, "standard: neither --latitude nor --gravity is given")
     height_sd = 0.0 if height_m is not None else HEIGHT_SD
     value = gravity_at(latitude_deg, height_m or 0.0)
     at = f"{height_m:g} m" if height_m is not None else f"the sea's level, {HEIGHT_SD:g} m more or less: no --height"
-    return Place(value, math.hypot(ANOMALY, GRADIENT * height_sd), *of_earth, f"WGS-84 at {latitude_deg:g} deg, {at}")
+    # Anomalies of some 30 mGal, and the free-air gradient, 1/s^2.
+    return Place(value, math.hypot(3e-4, 3.086e-6 * height_sd), *of_earth, f"WGS-84 at {latitude_deg:g} deg, {at}")

@@ -16,19 +16,17 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Mask
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import NONE, Accelerometer, forces, means_covariance, shaped
-from selfcal.calibration.fit import Fit, Mask, Problem
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import GYRO, Tumble, Turn
-
-Array = NDArray[np.float64]
+from selfcal.calibration.tumble_fit import Fit, Problem
 
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); scale; angle, rad; temperature
 #: coefficient, rad/s/degC (0.05 deg/s/degC).
@@ -37,9 +35,8 @@ SCALE_SD, ANGLE_SD = 0.02, 0.02
 #: The accelerometers' parameters.
 OF_ACCEL = accelerometer.THERMAL.stop
 #: Windows of a turn that show signs and units, s. A gyro's factor may be off by WRONG. Share of the most turned axis,
-#: or of a turn, from which on it is judged. Information below which there is none. Units taken for each other.
+#: or of a turn, from which on it is judged. Information below which there is none.
 WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
-TAKEN = (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
 #: Where the parameters are, behind the accelerometers'.
 BIAS, G, SCALE, ANGLE, THERMAL = (slice(a, b) for a, b in ((0, 3), (3, 12), (12, 15), (15, 21), (22, 25)))
 VERTICAL, LEVEL = 21, 25
@@ -118,7 +115,12 @@ def fault_of(accel: Accelerometer) -> str:
             continue
         words = [f"has the turns about {'xyz'[k]}"] * (at != k) + ["is of the other sign"] * (value < 0.0)
         if not 1.0 - WRONG < abs(value) < 1.0 + WRONG:
-            units = [one for one, size in TAKEN if abs(math.log(abs(value) / size)) < WRONG]
+            # Units that are taken for each other.
+            units = [
+                one
+                for one, size in (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
+                if abs(math.log(abs(value) / size)) < WRONG
+            ]
             words.append(
                 f"reads as if its unit were {units[0]}" if units else f"reads {1 / abs(value):.2g} times the rate"
             )
@@ -178,11 +180,11 @@ class _Problem:
         rests = self.tumble.rests
         self.count, self.temp = len(rests), float(self.tumble.temp.mean())
         self.turns = tuple(one for one in self.tumble.turns if not one.reason)
-        self.behind = {one.first + 1: k for k, one in enumerate(self.turns)}  # turn that leads to a rest
+        self.behind = {turn.first + 1: k for k, turn in enumerate(self.turns)}  # turn that leads to a rest
         self.chain = np.cumsum([k not in self.behind for k in range(self.count)]) - 1
         self.y = np.nan_to_num([one.gyro for one in rests])  # one that is not recorded weighs nothing
         self.white = np.array([self.tumble.noise[name].white for name in GYRO])
-        self.of_rests = [self.white / one.seconds + one.rounded[3:] for one in rests]
+        self.of_rests = [self.white / rest.seconds + rest.rounded[3:] for rest in rests]
         self.of_accel_means = [means_covariance(self.tumble, k, float(accel.fit.theta[k])) for k in range(3)]
         self.begin_s = np.concatenate([self.tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
         self.end_s = np.concatenate([self.tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])

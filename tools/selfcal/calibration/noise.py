@@ -12,20 +12,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.bank.priors import known, laid
 from selfcal.bank.result import Estimate
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model, Prior
 from selfcal.model.laws import Law
 
-Array = NDArray[np.float64]
-
-#: A rest of so many seconds identifies the law of the part.
+#: Shortest rest that identifies the law of the part, s.
 LONG_S = 1200.0
 #: Differences of piece means that measure N: fewer leave it to the model.
 FEWEST = 30
@@ -82,7 +80,7 @@ def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Arr
 
 
 def mean_square(prior: Prior) -> float:
-    """Of a parameter under its prior."""
+    """Mean square of a parameter under its prior."""
     if prior.law == "log_normal":
         return prior.median**2 * math.exp(2.0 * prior.sd**2)
     low, high = prior.min, prior.max
@@ -119,10 +117,10 @@ def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
     if not known(group):
         words = f"not known: the prior of {model.name}, weighed by this log"
         priors = laid(priors, N / size) if N is not None else priors
-    middle = {key: (mean_square(one), one.median) for key, one in priors.items() if key != "bias"}
+    middle = {key: (mean_square(prior), prior.median) for key, prior in priors.items() if key != "bias"}
     terms = of_laws(model.laws, model.hypotheses, dict.fromkeys(model.laws, middle))
     white = size**2 * middle["N"][0] if N is None else N**2
-    return Noise(white, tuple(Term(size**2 * one.square, one.alpha) for one in terms), words, not known(group))
+    return Noise(white, tuple(Term(size**2 * term.square, term.alpha) for term in terms), words, not known(group))
 
 
 def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise | None:
@@ -134,22 +132,22 @@ def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise |
     size = factor(found.unit, unit) ** 2
     result = found.result
 
-    def both(one: Estimate) -> tuple[float, float]:
-        return one.mean**2 + one.sd**2, one.median
+    def both(estimate: Estimate) -> tuple[float, float]:
+        return estimate.mean**2 + estimate.sd**2, estimate.median
 
     values = {law: {key: both(one) for key, one in own.items()} for law, own in result.parameters.items()}
     terms = of_laws(model.laws, result.probability, values)
     white = sum(share * values[law]["N"][0] for law, share in result.probability.items())
     return Noise(
         size * white,
-        tuple(Term(size * one.square, one.alpha) for one in terms),
+        tuple(Term(size * term.square, term.alpha) for term in terms),
         f"{recording.duration_s:.0f} s at rest",
     )
 
 
 def measured(pieces: Sequence[Array], piece_s: float) -> float | None:
     """N^2 by the differences of neighbouring means of `piece_s` s within rests [k] each; None of too few."""
-    steps = np.concatenate([np.diff(one) for one in pieces]) if pieces else np.zeros(0)
+    steps = np.concatenate([np.diff(piece) for piece in pieces]) if pieces else np.zeros(0)
     steps = steps[np.isfinite(steps)]
     return float(np.mean(steps**2)) * 0.5 * piece_s if steps.size >= FEWEST else None
 

@@ -8,20 +8,17 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means, runs
+from selfcal.base.grid import Array, Mask, block_means, runs
 from selfcal.base.units import factor
-from selfcal.calibration.fit import Fit, Mask, Problem, fit, linearized
 from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
+from selfcal.calibration.tumble_fit import Fit, Problem, fit, linearized
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
 from selfcal.readings.rest import PIECE_S, rest_of
-
-Array = NDArray[np.float64]
 
 ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
@@ -29,17 +26,13 @@ UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
 SETTLE_S = PIECE_S
 #: Shortest rest that is advised, s, and what the search for motion takes off both ends of one at most, s.
 REST_S, CUT_S = 10.0, 6.0 * PIECE_S
-#: Shortest rest that counts, s of readings, and rests at most: the fit is dense.
-LEAST_S, MOST = 2.0, 200
+#: Most rests: the fit is dense.
+MOST = 200
 #: Pieces of a rest: their differences show its drift.
 PIECES = 8
 #: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
 #: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
 SHARES, RESTLESS = 10.0 ** (1.5 - np.arange(0.0, 8.0, 0.75)), 10.0
-#: N^2 of a gyro that is not recorded beside others: it weighs nothing.
-UNRECORDED = 1e6
-#: Readings at the extreme in a row that a turn clips at, and steps of the lattice to the readings beside them at least.
-FLAT, STEEP = 3, 3.0
 #: Assumed time between two logs without stamps of one clock, s.
 BETWEEN_S = 60.0
 
@@ -149,18 +142,18 @@ class Tumble:
     @property
     def accel(self) -> Array:
         """Means [n, 3] of the accelerometers, m/s^2."""
-        return np.array([one.accel for one in self.rests])
+        return np.array([rest.accel for rest in self.rests])
 
     @property
     def temp(self) -> Array:
         """[n], degC; 0 where not all rests have one."""
-        temp = np.array([one.temp for one in self.rests])
+        temp = np.array([rest.temp for rest in self.rests])
         return temp if np.isfinite(temp).all() else np.zeros(temp.size)
 
     @property
     def has_temp(self) -> bool:
         """All rests have a temperature."""
-        return all(math.isfinite(one.temp) for one in self.rests)
+        return all(math.isfinite(rest.temp) for rest in self.rests)
 
     @property
     def warmth(self) -> Array:
@@ -175,12 +168,12 @@ class Tumble:
     @property
     def begin_s(self) -> Array:
         """[n], s."""
-        return np.array([one.begin_s for one in self.rests])
+        return np.array([rest.begin_s for rest in self.rests])
 
     @property
     def end_s(self) -> Array:
         """[n], s."""
-        return np.array([one.end_s for one in self.rests])
+        return np.array([rest.end_s for rest in self.rests])
 
 
 @dataclass(frozen=True)
@@ -205,7 +198,7 @@ class _Log:
 def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: bool) -> Tumble:
     """Rests and turns of logs in order of time. `part_stated`: the model is the part's own, and so is its range.
     Raises UserError where accelerometers are missing, or too many rests are there."""
-    gyros = tuple(name for name in GYRO if all(name in one.columns for one in recordings))
+    gyros = tuple(name for name in GYRO if all(name in recording.columns for recording in recordings))
     axes = ACCEL + gyros
     begins, notes = _begins(recordings)
     logs = [_log(one, begin_s, axes) for one, begin_s in zip(recordings, begins, strict=True)]
@@ -235,7 +228,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     noise = {name: _noise(logs, name, model, long_rest) for name in axes}
     for name in (one for one in GYRO if gyros and one not in axes):
         notes.append(f"{name} is not recorded: it has no number, and turns take three gyros")
-        noise[name] = Noise(UNRECORDED, (), "")
+        noise[name] = Noise(1e6, (), "")  # it weighs nothing
     return Tumble(tuple(rests), tuple(turns), noise, tuple(left_out), tuple(notes))
 
 
@@ -261,7 +254,7 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
         end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in found.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
-        if end - begin >= LEAST_S and behind - first >= PIECES:
+        if end - begin >= 2.0 and behind - first >= PIECES:
             rests.append(slice(first, behind))
     return _Log(recording, begin_s, own, bridged, steps, temp, tuple(rests))
 
@@ -298,8 +291,8 @@ def _begins(recordings: Sequence[Recording]) -> tuple[list[float], list[str]]:
     """When each log begins on one clock, s, and what is assumed of it."""
     if len(recordings) == 1:
         return [0.0], []
-    stamps = [one.started_s for one in recordings]
-    if all(one is not None for one in stamps):
+    stamps = [recording.started_s for recording in recordings]
+    if all(stamp is not None for stamp in stamps):
         known = [float(one) for one in stamps if one is not None]
         ends = [begin + one.duration_s for begin, one in zip(known, recordings, strict=True)]
         if all(end <= begin for end, begin in zip(ends, known[1:], strict=False)):
@@ -413,6 +406,7 @@ def _flat(part: Array, values: Array, step: float) -> bool:
     for extreme in (float(np.nanmax(values)), float(np.nanmin(values))):
         for first, behind in runs(part == extreme):
             beside = part[[max(first - 1, 0), min(behind, part.size - 1)]]
-            if behind - first >= FLAT and np.abs(beside - extreme).min() > STEEP * step:
+            # A turn clips at three readings in a row, three steps of the lattice from the readings beside them.
+            if behind - first >= 3 and np.abs(beside - extreme).min() > 3.0 * step:
                 return True
     return False

@@ -33,10 +33,6 @@ class Setting:
     bias: float
 
 
-def _any(value: float) -> bool:
-    return True
-
-
 def is_count(value: float) -> bool:
     """Whether a key's value counts something."""
     return value >= 1.0 and value == int(value)
@@ -50,7 +46,7 @@ class Key:
 
     default: Callable[[Setting], float] | None
     field: str = ""
-    fits: Callable[[float], bool] = _any
+    fits: Callable[[float], bool] = lambda value: True
     limits: str = "finite"
 
 
@@ -94,10 +90,6 @@ class Extension:
         return group
 
 
-def _never(a: Look, b: Look) -> bool:
-    return False
-
-
 def sized(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[str, Any]:
     """The entry of a column, of which a look knows numbers better than the search that chose it."""
     known = {} if look is None else medians(look)
@@ -115,7 +107,7 @@ class Grouping:
     most    times at most that the loop names it on an axis; 0: as often as it is found.
     """
 
-    alike: Callable[[Look, Look], bool] = _never
+    alike: Callable[[Look, Look], bool] = lambda a, b: False
     pairs: bool = False
     piece: Callable[[Look, Collection[str], Sequence[float]], bool] = field(default=lambda look, axes, jumps: False)
     settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None
@@ -236,7 +228,7 @@ class Cause:
 
 
 def shown(*names: str) -> Callable[[Look], Sequence[str]]:
-    """The same pictures for every look."""
+    """Pictures that every look has alike."""
     return lambda look: names
 
 

@@ -15,18 +15,16 @@ from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError
 from selfcal.diagnosis import words
 from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.extend import NO_ROOM
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
 from selfcal.diagnosis.separate import next_record
 from selfcal.likelihood.state import Look, State
 from selfcal.logs.recording import SIDE_CHANNELS, Recording
-from selfcal.model.file import MOST_COLUMNS
 from selfcal.model.regressors import coefficient_unit
 
 SCHEMA = "selfcal.diagnose/1"
-#: Why a finding is not in a module's model.
-NO_ROOM = f"a bank has {MOST_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
 G_SENSITIVITY_UNIT = coefficient_unit("deg/s", "m/s^2")
 
 

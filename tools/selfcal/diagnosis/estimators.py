@@ -22,10 +22,10 @@ from selfcal.likelihood.fit import Fit, left
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 
-#: Orders of ARX and of a state model at most, taps of the weighting function, and block rows of the subspace.
-ORDERS, TAPS, BLOCK_ROWS = 4, (1, 2, 4, 8, 16, 32), (5, 8, 12)
-#: Orders of a model whose noise has poles or zeros of its own at most, and steps of its fit; instruments on each side.
-NOISE_ORDERS, FIT_STEPS, INSTRUMENTS = 2, 20, 6
+#: Orders of ARX and of a state model at most, and taps of the weighting function.
+ORDERS, TAPS = 4, (1, 2, 4, 8, 16, 32)
+#: Orders of a model whose noise has poles or zeros of its own at most, and instruments on each side.
+NOISE_ORDERS, INSTRUMENTS = 2, 6
 #: Residual sum of squares, free numbers, and gain and delay, of one order.
 Tried = tuple[float, int, tuple[float, float]]
 
@@ -122,7 +122,7 @@ def _prediction_error(u: Array, y: Array, *, noise_of_its_own: bool) -> Estimate
             each = [_delayed(one, range(first, order + 1)) for first, one in zip(firsts, columns, strict=False)]
             return np.hstack(each)
 
-        found = least_squares(errors, np.concatenate([start, noise]), slopes, method="lm", max_nfev=FIT_STEPS)
+        found = least_squares(errors, np.concatenate([start, noise]), slopes, method="lm", max_nfev=20)
         B, F, _, _ = parts(found.x)
         return 2.0 * float(found.cost), found.x.size, (_ratio(B.sum(), F.sum()), _delay(B) - _delay(F))
 
@@ -182,7 +182,7 @@ def subspace(u: Array, y: Array) -> Estimate:
         return rss, free, (gain, _ratio(float(twice @ c[1 : 1 + order]), gain))
 
     found: dict[int, Tried] = {}
-    for rows in BLOCK_ROWS:
+    for rows in (5, 8, 12):
         count = y.size - 2 * rows + 1
         U, Y = (np.array([one[k : k + count] for k in range(2 * rows)]) for one in (u, y))
         (upper,) = qr(np.vstack([U[rows:], U[:rows], Y[:rows], Y[rows:]]).T, mode="r", check_finite=False)
@@ -203,7 +203,7 @@ METHODS: Mapping[str, Callable[[Array, Array], Estimate]] = MappingProxyType(
         "subspace": subspace,
     }
 )
-#: Those that take the input as it was read.
+#: Methods that take the input as it was read.
 AS_READ = ("instruments",)
 
 
@@ -239,12 +239,12 @@ def _likeliest(tried: Mapping[int, Tried], n: int) -> Estimate:
         if math.isfinite(rss)
     }
     best = max(score, key=lambda order: score[order])
-    evidence = {order: one - score[best] for order, one in score.items()}
+    evidence = {order: value - score[best] for order, value in score.items()}
     return Estimate(best, evidence, {order: tried[order][2] for order in score})
 
 
 def _delayed(values: Array, steps: Iterable[int]) -> Array:
-    """[n, k]: values [n] so many steps late, 0 before their begin."""
+    """Values [n] late by each of `steps` [k]: [n, k], 0 before their begin."""
     late = [np.concatenate([np.zeros(k), values[: values.size - k]]) for k in steps]
     return np.array(late).reshape(len(late), values.size).T
 

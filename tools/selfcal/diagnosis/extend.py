@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,8 @@ import yaml
 from selfcal.adequacy.part import read_out, rounding, without
 from selfcal.bank.priors import state_own
 from selfcal.base.ending import Stopped
-from selfcal.base.errors import UserError, remark
+from selfcal.base.errors import UserError, note, remark
+from selfcal.base.output import write_text
 from selfcal.diagnosis.cause import Cause, Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.causes.vibration import WIDTHS_S
@@ -32,6 +33,8 @@ from selfcal.model.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
 WIDE = 5.0
+#: Why a module leaves a finding out.
+NO_ROOM = f"a bank has {MOST_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
 #: Begins each file that is written here.
 HEAD = "# Written by `selfcal diagnose`"
 
@@ -52,35 +55,32 @@ def extended(
     kept = _regressors(model, record, found)
     if kept:
         tree["regressors"] = [*(tree.get("regressors") or []), *kept]
-    for name, one in found.items():
-        for finding in one.findings:
+    for name, axis in found.items():
+        for finding in axis.findings:
             extend = CAUSES[finding.look.cause].written.extend
             if extend is not None:
                 extend(Extension(tree, model, record, name, found, finding))
     _fit_small(tree, kept)
     # Block means have no lattice, so the recording's own rate; noise with memory is known at the rate looked at alone.
-    colored = any(one.state.extras.color for one in found.values())
+    colored = any(axis.state.extras.color for axis in found.values())
     block = 1 if colored else max(1, round(record.recorded_hz / record.rate_hz))
     tree["simulate"] = {
         "rate_hz": record.rate_hz if colored else record.recorded_hz,
         "duration_s": float(record.present.size / record.rate_hz),
         "axes": {
-            name: fitted_law(one, block, rounding(tree["groups"][model.group_of(name).name], tree["sensor"]["rate_hz"]))
-            for name, one in found.items()
+            name: fitted_law(
+                axis, block, rounding(tree["groups"][model.group_of(name).name], tree["sensor"]["rate_hz"])
+            )
+            for name, axis in found.items()
         },
-        "effects": list(dict.fromkeys(text for name, one in found.items() for text in _effects(name, one))),
+        "effects": list(dict.fromkeys(text for name, axis in found.items() for text in _effects(name, axis))),
     }
     return tree, said
 
 
-def _columns_of(entry: Mapping[str, Any]) -> int:
-    """How many a regressor has: a sine and a cosine of a line."""
-    return 2 if entry["kind"] == "periodic" else 1
-
-
 def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
     """Fewer nodes on the Cortex-M0 where its RAM needs them: beside a second column, or a law that is a sum."""
-    columns = sum(map(_columns_of, regressors))
+    columns = sum(2 if entry["kind"] == "periodic" else 1 for entry in regressors)  # a sine and a cosine of a line
     nodes = tree["nodes"]
     if "cortex-m0" in nodes and "cortex-m0-small" in nodes:
         plain = ("random_walk", "gauss_markov")
@@ -91,31 +91,31 @@ def _fit_small(tree: dict[str, Any], regressors: list[dict[str, Any]]) -> None:
 def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], list[tuple[str, Finding]]]:
     """Regressors that the model file has room for: those that a bank has columns for first, and the most evidence
     first. Findings that a bank has none for, with their axes: a finding fits whole or not at all."""
-    stated = {column for one in model.regressors for column in one.columns}
-    beyond = {column for one in model.beyond for column in one.columns}
+    stated = {column for regressor in model.regressors for column in regressor.columns}
+    beyond = {column for axis in model.beyond for column in axis.columns}
     offered: list[tuple[float, str, Finding | None, dict[str, int]]] = []
-    for name, one in found.items():
+    for name, axis in found.items():
         places = {
             column.name: k
-            for k, column in enumerate(one.state.regressors, 1)
+            for k, column in enumerate(axis.state.regressors, 1)
             if column.name not in stated | beyond and column.entry
         }
-        owner = {column.name: finding for finding in one.findings for column in finding.columns}
+        owner = {column.name: finding for finding in axis.findings for column in finding.columns}
         groups: dict[object, list[str]] = {}
         for column in places:
             of = owner.get(column)
             groups.setdefault(regressor_key(column) if of is None else id(of), []).append(column)
         for columns in groups.values():
             finding = owner.get(columns[0])
-            c, sd = (getattr(one.state.best, of)[[places[column] for column in columns]] for of in ("c", "sd"))
+            c, sd = (getattr(axis.state.best, of)[[places[column] for column in columns]] for of in ("c", "sd"))
             gain = finding.look.gain if finding else 0.5 * float(np.sum((c / np.maximum(sd, 1e-300)) ** 2))
             offered.append(
-                (gain, name, finding or _fundamental(one, columns[0]), dict(Counter(map(regressor_key, columns))))
+                (gain, name, finding or _fundamental(axis, columns[0]), dict(Counter(map(regressor_key, columns))))
             )
     kept: dict[str, bool] = {}
     out: list[tuple[str, Finding]] = []
     of_bank, of_file = len(stated), len(stated | beyond)
-    for _, name, finding, keys in sorted(offered, key=lambda one: -one[0]):
+    for _, name, finding, keys in sorted(offered, key=lambda axis: -axis[0]):
         more = {key: count for key, count in keys.items() if key not in kept}
         fits = of_bank + sum(more.values()) <= MOST_COLUMNS
         of_bank += fits * sum(more.values())
@@ -127,15 +127,15 @@ def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], l
     return sorted(kept, key=lambda key: not kept[key]), out
 
 
-def _fundamental(one: Diagnosed, harmonic: str) -> Finding | None:
+def _fundamental(axis: Diagnosed, harmonic: str) -> Finding | None:
     """The finding that a harmonic's column belongs to."""
-    hz = next(float(column.entry["frequency_hz"]) for column in one.state.regressors if column.name == harmonic)
+    hz = next(float(column.entry["frequency_hz"]) for column in axis.state.regressors if column.name == harmonic)
 
     def off(finding: Finding) -> float:
         turns = hz / float(finding.look.estimate["frequency_hz"]["median"])
         return abs(turns - round(turns))
 
-    return min((each for each in one.findings if "harmonics" in each.look.estimate), key=off, default=None)
+    return min((each for each in axis.findings if "harmonics" in each.look.estimate), key=off, default=None)
 
 
 def left_out(model: Model, found: Mapping[str, Diagnosed]) -> list[tuple[str, Finding]]:
@@ -148,13 +148,13 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
     kept = _fitting(model, found)[0]
     entries: dict[str, dict[str, Any]] = {}
     smoothed: set[str] = set()
-    for name, one in found.items():
+    for name, axis in found.items():
         group = model.group_of(name).name
-        for k, regressor in enumerate(one.state.regressors):
+        for k, regressor in enumerate(axis.state.regressors):
             key = regressor_key(regressor.name)
             if key not in kept:
                 continue
-            finding = finding_of(one, regressor)
+            finding = finding_of(axis, regressor)
             look = None if finding is None else finding.look
             own = CAUSES[regressor.cause].written.entry(regressor.entry, look, record)
             entry = entries.setdefault(key, {"name": key, **own, "sd": {}, "probability": 0.5})
@@ -163,23 +163,23 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
                 form == "rate" or (CAUSES[regressor.cause].written.smoothed and form != "lag")
             ):
                 smoothed.add(key)
-            c, sd = float(one.state.best.c[1 + k]), float(one.state.best.sd[1 + k])
+            c, sd = float(axis.state.best.c[1 + k]), float(axis.state.best.sd[1 + k])
             entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
     for key in smoothed:
         _smooth(entries[key], key, found)
     return [entries[key] for key in kept]
 
 
-def finding_of(one: Diagnosed, column: Column) -> Finding | None:
+def finding_of(axis: Diagnosed, column: Column) -> Finding | None:
     """The finding that added a column to the model; None: the model file had it, or its line is a harmonic."""
-    return next((each for each in one.findings if column.name in {added.name for added in each.columns}), None)
+    return next((each for each in axis.findings if column.name in {added.name for added in each.columns}), None)
 
 
 def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) -> None:
     """The window whose trailing mean, or slope, explains the axes best. A centred one, which the diagnosis takes, needs
     values that a module does not have yet; a trailing one lags, so a shorter window suits it."""
-    explained = [one for one in found.values() if any(column.name == name for column in one.state.regressors)]
-    record = max((one.record for one in explained), key=lambda record: record.rate_hz)
+    explained = [axis for axis in found.values() if any(column.name == name for column in axis.state.regressors)]
+    record = max((axis.record for axis in explained), key=lambda record: record.rate_hz)
     gains: dict[float, float] = {}
     for width in WIDTHS_S:
         window = max(1, round(width * record.rate_hz))
@@ -188,7 +188,7 @@ def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) ->
         if window == 1 and entry.get("form") == "rate":  # a slope has two readings at least
             continue
         try:
-            gains[width if window > 1 else 0.0] = sum(_with_values(one, name, width, entry) for one in explained)
+            gains[width if window > 1 else 0.0] = sum(_with_values(axis, name, width, entry) for axis in explained)
         except Stopped:  # the shortest, which suits any
             break
     best = max(gains, key=lambda width: gains[width], default=None)
@@ -198,9 +198,9 @@ def _smooth(entry: dict[str, Any], name: str, found: Mapping[str, Diagnosed]) ->
         entry["window_s"] = best
 
 
-def _with_values(one: Diagnosed, name: str, width: float, entry: Mapping[str, Any]) -> float:
+def _with_values(axis: Diagnosed, name: str, width: float, entry: Mapping[str, Any]) -> float:
     """ln likelihood of the axis with a column of trailing means, or slopes, of `width` s, at the drift found."""
-    record = one.record
+    record = axis.record
     channel = record.channel_of(str(entry["column"]), str(entry.get("input", "value")))
     form, about = str(entry.get("form", "static")), float(entry.get("reference", 0.0))
     if form == "rate":
@@ -210,20 +210,20 @@ def _with_values(one: Diagnosed, name: str, width: float, entry: Mapping[str, An
         number = float(entry.get(NUMBER.get(form, ""), math.nan))
         values = curved(means, entry["knots"]) if form == "free" else formed(means - about, form, number)
     columns = tuple(
-        replace(column, values=values) if column.name == name else column for column in one.state.regressors
+        replace(column, values=values) if column.name == name else column for column in axis.state.regressors
     )
-    fit = one.state.best
-    return finish(replace(one.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
+    fit = axis.state.best
+    return finish(replace(axis.state, regressors=columns).series, fit.terms, fit.theta).ln_likelihood
 
 
-def fitted_law(one: Diagnosed, block: int | None = None, rounded: float = 0.0) -> dict[str, Any]:
+def fitted_law(axis: Diagnosed, block: int | None = None, rounded: float = 0.0) -> dict[str, Any]:
     """The fitted law in the words of `simulate`: the base drift, white noise at low frequency, the bias.
 
     The fit takes the drift for a point at each of its samples, which are means of `block` others (laws.averaged), by
     default of the recording's. `rounded`: density that the read-out adds by itself (part.rounding).
     """
-    block = max(1, round(one.record.recorded_hz / one.record.rate_hz)) if block is None else block
-    fit = one.state.best
+    block = max(1, round(axis.record.recorded_hz / axis.record.rate_hz)) if block is None else block
+    fit = axis.state.best
     N = fit.N
     if fit.quantized:
         N = fit.N_of_color
@@ -246,12 +246,12 @@ def fitted_law(one: Diagnosed, block: int | None = None, rounded: float = 0.0) -
     # The simulator's ramp and temperature begin at 0, but for a rate.
     at_first = sum(
         float(c * column.values[0])
-        for c, column in zip(fit.c[1:], one.state.regressors, strict=True)
+        for c, column in zip(fit.c[1:], axis.state.regressors, strict=True)
         if column.cause in CAUSES and CAUSES[column.cause].written.from_zero and form_of(column)[2] != "rate"
     )
     return {
         "hypothesis": drift.pop("hypothesis"),
-        "bias": digits(one.state.level + float(fit.c[0]) + at_first),
+        "bias": digits(axis.state.level + float(fit.c[0]) + at_first),
         "N": digits(max(math.hypot(N, math.sqrt(lacking * fit.dt)), SMALLEST)),
         **drift,
     }
@@ -262,11 +262,11 @@ def regressor_key(column: str) -> str:
     return column.removesuffix(".sin").removesuffix(".cos")
 
 
-def _effects(name: str, one: Diagnosed) -> list[str]:
+def _effects(name: str, axis: Diagnosed) -> list[str]:
     """`--effect` texts that put what an axis has into a simulated record. The simulator itself has one effect of a
     kind on an axis: the strongest. Those that a cause adds are all there. The forms of one channel are one effect."""
     joined: dict[object, _Effect] = {}
-    for k, effect in enumerate([*_of_columns(one), *_of_findings(one)]):
+    for k, effect in enumerate([*_of_columns(axis), *_of_findings(axis)]):
         place: object = (effect.cause.id, *effect.channel) if effect.channel else k
         known = joined.get(place, replace(effect, strength=0.0))
         sizes = {key: value for key, value in effect.keys.items() if value}
@@ -300,9 +300,9 @@ def _channel_of(column: Column) -> tuple[str, ...]:
     return form_of(column)[:2] if column.entry.get("column") else ()
 
 
-def _of_findings(one: Diagnosed) -> Iterator[_Effect]:
-    """Of the findings, also of those that the model file states. The lattice and the range are in the groups."""
-    for finding in (*one.findings, *one.stated):
+def _of_findings(axis: Diagnosed) -> Iterator[_Effect]:
+    """Effects of findings, also of those that the model file states. Groups have the lattice and the range."""
+    for finding in (*axis.findings, *axis.stated):
         cause = CAUSES[finding.look.cause]
         keys = cause.effect(finding.look)
         if keys is not None:
@@ -310,15 +310,15 @@ def _of_findings(one: Diagnosed) -> Iterator[_Effect]:
             yield _Effect(cause, finding.look.gain, keys, channel)
 
 
-def _of_columns(one: Diagnosed) -> Iterator[_Effect]:
-    """Of the columns that the model file had."""
-    fit = one.state.best
+def _of_columns(axis: Diagnosed) -> Iterator[_Effect]:
+    """Effects of the columns that the model file had."""
+    fit = axis.state.best
     sizes: dict[str, list[int]] = {}
-    for k, column in enumerate(one.state.regressors):
-        if finding_of(one, column) is None:
+    for k, column in enumerate(axis.state.regressors):
+        if finding_of(axis, column) is None:
             sizes.setdefault(regressor_key(column.name), []).append(k)
     for places in sizes.values():
-        column = one.state.regressors[places[0]]
+        column = axis.state.regressors[places[0]]
         c = [float(fit.c[1 + k]) for k in places]
         strength = sum(
             0.5 * (value / max(float(fit.sd[1 + k]), 1e-300)) ** 2 for value, k in zip(c, places, strict=True)
@@ -328,17 +328,27 @@ def _of_columns(one: Diagnosed) -> Iterator[_Effect]:
             yield _Effect(cause, strength, cause.written.of_column(column, c), _channel_of(column))
 
 
-def check_not_by_hand(path: Path | str) -> None:
+def check_not_by_hand(path: Path | str | None) -> None:
     """Raise UserError for an older file that `as_text` has not made: its author wants to keep it."""
-    path = Path(path)
-    if not path.is_file() or path.stat().st_size == 0:
+    if path is None or not Path(path).is_file() or Path(path).stat().st_size == 0:
         return
-    with path.open("rb") as file:
+    with Path(path).open("rb") as file:
         if not file.read(len(HEAD)) == HEAD.encode():
             raise UserError(
                 f"{path}: `selfcal diagnose` did not write this file and does not write over it: give --write-model "
                 "another name, or delete the file"
             )
+
+
+def write_extended(
+    path: Path | str, tree: Mapping[str, Any], source: Path | str, said: str, out: Sequence[tuple[str, Finding]]
+) -> None:
+    """Write the file. `said`: of its read-out; `out`: findings that a module leaves out. Notes name both."""
+    write_text(path, as_text(tree, source, said))
+    note(f"{path}: {said}")
+    if out:
+        causes = ", ".join(f"{name} {finding.look.cause} ({finding.look.gain:.1f} nats)" for name, finding in out)
+        note(f"{path}: a module leaves out {causes}: {NO_ROOM}")
 
 
 def as_text(tree: Mapping[str, Any], source: Path | str, said: str) -> str:

@@ -37,10 +37,8 @@ from selfcal.likelihood.joint import (
 from selfcal.likelihood.state import EVIDENT, NET_LEAST, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import Array
 
-#: Its name in the document.
+#: Name of the quantity in the document.
 ID = "hidden_input"
-#: What an axis that the quantity moves must show, nats.
-ACTS = 3.0
 #: Samples of which an error ahead is taken, at least.
 LEAST = 60
 #: Correlation times that the search begins at.
@@ -166,7 +164,7 @@ class Hidden:
         return bins_of(self.y)
 
     def correlation(self, one: str, two: str) -> float:
-        """Of the white noise of two axes."""
+        """Correlation of the white noise of two axes."""
         at = [self.names.index(name) for name in (one, two)]
         return float(self.model.correlation[at[0], at[1]])
 
@@ -181,7 +179,8 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
     if net(model.value - null.value, m + 1, LN_LOOKS) < NET_LEAST:
         return None
     # A drift that one axis has beside a walk and a Gauss-Markov process would be taken for the quantity.
-    if (without_each(bins, model) > ACTS).sum() < LEAST_AXES:
+    # An axis that the quantity moves shows 3 nats.
+    if (without_each(bins, model) > 3.0).sum() < LEAST_AXES:
         return None
     gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
     return model if net(gain, m + 1, LN_LOOKS) >= NET_LEAST else None
@@ -236,8 +235,8 @@ def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str],
             "probability": on.probability,
             "gain": known,
         }
-    acting = {name: one for name, one in axes.items() if one["probability"] >= 0.5}
-    jumps = [{**one, "time_s": one["time_s"] + start_s} for one in hidden.jumps]
+    acting = {name: axis for name, axis in axes.items() if axis["probability"] >= 0.5}
+    jumps = [{**jump, "time_s": jump["time_s"] + start_s} for jump in hidden.jumps]
     tau_s = hidden.dt / hidden.model.rate
     estimate = {"law": "gauss_markov", "time_constant_s": tau_s, "jumps": jumps}
     return {
@@ -255,8 +254,8 @@ def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str],
 
 
 def _sentence(axes: Mapping[str, Any], jumps: Sequence[Mapping[str, float]], time_constant_s: float) -> str:
-    shares = ", ".join(f"{name} {100.0 * one['estimate']['share']:.0f} %" for name, one in axes.items())
-    times = ", ".join(f"{one['time_s']:.0f}" for one in jumps)
+    shares = ", ".join(f"{name} {100.0 * axis['estimate']['share']:.0f} %" for name, axis in axes.items())
+    times = ", ".join(f"{jump['time_s']:.0f}" for jump in jumps)
     jumped = f" It jumps at {times} s." if jumps else ""
     return (
         f"One quantity that nobody recorded moves {len(axes)} axes together, over some {time_constant_s:.2g} s. "
@@ -274,7 +273,7 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     y /= hidden.scale[:, None]
     y, _ = without_lines(y, LINE)
     before_after = [course(model, y) for model in (hidden.null, hidden.model)]
-    scores = [np.nansum(one.scores(), axis=1) for one in before_after]
+    scores = [np.nansum(side.scores(), axis=1) for side in before_after]
     more = before_after[1].ln_likelihood - before_after[0].ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())
     pieces = [part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]

@@ -341,8 +341,8 @@ def lines(seen: Seen) -> Iterator[Candidate]:
         found = []
         for kinds, f, parts in tried:
             theta = (f / seen.dt, *map(float, multiples[1 : len(parts) // 2]))
-            for acts, price, columns in _phased(parts, parts @ weights, there[: len(parts) // 2]):
-                cost = kinds + price + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
+            for acts, phases, columns in _phased(parts, parts @ weights, there[: len(parts) // 2]):
+                cost = kinds + phases + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
                 found.append(Candidate("periodic", theta, acts, cost, columns))
         yield _ranked(found)[0]
 

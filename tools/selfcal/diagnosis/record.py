@@ -20,6 +20,7 @@ from selfcal.model.file import REGRESSORS, Group, Model
 from selfcal.model.file import Regressor as Stated
 from selfcal.model.forms import variance_of
 from selfcal.model.regressors import columns_of, offered
+from selfcal.readings.held import Held
 from selfcal.readings.readings import (
     RateChange,
     Readings,
@@ -34,12 +35,10 @@ from selfcal.readings.readings import (
 
 #: Samples that a diagnosis needs at least, and takes at most, gaps included.
 LEAST, MOST = 200, 10_000_000
-#: Readings so many times beyond the sensor's range are no readings: the unit is wrong, or the file.
+#: Largest reading over the sensor's range: beyond, the unit is wrong, or the file.
 BEYOND = 100.0
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
 SLOWEST = 0.99
-#: A stated line whose sine stays below this is at half the rate, where the sine is rounding of the frequency.
-ROUNDED_SINE = 0.01
 #: Keys of a regressor that are times of the recording.
 TIMES = ("time_s", "start_s", "end_s")
 
@@ -84,7 +83,9 @@ class Record:
 
     def other_axes(self, axis: str) -> dict[str, Array]:
         """The other axes about their level, bridged where missing."""
-        return {name: bridged(one.y) - float(np.nanmedian(one.y)) for name, one in self.axes.items() if name != axis}
+        return {
+            name: bridged(state.y) - float(np.nanmedian(state.y)) for name, state in self.axes.items() if name != axis
+        }
 
     def variances(self, axis: str) -> dict[str, Array]:
         """Short-term variance of the other axes that have any, bridged where an axis is missing or left out."""
@@ -107,6 +108,73 @@ class Record:
         return self.channels[causes[column]] if column in causes else self.other_axes("")[column]
 
 
+@dataclass(frozen=True)
+class _Grid:
+    """`n` cells of `dt` s, `block` samples of the clock `base` each, from its first sample on."""
+
+    base: Clock
+    block: int
+    n: int
+
+    @property
+    def dt(self) -> float:
+        return self.block / self.base.rate_hz
+
+    def cell_of(self, clock: Clock) -> Rows:
+        """The cell that each sample of a clock falls in."""
+        base = self.base
+        shift = (clock.start_s - base.start_s) * clock.rate_hz - float(base.place[0]) * clock.rate_hz / base.rate_hz
+        # A clock of another rate or phase falls where it falls; the grid's own falls on whole numbers.
+        cells: Rows = np.floor((clock.place + shift + 1e-6) / (clock.rate_hz * self.dt)).astype(np.int64)
+        return cells
+
+    def means(self, clock: Clock, values: Array) -> tuple[Array, Array]:
+        """Means [n] of the values of a clock, NaN where half of a cell's samples are missing; samples of a cell over
+        those that are there [n]."""
+        expected, index = clock.rate_hz * self.dt, self.cell_of(clock)
+        kept = (index >= 0) & (index < self.n) & np.isfinite(values)
+        used = np.bincount(index[kept], minlength=self.n)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.bincount(index[kept], values[kept], minlength=self.n) / used
+        present = 2 * used >= round(expected)
+        return np.where(present, mean, np.nan), np.where(present, round(expected) / np.maximum(used, 1), 1.0)
+
+    def missing(self, clock: Clock) -> Missing | None:
+        """The samples that a clock lacks."""
+        gaps = np.flatnonzero(clock.lost_before)
+        if not gaps.size:
+            return None
+        ends = clock.time_s[gaps] - self.base.time_s[0]
+        lost = int(clock.lost_before.sum())
+        first = float(ends[0] - clock.missing_before[gaps[0]] / clock.rate_hz)
+        return Missing(lost, clock.missing_before.size + lost, (max(0.0, first), float(ends[-1])))
+
+    def motion(self) -> Mask:
+        """The cells [n] with some samples in a gap of the base clock that motion alone makes."""
+        base = self.base
+        place = base.place - base.place[0]
+        moved = np.zeros(self.n, bool)
+        for row in np.flatnonzero((base.missing_before > 0) & (base.lost_before == 0)):
+            moved[(place[row] - base.missing_before[row]) // self.block : (place[row] - 1) // self.block + 1] = True
+        return moved
+
+
+def _grid_of(recording: Recording, decimate: float | None, axes: Sequence[str]) -> _Grid:
+    """The grid of a record. Raises UserError for a length that no diagnosis takes."""
+    clocks = [recording.clock_of(name) for name in axes] if decimate is None else []
+    base = min(clocks, key=lambda clock: clock.rate_hz, default=recording.clock)
+    block = 1 if decimate is None else max(1, round(base.rate_hz / decimate))
+    n = int(base.place[-1] - float(base.place[0]) + 1) // block
+    if n < LEAST:
+        raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
+    if n > MOST:
+        raise UserError(
+            f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST:,}: cut it at its gaps, or "
+            "take a lower --decimate"
+        )
+    return _Grid(base, block, n)
+
+
 def of_recording(recording: Recording, model: Model, decimate: float | None = None, axes: Sequence[str] = ()) -> Record:
     """Every sensor column that the model knows, in the unit of each axis' group, and the side channels. What the model
     file states is in the model of each axis from the start. Stuck readings are left out. Where every axis holds its
@@ -121,172 +189,138 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     known = [name for name in model.axes if name in recording.columns and _varies(recording.columns[name].values)]
     recording, changes = evened(recording)
     recording, held = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
-    clocks = [recording.clock_of(name) for name in axes] if decimate is None else []
-    base = min(clocks, key=lambda clock: clock.rate_hz, default=recording.clock)
-    block = 1 if decimate is None else max(1, round(base.rate_hz / decimate))
-    dt = block / base.rate_hz
-    begin = float(base.place[0])
-    n = int(base.place[-1] - begin + 1) // block
-    if n < LEAST:
-        raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
-    if n > MOST:
-        raise UserError(
-            f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST:,}: cut it at its gaps, or "
-            "take a lower --decimate"
-        )
-
-    def cell_of(clock: Clock) -> Rows:
-        """The cell of the grid that each sample of a clock falls in."""
-        shift = (clock.start_s - base.start_s) * clock.rate_hz - begin * clock.rate_hz / base.rate_hz
-        # A clock of another rate or phase falls where it falls; the grid's own falls on whole numbers.
-        found: Rows = np.floor((clock.place + shift + 1e-6) / (clock.rate_hz * dt)).astype(np.int64)
-        return found
-
-    def on_grid(clock: Clock, values: Array) -> tuple[Array, Array]:
-        """Means [n] of the values of a clock, NaN where half of a cell's samples are missing; samples of a cell over
-        those that are there [n]."""
-        expected, index = clock.rate_hz * dt, cell_of(clock)
-        kept = (index >= 0) & (index < n) & np.isfinite(values)
-        used = np.bincount(index[kept], minlength=n)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.bincount(index[kept], values[kept], minlength=n) / used
-        present = 2 * used >= round(expected)
-        return np.where(present, mean, np.nan), np.where(present, round(expected) / np.maximum(used, 1), 1.0)
-
-    def stated(name: str) -> tuple[Regressor, ...]:
-        """The model file's regressors of an axis."""
-        found: list[Regressor] = []
-        own = recording.along(name) if offered(model, name) else recording
-        for one in offered(model, name):
-            values = columns_of((one,), own)
-            # The loop's own columns have a unit beside these: those alone may give way to a better form.
-            entry = {key: getattr(one, key) for key in ("kind", *REGRESSORS[one.kind]) if key != "unit"}
-            entry |= {key: entry[key] - recording.start_s for key in TIMES if key in entry}
-            for column, row in zip(one.columns, values.T, strict=True):
-                if one.kind == "periodic" and np.abs(row).max() < ROUNDED_SINE:
-                    continue
-                about = bridged(on_grid(own.clock, np.ascontiguousarray(row))[0]) - one.offset
-                found.append(Regressor(column, _cause(one, model), about, one.unit, entry))
-        return tuple(found)
-
-    def missing(clock: Clock) -> Missing | None:
-        """The samples that a clock lacks."""
-        gaps = np.flatnonzero(clock.lost_before)
-        if not gaps.size:
-            return None
-        ends = clock.time_s[gaps] - base.time_s[0]
-        lost = int(clock.lost_before.sum())
-        first = float(ends[0] - clock.missing_before[gaps[0]] / clock.rate_hz)
-        return Missing(lost, clock.missing_before.size + lost, (max(0.0, first), float(ends[-1])))
-
-    states: dict[str, State] = {}
-    gone: dict[str, Missing] = {}
-    read: dict[str, Readings] = {}
-    unclipped: dict[str, Array] = {}
-    alike: dict[str, Array] = {}
-    roughness: dict[str, Array] = {}
-    moving = np.zeros(n, bool)
+    grid = _grid_of(recording, decimate, axes)
+    kept: dict[str, _Axis] = {}
     for name in known:
-        clock, group = recording.clock_of(name), model.group_of(name)
-        values = recording.in_unit(name, group.unit)
-        if _beyond(values, group) or clock.rate_hz * dt < SLOWEST:
-            continue
-        if copied(recording, name, tuple(states)):
-            continue
-        whole = recording.columns[name].clock is None and bool(np.isfinite(values).all())
-        rows = own_rows(recording, name) if whole and held is None else None
-        if rows is not None:
-            one = look(recording, name, group)
-        else:
-            one = readings_of(recording if whole else recording.along(name), name, group)
-            if not whole:
-                rows, clock = None, replace(one.recording.clock, start_s=clock.start_s)
-        if held is not None and recording.columns[name].clock is None:
-            one = replace(one, held=held)
-        each = round(clock.rate_hz * dt)
-
-        def spread(values: Array, rows: Rows | None = rows, each: int = each) -> Array:
-            if rows is None:
-                return values
-            found = np.full(recording.samples, np.nan)
-            found[rows] = values
-            return found if each == 1 else _held_on(found)
-
-        y, r = on_grid(clock, spread(one.values if each == 1 else one.drawn))
-        if np.isfinite(y).sum() < LEAST:
-            continue
-        read[name] = one
-        lost = missing(recording.clock_of(name))
-        if lost is not None:
-            gone[name] = lost
-        if one.moving.any():
-            # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
-            cells = cell_of(clock)[spread(one.moving.astype(np.float64)) > 0.0]
-            moving[cells[(cells >= 0) & (cells < n)]] = True
-        found = one.lattice
-        level = float(np.nanmedian(y))
-        alone = recording.along(name)
-        rough = variance_of(alone.in_unit(name, group.unit), alone.missing_before)
-        roughness[name] = on_grid(replace(alone.clock, start_s=recording.clock_of(name).start_s), rough)[0]
-        if each == 1 and one.clipped is not None:
-            unclipped[name] = on_grid(clock, spread(one.drawn))[0] - level
-        elif each == 1 and one.uneven is not None:
-            alike[name] = on_grid(clock, spread(one.uneven.drawn))[0] - level
-        states[name] = State(
-            axis=name,
-            unit=group.unit,
-            y=y - level,
-            dt=dt,
-            level=level,
-            r=r,
-            regressors=stated(name),
-            lsb=found.step if found is not None and each == 1 else 0.0,
-            stated_lsb=group.lsb,
-            redrawn=each > 1,
-            block=each,
-            below_lattice=found is not None and found.too_coarse_over(dt),
-        )
-    present = np.isfinite(on_grid(base, np.zeros(base.missing_before.size))[0])
+        axis = _axis_of(recording, model, name, grid, held, tuple(kept))
+        if axis is not None:
+            kept[name] = axis
+    present = np.isfinite(grid.means(grid.base, np.zeros(grid.base.missing_before.size))[0])
     channels: dict[str, Array] = {}
     names: dict[str, str] = {}
     for cause, (column, unit) in SIDE_CHANNELS.items():
         if column in recording.columns:
             values = recording.in_unit(column, unit)
-            if np.ptp(values) > 0.0 and not copied(recording, column, tuple(states)):
-                channels[cause] = bridged(on_grid(recording.clock, values)[0])
+            if np.ptp(values) > 0.0 and not copied(recording, column, tuple(kept)):
+                channels[cause] = bridged(grid.means(recording.clock, values)[0])
                 names[cause] = column
     return Record(
-        1.0 / dt,
-        states,
-        channels,
-        names,
-        present | _all_motion(base, n, block),
-        gone,
-        base.rate_hz,
-        read,
-        changes,
-        unclipped,
-        alike,
-        recording.start_s,
-        roughness,
-        moving,
-        recording.since_power_on_s,
+        rate_hz=1.0 / grid.dt,
+        axes={name: axis.state for name, axis in kept.items()},
+        channels=channels,
+        channel_names=names,
+        present=present | grid.motion(),
+        missing={name: lost for name in kept if (lost := grid.missing(recording.clock_of(name))) is not None},
+        recorded_hz=grid.base.rate_hz,
+        readings={name: axis.readings for name, axis in kept.items()},
+        changes=changes,
+        unclipped={name: axis.unclipped for name, axis in kept.items() if axis.unclipped is not None},
+        alike={name: axis.alike for name, axis in kept.items() if axis.alike is not None},
+        start_s=recording.start_s,
+        roughness={name: axis.roughness for name, axis in kept.items()},
+        moving=np.any([np.zeros(grid.n, bool), *(axis.moving for axis in kept.values())], axis=0),
+        since_power_on_s=recording.since_power_on_s,
     )
 
 
-def _all_motion(clock: Clock, n: int, block: int) -> Mask:
-    """The cells of `block` samples [n] with some in a gap of a clock that motion alone makes."""
-    place = clock.place - clock.place[0]
-    found = np.zeros(n, bool)
-    for row in np.flatnonzero((clock.missing_before > 0) & (clock.lost_before == 0)):
-        found[(place[row] - clock.missing_before[row]) // block : (place[row] - 1) // block + 1] = True
-    return found
+@dataclass(frozen=True)
+class _Axis:
+    """What a record has of one axis, as Record explains it."""
+
+    state: State
+    readings: Readings
+    roughness: Array
+    moving: Mask
+    unclipped: Array | None
+    alike: Array | None
 
 
-def _held_on(values: Array) -> Array:
-    """Each value until the next that is there."""
-    there = np.flatnonzero(np.isfinite(values))
-    return values[there[np.maximum(0, np.searchsorted(there, np.arange(values.size), side="right") - 1)]]
+def _axis_of(
+    recording: Recording, model: Model, name: str, grid: _Grid, held: Held | None, before: tuple[str, ...]
+) -> _Axis | None:
+    """An axis on the grid; None where it has too few readings, or is a copy of an axis `before` it."""
+    clock, group = recording.clock_of(name), model.group_of(name)
+    each = round(clock.rate_hz * grid.dt)
+    values = recording.in_unit(name, group.unit)
+    if _beyond(values, group) or clock.rate_hz * grid.dt < SLOWEST or copied(recording, name, before):
+        return None
+    recorded = clock
+    whole = recording.columns[name].clock is None and bool(np.isfinite(values).all())
+    rows = own_rows(recording, name) if whole and held is None else None
+    if rows is not None:
+        readings = look(recording, name, group)
+    else:
+        readings = readings_of(recording if whole else recording.along(name), name, group)
+        if not whole:
+            clock = replace(readings.recording.clock, start_s=clock.start_s)
+    if held is not None and recording.columns[name].clock is None:
+        readings = replace(readings, held=held)
+
+    def spread(values: Array) -> Array:
+        if rows is None:
+            return values
+        found = np.full(recording.samples, np.nan)
+        found[rows] = values
+        if each == 1:
+            return found
+        there = np.flatnonzero(np.isfinite(found))  # each value until the next that is there
+        return found[there[np.maximum(0, np.searchsorted(there, np.arange(found.size), side="right") - 1)]]
+
+    y, r = grid.means(clock, spread(readings.values if each == 1 else readings.drawn))
+    if np.isfinite(y).sum() < LEAST:
+        return None
+    moving = np.zeros(grid.n, bool)
+    if readings.moving.any():
+        # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
+        cells = grid.cell_of(clock)[spread(readings.moving.astype(np.float64)) > 0.0]
+        moving[cells[(cells >= 0) & (cells < grid.n)]] = True
+    lattice = readings.lattice
+    level = float(np.nanmedian(y))
+    alone = recording.along(name)
+    rough = variance_of(alone.in_unit(name, group.unit), alone.missing_before)
+    clipped = each == 1 and readings.clipped is not None
+    uneven = readings.uneven if each == 1 and not clipped else None
+    state = State(
+        axis=name,
+        unit=group.unit,
+        y=y - level,
+        dt=grid.dt,
+        level=level,
+        r=r,
+        regressors=_stated(recording, model, name, grid),
+        lsb=lattice.step if lattice is not None and each == 1 else 0.0,
+        stated_lsb=group.lsb,
+        redrawn=each > 1,
+        block=each,
+        below_lattice=lattice is not None and lattice.too_coarse_over(grid.dt),
+    )
+    return _Axis(
+        state=state,
+        readings=readings,
+        roughness=grid.means(replace(alone.clock, start_s=recorded.start_s), rough)[0],
+        moving=moving,
+        unclipped=grid.means(clock, spread(readings.drawn))[0] - level if clipped else None,
+        alike=None if uneven is None else grid.means(clock, spread(uneven.drawn))[0] - level,
+    )
+
+
+def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple[Regressor, ...]:
+    """The model file's regressors of an axis."""
+    stated: list[Regressor] = []
+    own = recording.along(name) if offered(model, name) else recording
+    for regressor in offered(model, name):
+        values = columns_of((regressor,), own)
+        # The loop's own columns have a unit beside these: those alone may give way to a better form.
+        keys = ("kind", *REGRESSORS[regressor.kind])
+        entry = {key: getattr(regressor, key) for key in keys if key != "unit"}
+        entry |= {key: entry[key] - recording.start_s for key in TIMES if key in entry}
+        for column, row in zip(regressor.columns, values.T, strict=True):
+            # At half the rate a line's sine is rounding of the frequency.
+            if regressor.kind == "periodic" and np.abs(row).max() < 0.01:
+                continue
+            about = bridged(grid.means(own.clock, np.ascontiguousarray(row))[0]) - regressor.offset
+            stated.append(Regressor(column, _cause(regressor, model), about, regressor.unit, entry))
+    return tuple(stated)
 
 
 def carried(record: Record, name: str) -> bool:
@@ -304,7 +338,7 @@ def why_left_out(recording: Recording, model: Model, name: str) -> str:
     own = recording.clock_of(name).rate_hz
     if own < SLOWEST * recording.rate_hz:
         return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"
-    if told := copied(recording, name, [one for one in model.axes if one in recording.columns and one != name]):
+    if told := copied(recording, name, [axis for axis in model.axes if axis in recording.columns and axis != name]):
         return told
     if _varies(values):
         return "too few of its readings are none that stick or are clipped"
@@ -325,13 +359,13 @@ def _beyond(values: Array, group: Group) -> str:
     return mostly_beyond(values, group)
 
 
-def _cause(one: Stated, model: Model) -> str:
+def _cause(regressor: Stated, model: Model) -> str:
     """The cause that a regressor of the model file stands for."""
-    if one.kind not in ("column", "rate"):
-        return {"time": "ramp"}.get(one.kind, one.kind)
-    if one.column in model.axes:
-        return "vibration" if one.input == "variance" else "cross_axis"
-    return _channel(one.column)
+    if regressor.kind not in ("column", "rate"):
+        return {"time": "ramp"}.get(regressor.kind, regressor.kind)
+    if regressor.column in model.axes:
+        return "vibration" if regressor.input == "variance" else "cross_axis"
+    return _channel(regressor.column)
 
 
 def _channel(column: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from scipy.stats import binom
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, note, printable
-from selfcal.base.output import console_of, plotter, save_picture
+from selfcal.base.output import console_of, plotter, print_line, save_picture
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.record import Record
@@ -33,16 +34,13 @@ SCHEMA = "selfcal.response/1"
 #: Samples that are looked at as they are; of more, means. More than the second number are refused: all columns of all
 #: time constants are in memory together.
 SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
-#: Other methods take so many means at least, and so many records that the answer makes. Of 20 records the next one is
-#: within their range with 90 %.
-STEPS_LEAST, RECORDS = 150, 20
-#: Frequencies of the response that is written.
-FREQUENCIES = 60
-#: Several inputs are each looked at beside the others so many times before they are answered.
+#: Records that the answer makes. Of 20 records the next one is within their range with 90 %.
+RECORDS = 20
+#: Rounds in which each of several inputs is searched beside the others.
 ROUNDS = 2
-#: Of so many readings of an input one may be wild on either side.
+#: Readings of an input for each wild one on either side.
 WILD = 1000
-#: A misfit is named that chance makes once in so many records.
+#: Records for each false misfit.
 MISFIT = 500.0
 #: Quantiles of an interval.
 ENDS = tuple(0.5 + end * PROBABILITY / 2.0 for end in (-1.0, 0.0, 1.0))
@@ -174,7 +172,7 @@ def _best(state: State, inputs: Sequence[Input]) -> tuple[float, Array]:
 
 def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
     """Every structure of the input as it acts likeliest, and that input."""
-    each = [[transfer.tried(state, Drive(u.values, state.dt), one) for one in STRUCTURES] for u in inputs]
+    each = [[transfer.tried(state, Drive(u.values, state.dt), structure) for structure in STRUCTURES] for u in inputs]
     # Of two that explain a record alike, the first is meant.
     best = [max(one.score for one in tried) for tried in each]
     place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
@@ -271,12 +269,12 @@ def _misfits(left_over: float, held_out: float, methods: Mapping[str, Any]) -> l
         said.append("the residuals still go with the input")
     if held_out < -math.log(MISFIT):
         said.append("by the part before, the last third is predicted worse with the input than without")
-    for name, one in methods.get("methods", {}).items():
-        if not one["agrees"]:
-            key = next(key for key in ("gain", "delay_s") if not one["within"][key])
-            low, high = one["if_answer_holds"][key]
+    for name, method in methods.get("methods", {}).items():
+        if not method["agrees"]:
+            key = next(key for key in ("gain", "delay_s") if not method["within"][key])
+            low, high = method["if_answer_holds"][key]
             what = {"gain": "a static gain", "delay_s": "a delay"}[key]
-            said.append(f"{name} finds {what} of {one[key]:.3g}, where {low:.3g} to {high:.3g} was due")
+            said.append(f"{name} finds {what} of {method[key]:.3g}, where {low:.3g} to {high:.3g} was due")
     spectra = methods.get("spectra")
     if spectra and spectra["hold_answer"] < binom.ppf(1.0 / MISFIT, spectra["bands"], PROBABILITY):
         said.append(f"{spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")
@@ -331,7 +329,8 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
         return {}
     late_s = abs(float(np.median(pooled.each[0].delay_s)))
     finest = max(state.dt, late_s / 3.0)
-    steps = max(1, min(round(finest / state.dt), state.y.size // STEPS_LEAST))
+    # Other methods take 150 means at least.
+    steps = max(1, min(round(finest / state.dt), state.y.size // 150))
     own = len(chosen.structure.keys)
     parts = chosen.fit.c[-len(chosen.columns) :, None] * chosen.columns
     answers = np.vstack([parts[:own].sum(axis=0), *pooled.answers(drive, RECORDS - 1)])
@@ -363,7 +362,7 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
 
 def _band(pooled: Pooled, n: int, dt: float) -> dict[str, list[float]]:
     """Gain and phase over frequency with their 90 % bands, point by point."""
-    frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, FREQUENCIES)
+    frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, 60)
     G = pooled.of(lambda one: one.at(frequency), pooled.each[0].structure.keys[0])
     gain = np.quantile(np.abs(G), ENDS, axis=0)
     middle = G.mean(axis=0)
@@ -396,10 +395,7 @@ def _empirical(found: Empirical) -> dict[str, list[float]]:
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The answer in a few lines, and the table of its numbers."""
     console = console_of(to_stderr=to_stderr)
-
-    def line(text: str) -> None:
-        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
-
+    line = partial(print_line, console)
     source, axis = document["source"], document["output"]["axis"]
     given = document["input"]
     line(f"{given['column']} -> {axis}, means of {1.0 / document['judged_at_hz']:g} s")

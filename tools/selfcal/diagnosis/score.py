@@ -25,12 +25,8 @@ from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
 
-#: Predictions of the bias at most.
-PREDICTIONS = 300
 #: Samples to score, and between the first and the last prediction, at least.
 LEAST = 30
-#: A walk that moves less over the record than so many times what its white noise leaves of the mean is none.
-WALK_LEAST = 3.0
 #: The bias is a mean over so long, s.
 BIAS_S = 60.0
 
@@ -114,10 +110,10 @@ def _held_out(
     )
 
 
-def _cut(one: State, two: State, split: int) -> Cut | None:
+def _cut(before: State, after: State, split: int) -> Cut | None:
     """The scored time in pieces of equal size; None: too few samples are left."""
-    n = one.y.size
-    there = [np.isfinite(state.y) for state in (one, two)]
+    n = before.y.size
+    there = [np.isfinite(state.y) for state in (before, after)]
     kept = split + np.flatnonzero((there[0] & there[1])[split:])
     if kept.size < LEAST:
         return None
@@ -130,7 +126,7 @@ def _cut(one: State, two: State, split: int) -> Cut | None:
 
 def _horizons(dt: float, n: int, split: int) -> dict[float, Rows]:
     """By horizon the samples from which the bias is predicted, where there are enough."""
-    places = np.unique(np.linspace(split, n - 1, PREDICTIONS).astype(np.int64))
+    places = np.unique(np.linspace(split, n - 1, 300).astype(np.int64))
     found = {horizon: places[places <= n - _ahead(horizon, dt) - _window(dt)] for horizon in HORIZONS_S}
     return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= LEAST}
 
@@ -146,19 +142,19 @@ def _window(dt: float) -> int:
 
 def _added(before: State, after: State) -> list[Array]:
     """The columns that a finding has added."""
-    known = {one.name for one in before.regressors}
-    return [one.values for one in after.regressors if one.name not in known]
+    known = {regressor.name for regressor in before.regressors}
+    return [column.values for column in after.regressors if column.name not in known]
 
 
 def _begin(before: State, after: State, split: int) -> int:
     """The first scored sample that the finding's columns change."""
-    return split + min((int(np.argmax(one[split:] != 0.0)) for one in _added(before, after)), default=0)
+    return split + min((int(np.argmax(column[split:] != 0.0)) for column in _added(before, after)), default=0)
 
 
 def _price(look: Look, before: State, after: State, split: int) -> float:
     """Nats that the search costs where the finding's columns are nothing before the scored samples."""
     added = _added(before, after)
-    late = bool(added) and not any(one[:split].any() for one in added)
+    late = bool(added) and not any(column[:split].any() for column in added)
     return max(0.0, look.gain - look.net) if late else 0.0
 
 
@@ -237,13 +233,13 @@ def _errors(
     for horizon, places in horizons.items():
         first = places + _ahead(horizon, state.dt) - 1
         read = np.array([_mean(state.y[at : at + window]) for at in first])
-        errors = [one[horizon] - read for _, one in (old, new)]
+        errors = [squares[horizon] - read for _, squares in (old, new)]
         good = np.isfinite(errors[0]) & np.isfinite(errors[1])
         if good.sum() < 10:
             continue
         square = [error[good] ** 2 for error in errors]
-        rms = [math.sqrt(float(one.mean())) for one in square]
-        pieces = np.array([[part.mean() for part in np.array_split(one, 8)] for one in square])
+        rms = [math.sqrt(float(squares.mean())) for squares in square]
+        pieces = np.array([[part.mean() for part in np.array_split(squares, 8)] for squares in square])
         spread = float(np.std(pieces[1] - pieces[0], ddof=1)) / math.sqrt(8) / max(rms[0] + rms[1], 1e-300)
         found[f"{horizon:g}"] = {"before": rms[0], "after": rms[1], "sd": spread}
     return found
@@ -257,9 +253,10 @@ def _mean(values: Array) -> float:
 def numbers(state: State) -> dict[str, float]:
     """N, K and B of plain white noise and random walk fitted beside the model of a state, in the axis' unit; 0 where
     the record shows none. B is that of the model's flicker noise, else by the minimum of the Allan deviation."""
-    plain, best = next(one for one in state.fits if one.terms.walk), state.best
+    plain, best = next(fit for fit in state.fits if fit.terms.walk), state.best
     N, K = plain.N_of_color, plain.K
-    if not K * plain.duration_s > WALK_LEAST * N:
+    # Drop a walk that moves less over the record than three times the mean's white noise.
+    if not K * plain.duration_s > 3.0 * N:
         K = 0.0
     if best.terms.flicker:
         return {"N": N, "K": K, "B": best.sigma * math.exp(best.value("ln_flicker"))}

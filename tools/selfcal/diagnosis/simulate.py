@@ -20,10 +20,6 @@ from selfcal.logs import recording
 from selfcal.model.file import Group, Model
 from selfcal.model.laws import NAMED, PARAMETERS, PLACES, Law
 
-#: Readings, samples times axes, of a recording, which is made in memory: 4 GB.
-MOST_READINGS = 100_000_000
-#: Readings that the sensor takes for them: its rate over the recording's times as many; a quarter of an hour.
-MOST_TAKEN = 10_000_000_000
 #: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
 DRAWS = 2**32
 
@@ -33,7 +29,7 @@ def added_by(
 ) -> Callable[[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]], None] | None:
     """Adds the effects that a cause forms by itself, and the quantity that moves several axes, to `values` [axes, n]
     before the read-out; None without any."""
-    own = [(form, one["axes"]) for one in applied if (form := CAUSES[one["id"]].simulated.add) is not None]
+    own = [(form, effect["axes"]) for effect in applied if (form := CAUSES[effect["id"]].simulated.add) is not None]
     hidden = model.hidden_input
     if not own and hidden is None:
         return None
@@ -140,7 +136,8 @@ def scene_of(model: Model, seed: int) -> _reference.Scene:
     if scene.samples < 2:
         raise UserError(f"{model.path}: simulate.duration_s: {duration_s:g} s hold fewer than two samples")
     readings, block = scene.samples * len(model.axes), max(1, round(model.sensor_rate_hz / scene.rate_hz))
-    for much, most, what in ((readings, MOST_READINGS, "readings"), (readings * block, MOST_TAKEN, "sensor samples")):
+    # 4 GB in memory, and a quarter of an hour.
+    for much, most, what in ((readings, 100_000_000, "readings"), (readings * block, 10_000_000_000, "sensor samples")):
         if much > most:
             most_s = most / much * duration_s
             said = f"{duration_s:g} s are more than {most:,} {what}: take {most_s:.3g} s or a lower rate"

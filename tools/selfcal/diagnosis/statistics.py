@@ -17,35 +17,25 @@ from scipy.special import gammainc, gammaincc, log_ndtr, ndtr, ndtri, stdtr, std
 
 from selfcal.likelihood.fit import Fit, Series, run
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array, Matrices, matrices
+from selfcal.likelihood.statemodel import Array, Mask, Matrices, matrices
 from selfcal.readings.lattice import WHITE_REMAINDERS
 
 Indices = NDArray[np.int64]
 
 #: Simulated records a band rests on.
 ENSEMBLE = 48
-#: Of which so many have a statistic at least.
+#: Fewest simulated records that have a statistic.
 FEWEST = 8
-#: An ensemble of this size shows the skewness of a statistic too.
-SKEWED = 200
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
 LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}
-#: Steps of the lattice in the noise of a reading up to which even and odd codes are alike, block means of a coarser
-#: lattice included: beyond, the level decides.
-PARITY_MOST = 0.5
-#: Lags at most at which an echo is looked for, lengths of a spectrogram's pieces, and places of a jump at most: longer
-#: records are looked at in blocks.
-ECHOES = 20_000
-SEGMENTS = (32, 128, 512)
-JUMP_PLACES = 20_000
 #: Times at least that the drift forgets in a record in which jumps are looked for.
 TURNS_LEAST = 50.0
 #: Whitened residuals beyond are of a model that does not describe the readings at all, which `SPREAD` states.
 FAR_OFF, SPREAD = 1e9, "innovation_spread"
-#: Samples of the blocks whose sums show slow correlation, the lags in blocks, and blocks at least.
-BLOCKS, SLOW_LAGS, BLOCKS_LEAST = (4, 16, 64, 256), (1, 2, 3, 5), 60
-#: The longest averaging time of an Allan deviation is this part of a record; pairs of means a time, at most.
-LONGEST, PAIRS = 8, 100_000
+#: Samples of the blocks whose sums show slow correlation.
+BLOCKS = (4, 16, 64, 256)
+#: The longest averaging time of an Allan deviation is this part of a record.
+LONGEST = 8
 #: Share of simulated records beyond which the tail of the most striking statistic is fitted.
 TAIL = 1.0 / 3.0
 #: Lags of the correlation, roughly a factor 1.6 apart.
@@ -72,115 +62,134 @@ class Judged:
     p: float
 
 
-def all_statistics(
-    w: Array, y: Array | None, lsb: float, jumps: Callable[[Array], float] | None = None
-) -> dict[str, float]:
+def all_statistics(w: Array, y: Array | None, lsb: float, jumps: Callable[[Array], float] | None) -> dict[str, float]:
     """Every statistic of whitened residuals `w` [n] (NaN: missing) of readings `y` [n]; None: those are not as read."""
     present = np.isfinite(w)
     x = w[present]
     n = x.size
-    found: dict[str, float] = {}
     if n < 50:
-        return found
+        return {}
     sd = float(np.clip(x, -FAR_OFF, FAR_OFF).std())
     if not sd > 0.0:
         return {SPREAD: math.inf}
     x = (x - x.mean()) / sd
     filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)
-    reach = max(min(1 + max(LAGS), n // 8), min(ECHOES, n // 4))
+    # A longer echo is looked for in blocks.
+    reach = max(min(1 + max(LAGS), n // 8), min(20_000, n // 4))
     power = _power(filled, reach)
-    lagged = _lagged(power, reach) / math.sqrt(n)
+    found = dict(_of_memory(filled, present, n, _lagged(power, reach) / math.sqrt(n)))
+    clipped = np.clip(filled, -5.0, 5.0)
+    for size in (32, 128, 512):
+        if filled.size >= 4 * size:
+            found[f"spectrogram_of_{size}_samples"] = _uneven(clipped, size)
+    if jumps is not None:
+        found["jumps_of_the_bias"] = jumps(clipped)
+    found |= _of_sizes(x)
+    found |= _over_the_record(x, filled, present)
+    found |= _worst_band(power, n, w.size)
+    return found if y is None else found | _of_readings(y, lsb)
+
+
+def _of_memory(filled: Array, present: Mask, n: int, lagged: Array) -> Iterator[tuple[str, float]]:
+    """Correlation of `n` residuals (missing: 0): `lagged` [lags] of single ones, of sums, and of Allan deviations."""
     for lag in LAGS:
         if lag < min(lagged.size, n // 8):
-            found[f"innovation_lag{lag}"] = float(lagged[lag])
-    found["innovation_correlation_to_lag_20"] = _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
+            yield f"innovation_lag{lag}", float(lagged[lag])
+    yield "innovation_correlation_to_lag_20", _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
     for size in BLOCKS:
-        if n >= BLOCKS_LEAST * size:
+        if n >= 60 * size:
             sums = np.add.reduceat(filled, np.arange(0, filled.size - size + 1, size))
             scale = math.sqrt(sums.size) * float(sums.var())
-            for lag in SLOW_LAGS:
-                found[f"innovation_lag{lag}_of_{size}_samples"] = float(sums[lag:] @ sums[:-lag]) / scale
+            for lag in (1, 2, 3, 5):
+                yield f"innovation_lag{lag}_of_{size}_samples", float(sums[lag:] @ sums[:-lag]) / scale
     sizes = 2 ** np.arange(max(1, int(math.log2(n / LONGEST)) + 1))
     for m, deviation in zip(sizes, allan_deviation(np.where(present, filled, np.nan), sizes), strict=True):
         if math.isfinite(deviation):
-            found[f"allan_of_{m}_samples"] = _root(n * float(deviation) ** 2, n / float(m))
+            yield f"allan_of_{m}_samples", _root(n * float(deviation) ** 2, n / float(m))
     # A reading that repeats what was before, however long before.
-    found["innovation_largest_correlation"] = _largest(lagged[4:] * np.sqrt(n / (n - np.arange(4, lagged.size))))
-    for size in SEGMENTS:
-        if filled.size >= 4 * size:
-            found[f"spectrogram_of_{size}_samples"] = _uneven(np.clip(filled, -5.0, 5.0), size)
-    if jumps is not None:
-        found["jumps_of_the_bias"] = jumps(np.clip(filled, -5.0, 5.0))
+    yield "innovation_largest_correlation", _largest(lagged[4:] * np.sqrt(n / (n - np.arange(4, lagged.size))))
+
+
+def _of_sizes(x: Array) -> dict[str, float]:
+    """The distribution of residuals [n], and the spread of the noise level over the record."""
+    n = x.size
     clipped = np.clip(x, -12.0, 12.0)
     squared = clipped * clipped
-    found["innovation_excess_kurtosis"] = (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0)
-    found["innovation_skewness"] = float(squared @ clipped) / n * math.sqrt(n / 6.0)
-    found["innovation_largest"] = _largest(x)
-    # Spread of the noise level over the record, in pieces of three lengths.
+    found = {
+        "innovation_excess_kurtosis": (float(squared @ squared) / n - 3.0) * math.sqrt(n / 24.0),
+        "innovation_skewness": float(squared @ clipped) / n * math.sqrt(n / 6.0),
+        "innovation_largest": _largest(x),
+    }
     energies = np.minimum(squared, 16.0)
     variance = float(energies.var())
     for pieces in (8, 40, 200):
         size = n // pieces
-        if size < 10:
-            break
-        energy = energies[: size * pieces].reshape(pieces, size).mean(axis=1)
-        # In units of the pieces' own expected spread, from the fourth moment.
-        spread = variance / size
-        found[f"noise_level_of_{pieces}_pieces"] = _root(
-            float(((energy - energy.mean()) ** 2).sum() / spread), pieces - 1
-        )
+        if size >= 10:
+            energy = energies[: size * pieces].reshape(pieces, size).mean(axis=1)
+            # In units of the pieces' own expected spread, from the fourth moment.
+            spread = float(((energy - energy.mean()) ** 2).sum() / (variance / size))
+            found[f"noise_level_of_{pieces}_pieces"] = _root(spread, pieces - 1)
+    return found
+
+
+def _over_the_record(x: Array, filled: Array, present: Mask) -> dict[str, float]:
+    """Correlation of the magnitudes of residuals `x` [n], and their level: means of pieces against white noise."""
+    n = x.size
     # Magnitudes, not squares: their products have no heavy tail.
-    square = np.minimum(np.abs(filled), 3.5)
-    square = np.where(present, square - square[present].mean(), 0.0)
-    scale = math.sqrt(n) * float(square[present].var())
+    magnitude = np.minimum(np.abs(filled), 3.5)
+    magnitude = np.where(present, magnitude - magnitude[present].mean(), 0.0)
+    scale = math.sqrt(n) * float(magnitude[present].var())
     count = min(101, n // 8)
-    lagged = _lagged(_power(square, count), count) / scale
-    for lag in (1, 3, 10, 30, 100):
-        if lag < lagged.size:
-            found[f"innovation_magnitude_lag{lag}"] = float(lagged[lag])
-    # Level over the record: means of pieces against white noise.
+    lagged = _lagged(_power(magnitude, count), count) / scale
+    found = {f"innovation_magnitude_lag{lag}": float(lagged[lag]) for lag in (1, 3, 10, 30, 100) if lag < lagged.size}
     for pieces in (8, 40):
         size = n // pieces
-        if size < 10:
-            break
-        means = x[: size * pieces].reshape(pieces, size).mean(axis=1) * math.sqrt(size)
-        found[f"innovation_means_of_{pieces}_pieces"] = _root(float((means**2).sum()), pieces)
-    # The spectrum in bands of a third of an octave.
-    worst, places = 0.0, 0
+        if size >= 10:
+            means = x[: size * pieces].reshape(pieces, size).mean(axis=1) * math.sqrt(size)
+            found[f"innovation_means_of_{pieces}_pieces"] = _root(float((means**2).sum()), pieces)
+    return found
+
+
+def _worst_band(power: Array, n: int, padded: int) -> dict[str, float]:
+    """The spectrum in thirds of an octave. `padded`: samples with the missing ones, `n` of them are there."""
+    worst: list[float] = []
     high = power.size - 1
     while high > 8:
         low = max(1, int(high / 2 ** (1.0 / 3.0)))
         if high - low < 4:
             break
         # The padding makes a few more points of as much information.
-        points = (high - low) * w.size / (2 * (power.size - 1))
-        z = _root(2.0 * float(power[low:high].mean()) / n * points, 2.0 * points)
-        places += 1
-        worst = z if abs(z) > abs(worst) else worst
+        points = (high - low) * padded / (2 * (power.size - 1))
+        worst.append(_root(2.0 * float(power[low:high].mean()) / n * points, 2.0 * points))
         high = low
-    if places:
-        found["spectrum_worst_third_octave"] = worst
-    if y is None:
-        return found
+    return {"spectrum_worst_third_octave": max(worst, key=abs)} if worst else {}
+
+
+def _of_readings(y: Array, lsb: float) -> dict[str, float]:
+    """Readings `y` [n] that repeat, and how their codes on a lattice `lsb` are used."""
     # The codes of the lattice: sums in floating point differ in the last digit.
     codes = y if lsb <= 0.0 else np.rint((y - y[np.argmax(np.isfinite(y))]) / lsb)
     # Readings that repeat the one before, beyond those that repeat an earlier one: these do by chance.
     equal = [int((codes[k:] == codes[:-k]).sum()) for k in (1, 2, 3, 4)]
     usual = sum(equal[1:]) / 3.0
-    found["repeated_readings"] = (equal[0] - usual) / math.sqrt(max(1.0, (sum(equal) / 3.0)))
+    found = {"repeated_readings": (equal[0] - usual) / math.sqrt(max(1.0, (sum(equal) / 3.0)))}
     if lsb <= 0.0:
         # Without a lattice, or on one of several steps, no reading is much commoner than the next.
-        found["commonest_reading"] = _commonest(codes) if sum(equal) else 0.0
-    else:
-        found["longest_repeat"] = math.log(_longest_run(codes))
-        read = codes[np.isfinite(codes)].astype(np.int64)
-        odd = int((read & 1).sum())
-        if PARITY_MOST * float(np.diff(read).std()) > math.sqrt(2.0):
-            # A code that never comes leaves its readings to others: more pairs are equal than differ by little.
-            apart = np.concatenate([np.abs(codes[k:] - codes[:-k]) for k in (1, 2, 3, 4)])
-            same, near, next_ = (float((apart == k).sum()) for k in (0.0, 1.0, 2.0))
-            found["equal_readings"] = (same - (4.0 * near - next_) / 6.0) / math.sqrt(max(1.0, 2.0 * same))
-            found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
+        _, counts = np.unique(y[np.isfinite(y)], return_counts=True)
+        first, second = np.sort(counts)[:-3:-1] if counts.size > 1 else (counts[0], 0)
+        found["commonest_reading"] = float(first - second) / math.sqrt(float(first + second)) if sum(equal) else 0.0
+        return found
+    changes = np.flatnonzero(np.diff(codes, prepend=np.nan) != 0.0)
+    found["longest_repeat"] = math.log(int(np.diff(np.append(changes, codes.size)).max()))
+    read = codes[np.isfinite(codes)].astype(np.int64)
+    odd = int((read & 1).sum())
+    # Beyond two steps of the lattice in the noise of a reading its level does not decide.
+    if 0.5 * float(np.diff(read).std()) > math.sqrt(2.0):
+        # A code that never comes leaves its readings to others: more pairs are equal than differ by little.
+        apart = np.concatenate([np.abs(codes[k:] - codes[:-k]) for k in (1, 2, 3, 4)])
+        same, near, next_ = (float((apart == k).sum()) for k in (0.0, 1.0, 2.0))
+        found["equal_readings"] = (same - (4.0 * near - next_) / 6.0) / math.sqrt(max(1.0, 2.0 * same))
+        found["odd_even_codes"] = (read.size - 2 * odd) / math.sqrt(read.size) if 0 < odd < read.size else 9.0
     return found
 
 
@@ -192,7 +201,7 @@ def allan_deviation(y: Array, sizes: Indices) -> Array:
     count = np.concatenate([[0.0], np.cumsum(good)])
     found = np.full(len(sizes), np.nan)
     for k, m in enumerate(int(size) for size in sizes):
-        every = max(1, m // 8, y.size // PAIRS)
+        every = max(1, m // 8, y.size // 100_000)
         last = y.size - 2 * m + 1
         first, middle, end = (slice(j * m, last + j * m, every) for j in range(3))
         before, after = count[middle] - count[first], count[end] - count[middle]
@@ -219,7 +228,7 @@ def jumps_of(answer: Array) -> Callable[[Array], float] | None:
     """Excess kurtosis of the scores of a step at every sample: a bias that jumps has some that are much larger.
     `answer` [n]: residuals to a unit step of the bias at the first sample. None where the drift forgets too seldom for
     a kurtosis. A long record is looked at in blocks."""
-    block = max(1, answer.size // JUMP_PLACES)
+    block = max(1, answer.size // 20_000)
     count = answer.size // block
     g = answer[: count * block].reshape(count, block).sum(axis=1)
     forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
@@ -263,18 +272,6 @@ def _largest(x: Array) -> float:
     ln_p = math.log(2.0) + float(log_ndtr(-np.abs(x).max())) + math.log(x.size)
     p = -math.expm1(-math.exp(min(ln_p, 5.0)))
     return -float(ndtri(min(max(p, 1e-300), 1.0 - 1e-16)))
-
-
-def _commonest(y: Array) -> float:
-    """How much oftener the commonest reading comes than the next, as a normal deviate."""
-    _, counts = np.unique(y[np.isfinite(y)], return_counts=True)
-    first, second = np.sort(counts)[:-3:-1] if counts.size > 1 else (counts[0], 0)
-    return float(first - second) / math.sqrt(float(first + second))
-
-
-def _longest_run(y: Array) -> int:
-    change = np.flatnonzero(np.diff(y, prepend=np.nan) != 0.0)
-    return int(np.diff(np.append(change, y.size)).max())
 
 
 def simulated(state: State, random: np.random.Generator) -> Array:
@@ -424,7 +421,7 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
         Statistic(name, float(value[k]), float(mean[k] - half[k]), float(mean[k] + half[k]), math.exp(ln_p[k]))
         for k, name in enumerate(names)
     ]
-    return Judged(sorted(found_all, key=lambda one: one.p), _family(ln_p, sample, least))
+    return Judged(sorted(found_all, key=lambda statistic: statistic.p), _family(ln_p, sample, least))
 
 
 def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) -> Array:
@@ -441,7 +438,7 @@ def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) 
     # Student's t of a new value against the ensemble: its spread is known to 1 / sqrt(2 n).
     z = (values - mean) / (sd * math.sqrt(1.0 + 1.0 / n))
     size = np.abs(z)
-    if n >= SKEWED:
+    if n >= 200:
         # Type III of Pearson: the largest, the kurtosis and sums of squares have a long tail on one side.
         p = _pearson3_above(size, np.sign(z) * third / sd**3)
     else:

@@ -29,13 +29,11 @@ WIDENED = REACH / math.sqrt(3.0)
 #: From three runs of one ADIS16405 (tests/ACCURACY.md, "Warm start"). Of a coefficient, assumed: the runs have no
 #: temperature.
 RUN_TO_RUN = {"N": 0.05, "K": 0.2, "sigma_m": 0.2, "B": 0.2}
-RUN_TO_RUN_SECOND, RUN_TO_RUN_COEFFICIENT = 0.4, 0.1
+RUN_TO_RUN_COEFFICIENT = 0.1
 #: A law with less than this probability keeps the model's priors: its parameters stand for nothing.
 LEAST_PROBABILITY = 0.01
 #: ln of the odds, at most, that a regressor is in use or is not: 99 to 1. The next record may say otherwise.
 MOST_LN_ODDS = math.log(99.0)
-#: Bytes of a diagnosis.
-MOST_BYTES = 1 << 25
 
 
 @dataclass(frozen=True)
@@ -72,10 +70,10 @@ def warmed(tables: Tables, start: Start | None) -> Tables:
 
 def _hypothesis(h: HypothesisTable, tables: Tables, known: list[AxisStart | None]) -> HypothesisTable:
     rows = []
-    for at, (axis, one) in enumerate(zip(tables.axes, known, strict=True)):
+    for at, (axis, start) in enumerate(zip(tables.axes, known, strict=True)):
         plain = zip(axis.ln_min, axis.ln_max, axis.law, len(PARAMETERS) * (False,), strict=True)
         row: list[PriorRow] = list(h.priors[at] if h.priors else plain)
-        for parameter, (low, high) in (one.limits.get(h.name, {}) if one is not None else {}).items():
+        for parameter, (low, high) in (start.limits.get(h.name, {}) if start is not None else {}).items():
             least, most, law, _ = row[PLACES[parameter]]
             if law == PriorLaw.LOG_NORMAL:
                 law = PriorLaw.LOG_UNIFORM  # the posterior has the normal in it
@@ -87,11 +85,11 @@ def _hypothesis(h: HypothesisTable, tables: Tables, known: list[AxisStart | None
 def _regressor(column: RegressorTable, known: list[AxisStart | None]) -> RegressorTable:
     sd, odds = list(column.coefficient_sd), list(column.ln_odds)
     mean = [0.0] * len(sd)
-    for at, one in enumerate(known):
-        if one is None or sd[at] == 0.0:
+    for at, start in enumerate(known):
+        if start is None or sd[at] == 0.0:
             continue
-        odds[at] = one.ln_odds.get(column.name, odds[at])
-        measured, width = one.coefficients.get(column.name, (0.0, math.inf))
+        odds[at] = start.ln_odds.get(column.name, odds[at])
+        measured, width = start.coefficients.get(column.name, (0.0, math.inf))
         if width < sd[at]:  # else the record says less than the model file
             mean[at], sd[at] = measured, width
     return replace(column, coefficient_sd=tuple(sd), coefficient_mean=tuple(mean), ln_odds=tuple(odds))
@@ -116,7 +114,7 @@ class _Reader:
         from selfcal.diagnosis.document import SCHEMA  # takes long to import
 
         try:
-            text = read_text(self.path, MOST_BYTES, "not a diagnosis")
+            text = read_text(self.path, 1 << 25, "not a diagnosis")
         except OSError as error:
             raise UserError(f"{self.path}: cannot read the diagnosis: {error.strerror}") from error
         with reading(self.path, "not a diagnosis (the JSON that `selfcal diagnose --json` writes)"):
@@ -188,7 +186,7 @@ class _Reader:
         probability = self.mapping(posterior, "hypotheses", f"{where}.")
         limits: dict[str, dict[str, tuple[float, float]]] = {}
         share = {law: self.number(probability, law, f"{where}.hypotheses") for law in laws}
-        if not all(-1e-9 <= one <= 1.0 + 1e-6 for one in share.values()):
+        if not all(-1e-9 <= estimate <= 1.0 + 1e-6 for estimate in share.values()):
             raise self.fail(f"{where}.hypotheses", "must be probabilities, 0 to 1")
         for law in sorted(laws, key=lambda law: -share[law]):
             if share[law] < LEAST_PROBABILITY:
@@ -202,9 +200,9 @@ class _Reader:
                 raise self.fail(inside, f"must have {', '.join(self.model.laws[law].parameters)}")
             entries = {name: self.mapping(of_law, name, f"{inside}.") for name in of_law if of_law[name] is not None}
             limits[law] = {
-                name: self.limits(one, f"{inside}.{name}", name, axis, factor)
-                for name, one in entries.items()
-                if one.get("identified") is True
+                name: self.limits(estimate, f"{inside}.{name}", name, axis, factor)
+                for name, estimate in entries.items()
+                if estimate.get("identified") is True
             }
         coefficients, odds = self.regressors(posterior.get("regressors") or {}, f"{where}.regressors", factor)
         return AxisStart(limits, coefficients, odds)
@@ -219,7 +217,7 @@ class _Reader:
         prior = self.model.group_of(axis).priors[parameter]
         if not math.log(prior.min) <= middle <= math.log(prior.max):
             raise self.fail(f"{where}.median", f"lies outside the model's prior, {prior.min:g} to {prior.max:g}")
-        half = REACH * math.hypot((q95 - q05) / (2.0 * HALF_90), RUN_TO_RUN.get(parameter, RUN_TO_RUN_SECOND))
+        half = REACH * math.hypot((q95 - q05) / (2.0 * HALF_90), RUN_TO_RUN.get(parameter, 0.4))
         return middle - half, middle + half
 
     def regressors(
@@ -227,7 +225,7 @@ class _Reader:
     ) -> tuple[dict[str, tuple[float, float]], dict[str, float]]:
         coefficients: dict[str, tuple[float, float]] = {}
         odds: dict[str, float] = {}
-        columns_of = {one.name: one.columns for one in self.model.regressors}
+        columns_of = {regressor.name: regressor.columns for regressor in self.model.regressors}
         if not isinstance(tree, dict) or not set(tree) <= set(columns_of):
             raise self.fail(where, f"must be a mapping of the model's regressors ({', '.join(columns_of) or 'none'})")
         for name in tree:

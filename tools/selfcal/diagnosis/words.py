@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+from selfcal.base.errors import few
 from selfcal.base.units import duration_words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import ROUNDS
@@ -14,14 +15,12 @@ from selfcal.logs.recording import SIDE_CHANNELS
 
 
 def verdict(axis: Mapping[str, Any]) -> str:
-    """The verdict on an axis of the document; one that is not finished is none."""
+    """The verdict on an axis of the document, or that its diagnosis is not finished."""
     if not axis.get("unfinished"):
         return str(axis["verdict"])
     return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
 
 
-#: Stretches of time that a sentence names.
-INTERVALS_SHOWN = 3
 #: How an estimate's key is read out.
 LABELS = {
     "other": "other axis",
@@ -96,9 +95,8 @@ LATER = (
 )
 #: Half of a coefficient's 90 % interval over it, below which it is applied and not recorded again.
 APPLIED = 0.05
-#: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g). A
-#: coefficient so many times larger is no leak of that kind.
-G_SENSITIVITY, IMPLAUSIBLE = 0.02, 50.0
+#: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g).
+G_SENSITIVITY = 0.02
 
 
 def rounded(value: float, half: float) -> str:
@@ -112,9 +110,7 @@ def rounded(value: float, half: float) -> str:
 
 def intervals(stretches: Sequence[Sequence[float]]) -> str:
     """The first few stretches of time, and how many more there are."""
-    shown = ", ".join(f"{start:.6g} s to {end:.6g} s" for start, end in stretches[:INTERVALS_SHOWN])
-    more = len(stretches) - INTERVALS_SHOWN
-    return f"from {shown}" + (f" and {more} more" if more > 0 else "")
+    return f"from {few([f'{start:.6g} s to {end:.6g} s' for start, end in stretches], 3)}"
 
 
 def sizes(estimate: Mapping[str, Any]) -> str:
@@ -156,7 +152,7 @@ def _size(key: str, value: Any) -> str:
 
 
 def statistic(name: str) -> str:
-    """What stands out, by the name of a statistic or of a check."""
+    """The meaning of a statistic or a check, by its name."""
     return next((told for begin, told in STATISTICS if name.startswith(begin)), name.replace("_", " "))
 
 
@@ -251,7 +247,7 @@ def effects(finding: Mapping[str, Any]) -> str:
 
 
 def action(finding: Mapping[str, Any]) -> str:
-    """What to do. A coefficient that is known well enough is applied, and not measured again."""
+    """The next step. A coefficient that is known well enough is applied, and not measured again."""
     if "readings_hz" in finding["estimate"]:
         return f"Look for what turns or switches at {finding['estimate']['readings_hz']['median']:.3g} Hz."
     if finding.get("next_record") and finding.get("confirmed_on") is not None:
@@ -318,7 +314,7 @@ def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f
 
 
 def carried(finding: Mapping[str, Any]) -> list[str]:
-    """What a finding gains on a second recording, in a line; none without one."""
+    """The gain of a finding on a second recording, in a line; no line without one."""
     if finding.get("gain_on"):
         score = finding["gain_on"]["log_score_per_sample"]
         more = score["after"] - score["before"]
@@ -333,10 +329,11 @@ def navigation(document: Mapping[str, Any]) -> list[str]:
     """What the findings mean for a GPS/INS filter, a line each, and what that rests on; none where nobody asked."""
     if "navigation" not in document:
         return []
-    flown = [one for one in document["findings"] if "navigation" in one]
     lines = [
-        f"{what(one)}: {one['navigation']['words'] if one['navigation'] else 'no flight: ' + one['navigation_reason']}"
-        for one in flown
+        f"{what(finding)}: "
+        + (flight["words"] if (flight := finding["navigation"]) else f"no flight: {finding['navigation_reason']}")
+        for finding in document["findings"]
+        if "navigation" in finding
     ]
     told = document["navigation"]
     return [*lines, told["words"]] if told else [*lines, *([] if lines else ["no flight: no finding matters"])]
@@ -355,7 +352,7 @@ def inflation_sentence(inflation: Mapping[str, float]) -> str:
 def plausibility(coefficient: float) -> str:
     """How a gyroscope's coefficient on an accelerometer, deg/s per m/s^2, compares with parts; empty if plausible."""
     times = abs(coefficient) / G_SENSITIVITY
-    if times < IMPLAUSIBLE:
+    if times < 50.0:
         return ""
     return (
         f"That is {times:.2g} times the largest sensitivity to acceleration of any part ({G_SENSITIVITY:g} deg/s per "

@@ -58,7 +58,7 @@ SMALLEST = 1e-20
 LN_LIMIT = 46.0
 #: sd from the middle of a log-normal prior to its limits: SELFCAL_LOG_NORMAL in lib/selfcal_tables.h.
 LOG_NORMAL_REACH = 4.0
-#: Its sd: below, a float no longer tells the limits of large logarithms apart.
+#: sd of a log-normal prior: below, the limits of large logarithms are equal floats.
 LOG_NORMAL_SD = (1e-4, 5.0)
 #: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
@@ -200,7 +200,7 @@ class Regressor:
         return (f"{self.name}.sin", f"{self.name}.cos") if self.kind == "periodic" else (self.name,)
 
 
-#: Nearer than so many standard deviations too much of the noise itself would be kept out.
+#: Least distance of an outlier, sd: below, too much of the noise itself would be kept out.
 LEAST_OUTLIER_SD = 4.0
 
 
@@ -231,7 +231,7 @@ class Handling:
         return self.outlier_sd, self.steps, self.variance_changes
 
 
-#: Of a model that says nothing of it.
+#: Handling of a model that states none.
 NOT_HANDLED = Handling()
 
 
@@ -290,8 +290,8 @@ class Model:
 
     @property
     def left_out(self) -> str:
-        """What a bank leaves out, in words; "" for nothing."""
-        names = ", ".join(one.name for one in self.beyond)
+        """Regressors that a bank leaves out, in words; "" for none."""
+        names = ", ".join(regressor.name for regressor in self.beyond)
         said = f"a bank has {MOST_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
         return f"{self.path}: {said}" if names else ""
 
@@ -311,16 +311,16 @@ class Model:
 
     @staticmethod
     def of_tree(tree: Mapping[str, Any], path: Path) -> Model:
-        """The same of a tree that is read already, from the file `path`."""
+        """Check a tree that is read already, from the file `path`."""
         return _Reader(path, tree).model()
 
 
 def with_room(regressors: Sequence[Regressor]) -> tuple[Regressor, ...]:
-    """Those that a bank has columns for: in their order, each whole or not at all."""
+    """Regressors that a bank has columns for: in their order, each whole or not at all."""
     kept: list[Regressor] = []
-    for one in regressors:
-        if sum(len(other.columns) for other in (*kept, one)) <= MOST_COLUMNS:
-            kept.append(one)
+    for regressor in regressors:
+        if sum(len(other.columns) for other in (*kept, regressor)) <= MOST_COLUMNS:
+            kept.append(regressor)
     return tuple(kept)
 
 
@@ -466,11 +466,14 @@ class _Reader:
             raise self.fail(where, f"must be a finite number{bound}, not {shown(value)}")
         return number
 
+    def within(self, value: Any, where: str, limits: tuple[float, float], unit: str = "") -> float:
+        number, (low, high) = self.number(value, where), limits
+        if not low <= number <= high:
+            raise self.fail(where, f"must be {low:g} to {high:g}{unit}, not {number:g}")
+        return number
+
     def rate(self, value: Any, where: str) -> float:
-        rate = self.number(value, where)
-        if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
-            raise self.fail(where, f"must be {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g} Hz, not {rate:g}")
-        return rate
+        return self.within(value, where, (LEAST_RATE_HZ, MOST_RATE_HZ), " Hz")
 
     def count(self, value: Any, where: str, low: int, high: int = 2**31 - 1) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
@@ -507,9 +510,8 @@ class _Reader:
             return Prior("normal", sd=self.number(self.entry(fields, "sd", where), f"{where}.sd"))
         if law == "log_normal":
             self.only(tree, ("law", "median", "sd"), where)
-            median, sd = (self.number(self.entry(fields, key, where), f"{where}.{key}") for key in ("median", "sd"))
-            if not LOG_NORMAL_SD[0] <= sd <= LOG_NORMAL_SD[1]:
-                raise self.fail(f"{where}.sd", f"must be {LOG_NORMAL_SD[0]:g} to {LOG_NORMAL_SD[1]:g}, not {sd:g}")
+            median = self.number(self.entry(fields, "median", where), f"{where}.median")
+            sd = self.within(self.entry(fields, "sd", where), f"{where}.sd", LOG_NORMAL_SD)
             prior = Prior.log_normal(median, sd)
         elif law in ("log_uniform", "uniform"):
             self.only(tree, ("law", "min", "max"), where)
@@ -536,12 +538,8 @@ class _Reader:
             raise self.fail(f"{where}.axes", f"has {len(axes)} axes, {MOST_AXES} are the most")
         if not all(re.fullmatch(r"\w[\w.-]*", axis) and len(axis) <= LONGEST_TEXT for axis in axes):
             raise self.fail(f"{where}.axes", "a name is of letters, digits, '_', '.' and '-': the tables have it")
-        names = (
-            "bias",
-            *PARAMETERS,
-            *(key for law in laws.values() for key in law.parameters if key not in PARAMETERS),
-        )
-        of_laws = {"bias", "N", *(key for law in laws.values() for key in law.parameters)}
+        of_laws = dict.fromkeys(("bias", "N", *(key for law in laws.values() for key in law.parameters)))
+        names = dict.fromkeys(("bias", *PARAMETERS, *of_laws))
         priors = self.priors(self.entry(fields, "priors", where), f"{where}.priors", names, of_laws=of_laws)
         owns = fields.get("own_priors") or {}
         self.only(owns, tuple(axes), f"{where}.own_priors")
@@ -650,7 +648,7 @@ class _Reader:
             raise self.fail("regressors", "must be a list")
         if len(tree) > MOST_STATED:
             raise self.fail("regressors", f"{len(tree)} are more than {MOST_STATED}")
-        found = tuple(self.regressor(one, f"regressors[{i}]", groups) for i, one in enumerate(tree))
+        found = tuple(self.regressor(entry, f"regressors[{i}]", groups) for i, entry in enumerate(tree))
         names = [regressor.name for regressor in found]
         for name in names:
             if names.count(name) > 1:
@@ -720,22 +718,17 @@ class _Reader:
         if by_ratio and walk:
             raise self.fail(f"{where}.deviation", "of a walk must be a number")
         stated = swings or "correlation_time_s" in fields
-        damping = self.number(self.entry(fields, "damping", where), f"{where}.damping") if swings else 0.0
-        if swings and not DAMPING_LIMITS[0] <= damping <= DAMPING_LIMITS[1]:
-            limits = " to ".join(f"{limit:g}" for limit in DAMPING_LIMITS)
-            raise self.fail(f"{where}.damping", f"must be {limits}, not {damping:g}")
+        damping = 0.0
         if swings:
+            damping = self.within(self.entry(fields, "damping", where), f"{where}.damping", DAMPING_LIMITS)
             time_s = self.number(self.entry(fields, "period_s", where), f"{where}.period_s") / (2.0 * math.pi)
         else:
             time_s = self.number(fields["correlation_time_s"], f"{where}.correlation_time_s") if stated else 1.0
         numbers = {
-            key: self.number(fields.get(key, 1.0), f"{where}.{key}")
+            key: self.within(fields.get(key, 1.0), f"{where}.{key}", FACTORS)
             for key in ("deviation", "bandwidth")
             if not (key == "deviation" and by_ratio)
         }
-        for key, value in numbers.items():
-            if not FACTORS[0] <= value <= FACTORS[1]:
-                raise self.fail(f"{where}.{key}", f"must be {FACTORS[0]:g} to {FACTORS[1]:g}, not {value:g}")
         bandwidth = 1.0 / time_s if stated else numbers["bandwidth"]
         return Term(fields["kind"], numbers.get("deviation", 1.0), bandwidth, stated, by_ratio, damping)
 
@@ -745,7 +738,7 @@ class _Reader:
         if not isinstance(terms, list):
             raise self.fail(f"{where}.terms", f"must be a list of terms, not {shown(terms)}")
         most = MOST_TERMS - (1 if coloured else 0)
-        law = Law(tuple(self.term(one, f"{where}.terms[{i}]") for i, one in enumerate(terms)), coloured)
+        law = Law(tuple(self.term(entry, f"{where}.terms[{i}]") for i, entry in enumerate(terms)), coloured)
         if len(law.read) > most:
             beside = " beside coloured noise" * coloured + ", an oscillation counts as two" * law.has_oscillation
             raise self.fail(f"{where}.terms", f"has {len(law.read)}, {most} are the most{beside}")

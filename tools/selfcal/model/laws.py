@@ -99,7 +99,7 @@ class Law:
 
     @cached_property
     def is_sum(self) -> bool:
-        """It needs the filters for several states: `selfcal_law_is_sum()`."""
+        """Whether the law needs the filters for several states: `selfcal_law_is_sum()`."""
         plain = (Term("walk"), Term("markov"))
         return self.coloured_noise or len(self.terms) > 1 or any(term not in plain for term in self.terms)
 
@@ -124,7 +124,7 @@ class Law:
         return parameters[drift] if drift else 0.0, parameters[second] if second else 1.0
 
     def with_time(self, correlation_time_s: float) -> Law:
-        """The same with a correlation time for the term whose stated bandwidth is left open (NaN)."""
+        """The law with a correlation time for the term whose stated bandwidth is left open (NaN)."""
         open_terms = (t.stated and math.isnan(t.bandwidth) for t in self.terms)
         terms = (
             replace(t, bandwidth=1.0 / correlation_time_s) if is_open else t
@@ -195,8 +195,7 @@ NAMED: dict[str, Law] = {
     "moving_average": Law((Term("walk"),), coloured_noise=True),
     "walk_and_markov": Law((Term("walk"), Term("markov", bandwidth=math.nan, stated=True, by_ratio=True))),
 }
-#: Those that are sums of several terms, and the others, which are the paper's.
-SUMS = tuple(name for name, law in NAMED.items() if law.is_sum)
+#: Laws of one term, which are the paper's.
 PLAIN = tuple(name for name, law in NAMED.items() if not law.is_sum)
 
 

@@ -16,8 +16,6 @@ from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import KIND, Source, curved, made, played, source_of, variance_of
 
-#: End of a pulse that is over before the first row, s.
-OVER_S = 1e-6
 #: A subset of the regressors.
 Choice = tuple[Regressor, ...]
 
@@ -39,11 +37,13 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     regressors = from_time(regressors, recording.start_s)
     missing = np.ascontiguousarray(recording.missing_before, np.uint64)
     values = [
-        _varying(recording.in_unit(name, unit), missing) if by == "variance" else recording.in_unit(name, unit)
+        bridged(variance_of(recording.in_unit(name, unit), missing))
+        if by == "variance"
+        else recording.in_unit(name, unit)
         for name, unit, by in channels
     ]
     rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
-    sources = [source for one in regressors for source in sources_of(one, channels)]
+    sources = [source for regressor in regressors for source in sources_of(regressor, channels)]
     columns = made(sources, 1.0 / recording.rate_hz, rows, missing, recording.powered)
     place = 0
     for one in regressors:
@@ -55,11 +55,6 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     return columns
 
 
-def _varying(values: NDArray[np.float64], missing: NDArray[np.uint64]) -> NDArray[np.float64]:
-    """The variance of a channel at each sample; where there is none yet, the one before or the first."""
-    return bridged(variance_of(values, missing))
-
-
 def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
     """The regressors for a clock that begins at `start_s` of the one that their times are of."""
 
@@ -67,17 +62,17 @@ def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regresso
         if one.kind == "step":
             return replace(one, time_s=max(0.0, one.time_s - start_s))
         if one.kind == "pulse":
-            return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(OVER_S, one.end_s - start_s))
+            return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(1e-6, one.end_s - start_s))
         return one
 
-    return tuple(moved(one) for one in regressors)
+    return tuple(moved(regressor) for regressor in regressors)
 
 
 def check_channels(regressors: Sequence[Regressor], recording: Recording) -> None:
     """Raise UserError for a channel of the regressors that the recording has not."""
     for name, *_ in channels_of(regressors):
         if name not in recording.columns:
-            needs = next(one.name for one in regressors if one.column == name)
+            needs = next(regressor.name for regressor in regressors if regressor.column == name)
             raise UserError(
                 f"{recording.path}: there is no column '{name}', which the model's regressor '{needs}' needs "
                 f"(there are {', '.join(recording.columns)})"
@@ -94,7 +89,7 @@ def _channel(one: Regressor) -> tuple[str, str, str]:
 
 
 def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
-    """Of each of its columns."""
+    """`selfcal_source_t` of each column of a regressor."""
     if one.kind == "time":
         return [(KIND["TIME"], 0, 0.0, 0.0)]
     if one.kind == "step":
@@ -130,7 +125,7 @@ def choices_of(regressors: Choice) -> list[Choice]:
 
 def mask_of(regressors: Choice, choice: Choice) -> int:
     """A bit for every column in use, in the order of `regressors`."""
-    names = [column for one in regressors for column in one.columns]
+    names = [column for regressor in regressors for column in regressor.columns]
     return sum(1 << names.index(column) for one in choice for column in one.columns)
 
 

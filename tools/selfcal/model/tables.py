@@ -21,8 +21,8 @@ from selfcal.model.regressors import channels_of, sources_of
 
 #: Samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
-#: Bank intervals of a stated correlation time, at most: ALPHA_DT_MAX in lib/bank_inside.h, TIME_MAX in bank_states.c.
-ALPHA_DT_MAX, TIME_MAX = 6.9, 1e6
+#: Bank intervals of a stated correlation time, at most: TIME_MAX in bank_states.c.
+TIME_MAX = 1e6
 
 
 class PriorLaw(IntEnum):
@@ -147,7 +147,7 @@ class Tables:
 
     @property
     def rate_hz(self) -> float:
-        """Of the samples."""
+        """Rate of the samples."""
         return self.block / self.dt_s
 
     @property
@@ -160,7 +160,7 @@ class Tables:
         """Name and unit of what the regressors take beside the readings of these axes."""
         axes = {(axis.name, axis.unit) for axis in self.axes}
         taken = dict.fromkeys(column.source[3:] for column in self.regressors if column.source[3])
-        return tuple(one for one in taken if one not in axes)
+        return tuple(channel for channel in taken if channel not in axes)
 
     def source_of(self, column: RegressorTable) -> tuple[int, int, float, float]:
         """`selfcal_source_t` of a column: kind, place of its channel (the axes' readings, then `channels`), numbers."""
@@ -271,7 +271,7 @@ def make_tables(
                 column,
                 one.unit,
                 one.offset,
-                tuple(_coefficient_sd(model, one, name) for name in names),
+                tuple((0.0 if one.column == name else one.sd.get(model.group_of(name).name, 0.0)) for name in names),
                 _source(one, place),
                 len(names) * ((math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0),),
             )
@@ -318,7 +318,8 @@ def _check_times(model: Model, dt: float) -> None:
         for term in law.terms:
             if term.stated and term.kind == "markov":
                 stated = "correlation_time_s" if name in NAMED else f"{where}correlation_time_s"
-                check(stated, 1.0 / term.bandwidth, dt / ALPHA_DT_MAX, TIME_MAX * dt)
+                # 6.9 is ALPHA_DT_MAX in lib/bank_inside.h.
+                check(stated, 1.0 / term.bandwidth, dt / 6.9, TIME_MAX * dt)
 
 
 def priors_of(group: Group, law: str) -> tuple[PriorRow, ...]:
@@ -333,12 +334,7 @@ def _law(prior: Prior) -> PriorLaw:
 
 
 def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, str]:
-    """Of a column by its place in the regressor."""
+    """Source of a column by its place in the regressor."""
     channels = channels_of((regressor,))
     kind, _, number, second = sources_of(regressor, channels)[place]
     return kind, number, second, *(channels[0][:2] if channels else ("", ""))
-
-
-def _coefficient_sd(model: Model, regressor: Regressor, axis: str) -> float:
-    """0 where the axis does not have the regressor: no prior for its group, or it is the axis itself."""
-    return 0.0 if regressor.column == axis else regressor.sd.get(model.group_of(axis).name, 0.0)

@@ -21,8 +21,6 @@ WIDTH, HEIGHT = 340, 220
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Size of a picture of strips, room for their names, and the height of each.
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
-#: Share of a strip's points that may lie beyond each of its edges.
-USUAL = 0.02
 #: Points of a curve at most.
 POINTS = 400
 #: Rows of a table behind a picture at most.
@@ -73,8 +71,13 @@ class Panel:
 
     @property
     def drawn(self) -> list[Curve | Band]:
-        """What the key and the tables name."""
+        """All curves and bands, as the key and the tables name them."""
         return [*self.curves, *self.bands]
+
+    @property
+    def heights(self) -> list[Array]:
+        """All that lies on the vertical axis."""
+        return [curve.y for curve in self.curves] + [edge for band in self.bands for edge in (band.low, band.high)]
 
     @property
     def alternative(self) -> str:
@@ -221,21 +224,15 @@ def _x_limits(figure: Figure) -> tuple[float, float]:
     return (0.0 if not first.log_x and 0.0 < low < 0.05 * high else low), high
 
 
-def _y_limits(figure: Figure) -> tuple[float, float]:
-    values = [curve.y for panel in figure.panels for curve in panel.curves]
-    values += [edge for panel in figure.panels for band in panel.bands for edge in (band.low, band.high)]
-    return _limits(values, figure.panels[0].log_y, 0.06)
-
-
 def draw(figure: Figure) -> Markup:
     """The figure in HTML: its panels on one scale, caption, key, and a table behind them."""
-    first = figure.panels[0]
+    first, heights = figure.panels[0], [each for panel in figure.panels for each in panel.heights]
     right, bottom = WIDTH - RIGHT, HEIGHT - BOTTOM
     return render(
         "panels.html",
         figure=figure,
         x=_Scale(*_x_limits(figure), first.log_x, LEFT, right - LEFT),
-        y=_Scale(*_y_limits(figure), first.log_y, bottom, TOP - bottom),
+        y=_Scale(*_limits(heights, first.log_y, 0.06), first.log_y, bottom, TOP - bottom),
         paths=_paths,
         **{"width": WIDTH, "height": HEIGHT, "left": LEFT, "right": right, "top": TOP, "bottom": bottom},
     )
@@ -275,7 +272,7 @@ def _usual(panel: Panel) -> tuple[float, float]:
     """Limits that all but a few points of a panel keep: a shock must not hide a step."""
     bands = [band for band in panel.bands if band.kind != "moving"]
     values = [curve.y for curve in panel.curves] + [edge for band in bands for edge in (band.low, band.high)]
-    usual = [np.nanquantile(ys, (USUAL, 1.0 - USUAL)) for ys in values if np.isfinite(ys).any()]
+    usual = [np.nanquantile(ys, (0.02, 0.98)) for ys in values if np.isfinite(ys).any()]
     return _limits(usual, False, 0.06)
 
 

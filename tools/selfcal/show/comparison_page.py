@@ -15,8 +15,6 @@ from selfcal.base.units import typeset
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
 from selfcal.show.template import render
 
-#: Characters that a picture's title has room for.
-LONGEST_TITLE = 22
 #: Allan deviations by axis and recording: the key `allan` of `selfcal.identify/1`.
 Curves = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
@@ -80,7 +78,7 @@ def _deviations(name: str, curves: Mapping[str, Mapping[str, Any]], names: Mappi
     panels = []
     for log, known in curves.items():
         tau, measured, low, high = (np.array(known[key]) for key in ("tau_s", "recording", "model_q05", "model_q95"))
-        title = names[log] if len(names[log]) <= LONGEST_TITLE else f"{names[log][: LONGEST_TITLE - 1]}…"
+        title = names[log] if len(names[log]) <= 22 else f"{names[log][:21]}…"
         curve, band = Curve("recording", tau, measured), Band("law, 5 to 95 %", tau, low, high)
         unit = f"deviation, {typeset(known['unit'])}"
         if tau.size > 1:

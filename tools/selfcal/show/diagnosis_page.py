@@ -29,8 +29,8 @@ from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outsi
 from selfcal.show.findings import before_after, noisier_of
 from selfcal.show.template import number, render, spaced
 
-#: Bytes of the page at most, and of the line in place of a picture.
-SIZE_MOST, LINE = 995_000, 140
+#: Bytes of the line in place of a picture.
+LINE = 140
 #: Name of the Allan figure, and the share of its points outside the band from which on the curve leaves it. Each point
 #: of a fitting record is outside the range of 20 with a probability of 2/21, neighbours together: 1 of 400 fitting
 #: records had more than this share outside, 9 more than a quarter.
@@ -76,7 +76,9 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "alone": [
             finding for finding in findings if not any(axis.first_of(finding["cause"]) is not None for axis in axes)
         ],
-        "boxes_of": lambda finding: [(axis.name, k) for axis in axes if (k := axis.box_of(finding)) is not None],
+        "boxes_of": lambda finding: [
+            (axis.name, k) for axis in axes if (k := axis.first_of(finding["id"], "of")) is not None
+        ],
         "noisier": noisier_of(results),
         "readings": _readings(shown, axes) if axes else "",
         "causes": list({str(finding["cause"]): None for _, finding in gains}),
@@ -90,11 +92,16 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "given": partial(_given, options),
         "model": _model(document),
         "records": pictures.RECORDS,
+        "id": lambda axis, k: f"f-{''.join(c if c.isalnum() else '-' for c in axis)}-{k + 1}",
+        "whole": _whole,
+        "gained": _gained,
+        "factor": _factor,
+        "outside": _outside,
     }
-    functions = {"id": _id, "whole": _whole, "gained": _gained, "factor": _factor, "outside": _outside}
-    text = render("diagnosis.html", **values, **functions)
-    if _leave_out([picture for axis in axes for picture in axis.pictures], len(_bytes(text)) - SIZE_MOST):
-        text = render("diagnosis.html", **values, **functions)
+    text = render("diagnosis.html", **values)
+    # A page has 995 000 bytes at most.
+    if _leave_out([picture for axis in axes for picture in axis.pictures], len(_bytes(text)) - 995_000):
+        text = render("diagnosis.html", **values)
     return str(text)
 
 
@@ -171,13 +178,9 @@ class _Axis:
         """Whether a cause changes a number by as much as matters, or has no name."""
         return cause in (*self.entry.get("material", ()), UNEXPLAINED)
 
-    def first_of(self, cause: str) -> int | None:
-        """Place of the first box of a cause."""
-        return next((k for k, finding in enumerate(self.entry["findings"]) if finding["cause"] == cause), None)
-
-    def box_of(self, finding: Entry) -> int | None:
-        """Place of the box of a finding of all axes."""
-        return next((k for k, box in enumerate(self.entry["findings"]) if box.get("of") == finding["id"]), None)
+    def first_of(self, value: str, key: str = "cause") -> int | None:
+        """Place of the first box of a cause; with the key `of`, of a finding of all axes."""
+        return next((k for k, finding in enumerate(self.entry["findings"]) if finding.get(key) == value), None)
 
 
 def _axis(name: str, entry: Entry, diagnosed: Diagnosed) -> _Axis:
@@ -269,10 +272,6 @@ def _nats(finding: Entry) -> float:
 
 def _whole(nats: float) -> str:
     return f"{nats:.0f}" if 100.0 <= nats < 1e7 else number(nats, 3)
-
-
-def _id(axis: str, k: int) -> str:
-    return f"f-{''.join(c if c.isalnum() else '-' for c in axis)}-{k + 1}"
 
 
 def _match(finding: Entry, candidates: Sequence[Finding]) -> int | None:

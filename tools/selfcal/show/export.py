@@ -36,8 +36,6 @@ FORMS = {
 OVERBOUND = 0.95
 #: Step of PX4's filter by default (EKF2_PREDICT_US), s.
 PREDICT_S = 0.01
-#: Correlation time that makes a Gauss-Markov drift a walk, s.
-ENDLESS = 1e9
 
 
 @dataclass(frozen=True)
@@ -80,7 +78,7 @@ class Kind:
     @property
     def correlation_s(self) -> float:
         """Correlation time of that form: an overbound is a walk."""
-        return ENDLESS if self.bounded else 1.0 / self.median["alpha"]
+        return 1e9 if self.bounded else 1.0 / self.median["alpha"]
 
 
 def write_export(

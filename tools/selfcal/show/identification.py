@@ -16,7 +16,7 @@ from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.bank.result import likeliest
 from selfcal.base import units
-from selfcal.base.errors import called, printable
+from selfcal.base.errors import called, few, printable
 from selfcal.base.output import TABLE_WIDTH, console_of, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
@@ -27,8 +27,6 @@ Reason = TypeVar("Reason", str, tuple[str, str])
 #: A check, its axes, and their outcomes.
 _Event = tuple[str, list[str], list[Mapping[str, Any]]]
 
-#: Least probability of a law that is named if the grid is too coarse for it.
-TOLD_OF = 0.01
 #: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
 #: Largest distance of jumps of one event, s.
@@ -180,10 +178,7 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
 
 
 def _times(intervals: Sequence[Sequence[float]]) -> str:
-    """The first few stretches, and how many more there are."""
-    times = ", ".join(f"{a:.6g} to {b:.6g} s" for a, b in intervals[:MOST_LISTED])
-    more = len(intervals) - MOST_LISTED
-    return f"{times}{f' and {more} more' if more > 0 else ''}"
+    return few([f"{a:.6g} to {b:.6g} s" for a, b in intervals], MOST_LISTED)
 
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
@@ -249,7 +244,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         coarse = [
             law
             for law, parameters in axis["parameters"].items()
-            if axis["hypotheses"][law] >= TOLD_OF and any(e["off_grid"] for e in parameters.values())
+            if axis["hypotheses"][law] >= 0.01 and any(e["off_grid"] for e in parameters.values())
         ]
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
@@ -263,7 +258,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         if suspected:
             failed.append(f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in suspected.items())}")
     more = _by_reason(
-        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > TOLD_OF), name)
+        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > 0.01), name)
         for name, more in ((name, axis["more_laws"]) for name, axis in axes.items() if "more_laws" in axis)
     )
     failed += [f"with the laws of sums.yaml: {names}: {laws}" for laws, names in more.items()]

@@ -24,10 +24,6 @@ from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope
 
 #: Simulated records of a band.
 RECORDS = 20
-#: Averaging times a decade, and frequencies a decade, of the overview.
-TAUS_A_DECADE, BINS_A_DECADE = 8, 24
-#: Standard deviations within which 99 % of a normal deviate lie.
-TWO_SIDED_99 = 2.576
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
 
@@ -56,13 +52,8 @@ class Compared:
     stairs: bool = False
 
 
-@dataclass
-class _Pair:
-    """Curve and band of a state."""
-
-    measured: Array
-    low: Array
-    high: Array
+#: Curve of a state, and its band's lower and upper edge, by the picture's identity and the state's place.
+_Pairs = dict[tuple[int, int], tuple[Array, Array, Array]]
 
 
 def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> tuple[list[Figure], list[list[Figure]]]:
@@ -73,7 +64,14 @@ def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> t
         _allan(diagnosed.first, diagnosed.state, factor, unit),
         _spectrum(diagnosed.first, diagnosed.state, factor, unit),
     ]
-    plans = [_plan(finding, finding.record or record, factor, unit) for finding in diagnosed.findings]
+    plans = [
+        [
+            picture
+            for name in CAUSES[finding.look.cause].pictures(finding.look)
+            for picture in _PICTURES[name](finding, finding.record or record, factor, unit)
+        ]
+        for finding in diagnosed.findings
+    ]
     compared = [*overview, *(item for plan in plans for item in plan if isinstance(item, Compared))]
     pairs = _ensembles(compared)
 
@@ -84,44 +82,40 @@ def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> t
     return [sides, *(figure(item) for item in overview)], [[figure(item) for item in plan] for plan in plans]
 
 
-def _ensembles(items: Sequence[Compared]) -> dict[tuple[int, int], _Pair]:
+def _ensembles(items: Sequence[Compared]) -> _Pairs:
     """Every band. Each state is simulated once for all the pictures that need it: with a record in memory at a time."""
-    jobs: dict[int, list[tuple[int, int, Compared]]] = {}
-    states: dict[int, State] = {}
-    for number, item in enumerate(items):
+    jobs: dict[int, tuple[State, list[tuple[int, Compared]]]] = {}
+    for item in items:
         for side, state in enumerate(item.states):
-            jobs.setdefault(id(state), []).append((number, side, item))
-            states[id(state)] = state
-    pairs: dict[tuple[int, int], _Pair] = {}
-    for key, wanted in jobs.items():
-        state = states[key]
+            jobs.setdefault(id(state), (state, []))[1].append((side, item))
+    pairs: _Pairs = {}
+    for state, wanted in jobs.values():
         random = np.random.default_rng(20)
-        drawn: dict[tuple[int, int], list[Array]] = {(number, side): [] for number, side, _ in wanted}
-        needs = any(item.whitened for _, _, item in wanted)
+        drawn: list[list[Array]] = [[] for _ in wanted]
+        needs = any(item.whitened for _, item in wanted)
         for _ in range(RECORDS):
             y = simulated(state, random)
             w = whitened_of(state, y) if needs else y
-            for number, side, item in wanted:
-                drawn[number, side].append(item.summaries[side](y, w))
-        for number, side, item in wanted:
-            sample = np.array(drawn[number, side])
+            for curves, (side, item) in zip(drawn, wanted, strict=True):
+                curves.append(item.summaries[side](y, w))
+        for curves, (side, item) in zip(drawn, wanted, strict=True):
             measured = item.summaries[side](state.y, state.whitened)
-            pairs[id(item), side] = _Pair(measured, sample.min(axis=0), sample.max(axis=0))
+            pairs[id(item), side] = measured, np.min(curves, axis=0), np.max(curves, axis=0)
     return pairs
 
 
-def _figure(item: Compared, pairs: Mapping[tuple[int, int], _Pair]) -> Figure:
+def _figure(item: Compared, pairs: _Pairs) -> Figure:
     panels = []
     same = item.states[0] is item.states[1]
     for side, title in enumerate(("Model as it is",) if same else ("Before", "After")):
-        pair = pairs[id(item), side]
+        measured, low, high = pairs[id(item), side]
         panels.append(
             Panel(
                 title,
                 item.x_label,
                 item.y_label,
-                [Curve("measured", item.x, pair.measured, "dots" if item.dots else "measured")],
-                [Band(f"range of {RECORDS} simulated records", item.x, pair.low, pair.high)],
+                [Curve("measured", item.x, measured, "dots" if item.dots else "measured")],
+                [Band(f"range of {RECORDS} simulated records", item.x, low, high)],
                 item.log_x,
                 item.log_y,
                 item.marks,
@@ -129,12 +123,6 @@ def _figure(item: Compared, pairs: Mapping[tuple[int, int], _Pair]) -> Figure:
             )
         )
     return Figure(item.name, item.caption, panels)
-
-
-def _plan(finding: Finding, record: Record, factor: float, unit: str) -> list[Compared | Figure]:
-    """The pictures for a cause."""
-    names = CAUSES[finding.look.cause].pictures(finding.look)
-    return [figure for name in names for figure in _PICTURES[name](finding, record, factor, unit)]
 
 
 def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> Compared | Figure:
@@ -154,13 +142,13 @@ def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> 
         return _level(finding, record, means=True)
     if "spectrum" in name:
         return _spectrum(state, state, factor, unit)
-    return _readings(finding, factor, unit)
+    return _histogram_of_readings((finding.before, finding.after), "How often each reading comes.", factor, unit)
 
 
 def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
     n = before.y.size
     most = max(2, n // 6)
-    count = max(2, round(TAUS_A_DECADE * math.log10(most)) + 1)
+    count = max(2, round(8 * math.log10(most)) + 1)
     sizes = np.unique(np.rint(np.logspace(0.0, math.log10(most), count)).astype(int))
 
     def summary(y: Array, w: Array) -> Array:
@@ -193,7 +181,7 @@ def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared
     frequency = rfftfreq(n, dt)
     first = min(3, frequency.size - 2)
     decades = math.log10(frequency[-1] / frequency[first])
-    wanted = np.logspace(0.0, decades, max(4, round(BINS_A_DECADE * decades))) * frequency[first]
+    wanted = np.logspace(0.0, decades, max(4, round(24 * decades))) * frequency[first]
     edges = np.unique(np.searchsorted(frequency, wanted))
     edges = edges[edges < frequency.size - 1]
     size = np.diff(np.append(edges, frequency.size))
@@ -336,19 +324,14 @@ def _histogram(before: State, after: State) -> Compared:
     )
 
 
-def _readings(finding: Finding, factor: float, unit: str) -> Compared:
-    """Histogram of the readings."""
-    return _histogram_of_readings((finding.before, finding.after), "How often each reading comes.", factor, unit)
-
-
 def _lattice(finding: Finding, factor: float, unit: str) -> Compared:
-    """The same; before, the model reads out on no lattice."""
+    """Histogram of the readings; before, the model reads out on no lattice."""
     free = replace(finding.before, lsb=0.0)
     return _histogram_of_readings((free, finding.after), "Before: without a lattice.", factor, unit, finding.before.lsb)
 
 
 def _limit(finding: Finding, factor: float, unit: str) -> Compared:
-    """The same; before, the model reads out without a limit."""
+    """Histogram of the readings; before, the model reads out without a limit."""
     before = finding.before
     # The state after saturation holds clipped readings drawn anew: the readings are the record's own.
     states = (before, replace(finding.after, y=before.y))
@@ -412,7 +395,7 @@ def _together(finding: Finding) -> Iterator[Figure]:
                 "frequency, Hz",
                 "correlation",
                 [Curve("measured", hz, r, "dots")],
-                [Band("99 % of axes that share nothing", hz, -TWO_SIDED_99 * sd, TWO_SIDED_99 * sd)],
+                [Band("99 % of axes that share nothing", hz, -2.576 * sd, 2.576 * sd)],
                 log_x=True,
             )
         ],
@@ -435,7 +418,7 @@ def _missing(finding: Finding, record: Record) -> Figure:
 
 
 def _effect(finding: Finding) -> Array:
-    """What the finding's columns add to a reading [n], in the inner unit."""
+    """Sum of the finding's columns in a reading [n], in the inner unit."""
     known = {column.name for column in finding.before.regressors}
     effect = np.zeros(finding.after.y.size)
     for k, column in enumerate(finding.after.regressors):

@@ -84,7 +84,8 @@ def plot_run(
                 spans[axis, parameter].append(value)
                 panel.axhline(value, color="black", linestyle="--", linewidth=1.0)
             panel.set_yscale("log")
-            panel.set_ylabel(_label(parameter, unit[axis]))
+            own_unit = "s" if parameter == "alpha" else parameter_unit(parameter, unit[axis])
+            panel.set_ylabel("" if own_unit == "1" else typeset(own_unit))
             panel.grid(True, alpha=0.3)
         row[0].grid(True, alpha=0.3)
     for column, parameter in enumerate(panels, start=1):
@@ -184,12 +185,6 @@ def _true(truth: Any, parameter: str, unit: str) -> float | None:
     if not isinstance(stated, str) or not known(stated) or not same_kind(stated, unit):
         return None
     return float(value) * factor(stated, unit)
-
-
-def _label(parameter: str, reading: str) -> str:
-    """The unit of a panel, as print has it."""
-    unit = "s" if parameter == "alpha" else parameter_unit(parameter, reading)
-    return "" if unit == "1" else typeset(unit)
 
 
 def _write(panel: Any, text: str, color: str) -> None:

@@ -46,9 +46,7 @@ def _hints(of: type[Object]) -> dict[str, Any]:
 def _typed(value: Any, hint: Any) -> Any:
     """`value` with the classes of `hint`; as it is where that does not fit it."""
     if isinstance(hint, UnionType):
-        hint = next(
-            (choice for choice in get_args(hint) if isinstance(value, get_origin(choice) or _shape(choice))), Any
-        )
+        hint = next((choice for choice in get_args(hint) if isinstance(value, _shape(choice))), Any)
     arguments = get_args(hint)
     if get_origin(hint) is dict and isinstance(value, Mapping):
         return {key: _typed(entry, arguments[1]) for key, entry in value.items()}
@@ -61,8 +59,13 @@ def _typed(value: Any, hint: Any) -> Any:
 
 def _shape(hint: Any) -> type:
     """What a value must be to be taken for `hint`."""
+    hint = get_origin(hint) or hint
     return (
-        Mapping if isinstance(hint, type) and issubclass(hint, Object) else hint if isinstance(hint, type) else object
+        hint
+        if isinstance(hint, type) and not issubclass(hint, Object)
+        else Mapping
+        if isinstance(hint, type)
+        else object
     )
 
 

@@ -42,7 +42,7 @@ def _list(items: Json, **more: Any) -> Json:
 
 
 def _group() -> Json:
-    """Of a group of axes."""
+    """Schema of a group of axes."""
     bias = _only({"law": {"const": "normal"}, "sd": NUMBER}, ["law", "sd"])
     priors = {"bias": bias, **dict.fromkeys(PLACES, PRIOR)}
     return _only(
@@ -60,7 +60,7 @@ def _group() -> Json:
 
 
 def model() -> Json:
-    """Of a model file."""
+    """Schema of a model file."""
     limits: dict[str, Json] = {"law": {"enum": ["log_uniform", "uniform"]}, "min": NUMBER, "max": NUMBER}
     prior = {
         "oneOf": [
@@ -142,7 +142,7 @@ def result(of: type[Object]) -> Json:
 
 
 def _hint(hint: Any, places: dict[str, Json]) -> Json:
-    """Of an annotation; classes go to `places`."""
+    """Schema of an annotation; classes go to `places`."""
     if isinstance(hint, UnionType):
         return {"anyOf": [_hint(choice, places) for choice in get_args(hint)]}
     if hint is NoneType:

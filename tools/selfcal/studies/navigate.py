@@ -15,7 +15,7 @@ from scipy import optimize
 from selfcal.base.output import console_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
-from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 
@@ -86,7 +86,7 @@ def noise_of(bank: Bank, axis: int, mask: int = 0) -> tuple[dict[str, float], Ax
     white = [(now.probability[law], estimates["N"]) for law, estimates in now.parameters.items()]
     noise = {"N": math.sqrt(sum(p * (e.mean**2 + e.sd**2) for p, e in white))}
     if now.best != "constant":
-        noise |= matched(now.bias_sd**2, *(one.bias_sd**2 for one in later))
+        noise |= matched(now.bias_sd**2, *(report.bias_sd**2 for report in later))
     return noise, now
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from selfcal.base.units import STANDARD_GRAVITY, convert
-from selfcal.model.parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
+from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
 
 #: Lengths of the rest, and of the flight with GPS and after its outage, s; the longest outage that is flown.
 REST_S, GPS_S, OUTAGE_S, LONGEST_S = 1800, 300, 60, 300
@@ -37,8 +37,8 @@ RATE_HZ = 10
 LATENCY_S, LATENCY_SD_S, GPS_SD_M = 1, 0.1, 3.0
 #: Sd of the start's errors: the tilt of the floor and the heading, deg; the position by axis, m.
 TILT_SD, HEADING_SD, START_SD_M = 0.1, 2.0, 3.0
-#: Speed and its swing, m/s; largest turn, deg/s; take-off and periods of the swings, s.
-SPEED, SPEED_SWING, TURN, TAKE_OFF_S, SPEED_PERIOD_S, TURN_PERIOD_S = 20.0, 4.0, 10.0, 20.0, 47.0, 60.0
+#: Largest turn, deg/s; take-off and period of the turns, s.
+TURN, TAKE_OFF_S, TURN_PERIOD_S = 10.0, 20.0, 60.0
 #: Units of the filter, by AXES, and the size of each axis' unit in them.
 SI = {"deg/s": "rad/s", "m/s^2": "m/s^2"}
 SCALE = np.array([convert(np.ones(1), unit, SI[unit])[0] for unit in AXES.values()])
@@ -98,7 +98,7 @@ def flight() -> Flight:
     t = np.arange((GPS_S + LONGEST_S) * RATE_HZ + 1) * dt
     after = np.maximum(t - TAKE_OFF_S, 0.0)
     start = 0.5 * (1.0 - np.cos(np.pi * np.minimum(t / TAKE_OFF_S, 1.0)))
-    speed = SPEED * start + SPEED_SWING * np.sin(2.0 * np.pi * after / SPEED_PERIOD_S)
+    speed = 20.0 * start + 4.0 * np.sin(2.0 * np.pi * after / 47.0)
     phase = 2.0 * np.pi * after / TURN_PERIOD_S
     turn = math.radians(TURN) * np.sin(phase)
     heading = math.radians(TURN) * TURN_PERIOD_S / (2.0 * np.pi) * (1.0 - np.cos(phase))

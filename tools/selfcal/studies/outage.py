@@ -30,8 +30,8 @@ from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model
-from selfcal.model.parts import AXES, SHEET_N, Floats
 from selfcal.model.regressors import columns_of, mask_of, offered
+from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
 from selfcal.model.tables import make_tables
 from selfcal.readings.readings import look
 from selfcal.studies.navigate import noise_of
@@ -85,7 +85,7 @@ def add_outages(
     document what they have in common, None without a flight. `tree`: the extended model file's."""
     flown = recording if second is None else second
     names = [name for name in AXES if name in found and name in flown.columns]
-    extended = {one.name: one for one in Model.of_tree(tree, model.path).regressors}
+    extended = {regressor.name: regressor for regressor in Model.of_tree(tree, model.path).regressors}
     terms: dict[str, list[tuple[str, Term]]] = {name: [] for name in names}
     reasons: dict[str, str] = {}
     for name in names:
@@ -140,7 +140,7 @@ def _told(
     recording: Recording,
     second: Recording | None,
 ) -> Told:
-    """What a filter is told of an axis by a model with these terms."""
+    """Noise and errors of an axis by a model with these terms."""
     own = with_terms(model, record, found, name, terms, [column for term in terms for column in term.columns])
     stays = {column.name for term in terms if why_stays(term.finding) for column in term.columns}
     anew = {column.name for term in terms if term.anew for column in term.columns} - stays
@@ -152,7 +152,7 @@ def _told(
         kept = np.array([place not in stays | anew for place in places], bool)
         values, columns, readings = _readings(own, name, second)
         values = values - columns[:, kept] @ c[kept]
-        fresh = replace(own, regressors=tuple(one for one in own.regressors if one.name in anew))
+        fresh = replace(own, regressors=tuple(regressor for regressor in own.regressors if regressor.name in anew))
         columns = columns[:, [place in anew for place in places]]
         c = _learned(fresh, name, readings, values, columns, values.size // 2)[1] if anew else np.zeros(0)
     group = replace(own.group_of(name), range=0.0, stuck_limit=0)
@@ -171,7 +171,13 @@ def _readings(own: Model, name: str, recording: Recording) -> tuple[Floats, Floa
     if seen.recording.rate_hz < 1.0:
         raise UserError("flights need readings at 1 Hz or faster")
     regressors = offered(own, name)
-    about = np.array([one.reference if one.kind == "column" else 0.0 for one in regressors for _ in one.columns])
+    about = np.array(
+        [
+            regressor.reference if regressor.kind == "column" else 0.0
+            for regressor in regressors
+            for _ in regressor.columns
+        ]
+    )
     columns = columns_of(regressors, seen.recording) - about
     return seen.working - float(np.nanmedian(seen.working)), columns, seen.recording
 
@@ -199,7 +205,7 @@ def flights(told: Mapping[str, Told]) -> dict[str, dict[str, Any]]:
     white = _white(seconds)
     own, noise = [], []
     for name, unit in AXES.items():
-        alike = [one.noise["N"] ** 2 for other, one in told.items() if AXES[other] == unit]
+        alike = [known.noise["N"] ** 2 for other, known in told.items() if AXES[other] == unit]
         N = math.sqrt(sum(alike) / len(alike)) if alike else SHEET_N[unit]
         axis = told.get(name, Told({"N": N}, N * white[name]))
         own.append(axis.errors[:seconds])

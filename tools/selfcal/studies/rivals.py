@@ -18,8 +18,6 @@ from typing import Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
-from rich.progress import Progress
 from rich.table import Table
 
 from selfcal.adequacy.document import recording_entry
@@ -29,12 +27,12 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
 from selfcal.base.grid import runs
 from selfcal.base.output import check_writable, console_of, table_of, write_json
+from selfcal.base.progress import bar
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.loaders import Reading
-from selfcal.logs.recording import Recording, as_float, load
+from selfcal.logs.recording import Recording, load
 from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
-from selfcal.model.tables import make_tables
 from selfcal.studies.methods import RIVALS, Rival
 from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.studies.methods.problem import Answer, Problem
@@ -48,10 +46,8 @@ SAMPLES = (150, 600)
 MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
-#: Ratio of an interval's ends that says nothing: wider than any prior here.
-LOOSE = 1e4
-#: Columns of a terminal that the table takes with the intervals, and without.
-WHOLE_WIDTH, BRIEF_WIDTH = 190, 110
+#: Columns of a terminal that the table takes with the intervals; without them it takes 110.
+WHOLE_WIDTH = 190
 
 
 def of_recording(
@@ -79,8 +75,7 @@ def of_recording(
     names = chosen_axes(recording, loaded, axes)
     loaded = for_record(loaded, recording, names)
     answers: dict[str, Any] = {}
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with bar() as progress:
         task = progress.add_task("rivals", total=len(names) * len(chosen))
         for name in names:
             problem, left_out = problem_of(recording, name, loaded, decimate)
@@ -178,24 +173,20 @@ def chosen_rivals(only: Sequence[str]) -> list[Rival]:
 def problem_of(recording: Recording, name: str, model: Model, decimate: float | None) -> tuple[Problem, int]:
     """The longest stretch of the axis' block means without a gap, and how many means lie outside it. Most methods take
     no gaps, and all must see the same samples."""
-    from selfcal.bank.blocks import usable_blocks
+    from selfcal.bank.blocks import bank_means
 
     laws = tuple(law for law in model.hypotheses if law in PLAIN)
     if not laws:
         raise UserError(f"{model.path}: rivals knows the laws {', '.join(PLAIN)}: the model has none of them")
-    recording = recording.along(name)
-    group = model.group_of(name)
-    tables = make_tables(replace(model, regressors=()), recording.rate_hz, (name,), bank_rate_hz=decimate)
-    samples = as_float(recording.in_unit(name, group.unit))
-    mean = usable_blocks(samples, recording.missing_before, tables, group).mean
+    mean, dt_s = bank_means(recording, model, name, decimate)
     y = longest_stretch(mean)
     if y.size < FEWEST:
         raise UserError(
-            f"{recording.path}: {name}: {y.size} averages of {tables.dt_s:g} s without a gap are too few, "
+            f"{recording.path}: {name}: {y.size} averages of {dt_s:g} s without a gap are too few, "
             f"{FEWEST} are needed: record longer, or give --decimate HZ"
         )
-    alone = replace(group, axes=(name,))
-    return Problem(y, tables.dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
+    alone = replace(model.group_of(name), axes=(name,))
+    return Problem(y, dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
 
 
 def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -234,7 +225,7 @@ def _alone(rival: Rival, problem: Problem, unit: str) -> dict[str, Any]:
 
 
 def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
-    """What the document says of an answer, in the unit `to`."""
+    """The document's entry of an answer, in the unit `to`."""
     factor = units.factor(unit, to)
     return {
         "parameters": {
@@ -253,7 +244,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table an axis: a row for each method and law."""
     console = console_of(to_stderr=to_stderr)
     brief = console.is_terminal and console.width < WHOLE_WIDTH
-    console.width = max(console.width, BRIEF_WIDTH if brief else WHOLE_WIDTH)
+    console.width = max(console.width, 110 if brief else WHOLE_WIDTH)
     for name, axis in document["axes"].items():
         console.print(_table(name, axis, brief=brief))
         if axis["samples_left_out"]:
@@ -383,6 +374,6 @@ def _shown(value: Mapping[str, Any] | None, *, inverse: bool = False, brief: boo
         middle, low, high = 1.0 / middle, 1.0 / high, 1.0 / low
     if brief or not (math.isfinite(low) and math.isfinite(high)):
         return f"{middle:.3g}"
-    if not (low > 0.0 and high < LOOSE * low):
+    if not (low > 0.0 and high < 1e4 * low):
         return f"{middle:.3g} (undetermined)"
     return f"{middle:.3g} \\[{low:.3g}, {high:.3g}]"

@@ -15,9 +15,9 @@ from selfcal.base.errors import UserError, printable
 from selfcal.base.output import console_of, table_of
 from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
 from selfcal.batch.spread import Row
-from selfcal.logs.recording import Recording, as_float, load
+from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Group, Model
-from selfcal.model.parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
 from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"
@@ -30,7 +30,7 @@ CORNER_HZ = 0.02
 #: Length of dead reckoning, s, and its seconds after a rest.
 RECKONED_S = 60
 SECONDS = (*range(1, RECKONED_S + 1), *(h for h in HORIZONS_S if h > RECKONED_S))
-#: Its errors in the document, and in the table.
+#: Errors of dead reckoning in the document, and in the table.
 RECKONED = {"heading_deg": "heading, deg", "position_m": "position, m"}
 #: The gyro that turns each horizontal accelerometer out of the level.
 ACROSS = {"ax": "gy", "ay": "gx"}
@@ -125,7 +125,7 @@ class After:
         return cls(model.group_of(axis).unit, *predictions(model, axis, y[:rest]), y[rest : rest + RECKONED_S])
 
     def errors(self, unit: str) -> dict[str, Floats]:
-        """Of the minute's corrected readings, by method."""
+        """Errors of the minute's corrected readings, by method."""
         errors = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
         return {name: convert(error, self.unit, unit) for name, error in errors.items()}
 
@@ -168,15 +168,12 @@ def simulated(model: Model, job: Job) -> list[Row]:
 
 def _means(recording: Recording, model: Model, name: str) -> Floats:
     """Means of 1 s of a recorded axis, NaN in gaps."""
-    from selfcal.bank.blocks import usable_blocks
+    from selfcal.bank.blocks import bank_means
 
-    recording = recording.along(name)
-    group = model.group_of(name)
-    if not (same_kind(group.unit, "rad/s") or same_kind(group.unit, "m/s^2")):
+    unit = model.group_of(name).unit
+    if not (same_kind(unit, "rad/s") or same_kind(unit, "m/s^2")):
         raise UserError(f"{recording.path}: {name}: worth takes gyros and accelerometers; choose with --axis")
-    tables = make_tables(model, recording.rate_hz, (name,), bank_rate_hz=1.0)
-    samples = as_float(recording.in_unit(name, group.unit))
-    return usable_blocks(samples, recording.missing_before, tables, group).mean
+    return bank_means(recording, model, name, 1.0)[0]
 
 
 def recorded(log: Path | str, model: Model, wanted: Sequence[str]) -> list[Row]:
@@ -236,7 +233,11 @@ def regret(cases: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, Any]]:
             groups[key].append({name: errors[name] for name in TITLES})
     worst: dict[str, dict[str, Any]] = {}
     for name in TITLES:
-        ratios = {key: [one[name] / min(one.values()) for one in group] for key, group in groups.items() if group}
+        ratios = {
+            key: [errors_of[name] / min(errors_of.values()) for errors_of in group]
+            for key, group in groups.items()
+            if group
+        }
         spread = {key: {"worst": max(all_), "median": float(np.median(all_))} for key, all_ in ratios.items()}
         worst[name] = {**spread.pop("bias"), **spread}
     return worst

@@ -34,6 +34,8 @@ From = Annotated[
     option("Priors as `diagnose --json` measured them", "--from", metavar="DIAGNOSIS.json"),
 ]
 Axes = Annotated[Sequence[str], option("Axis to report (repeat for more); default: all", "--axis", metavar="NAME")]
+Decimate = Annotated[float | None, option("Rate of the block means instead of the model file's", metavar="HZ")]
+RunPlot = Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")]
 Json = Annotated[Path | str | None, option("Write the result as JSON (- for stdout)", metavar="FILE")]
 Report = Annotated[Path | str | None, option("Write a page with pictures and tables", metavar="FILE.html")]
 Start = Annotated[

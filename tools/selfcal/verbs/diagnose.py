@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Unpack
 
-from selfcal.base.errors import UserError, note
+from selfcal.base.errors import UserError
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
 from selfcal.verbs import _shared as shared
@@ -78,15 +78,15 @@ def diagnose(
     from selfcal.adequacy.identify import chosen_axes, stretch_of
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.ending import held
-    from selfcal.base.output import check_writable, write_json, write_text
+    from selfcal.base.output import check_writable, write_json
     from selfcal.base.progress import Doing
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.diagnosis import hidden
     from selfcal.diagnosis.diagnose import add_carried, add_posteriors, entry_of, events_of, options_given, shared_by
-    from selfcal.diagnosis.document import NO_ROOM, SCHEMA, to_document
+    from selfcal.diagnosis.document import SCHEMA, to_document
     from selfcal.diagnosis.events import add_findings
-    from selfcal.diagnosis.extend import as_text, check_not_by_hand, extended, left_out
+    from selfcal.diagnosis.extend import check_not_by_hand, extended, left_out, write_extended
     from selfcal.diagnosis.record import of_recording
     from selfcal.likelihood import work
     from selfcal.logs.recording import list_of, load
@@ -101,18 +101,15 @@ def diagnose(
     if full_rate and decimate is not None:
         raise UserError("--full-rate looks at every sample, --decimate at means: take one of them")
     check_writable(json, report, write_model, junit, verdicts, inputs=(*list_of(log), model, limits))
-    if write_model is not None:
-        check_not_by_hand(write_model)
+    check_not_by_hand(write_model)
     loaded = Model.load(model)
     bounds = None if limits is None else Limits.load(limits, loaded)
-    recording = load(log, sensors=loaded.sensors, **reading)
-    recording = stretch_of(recording.later(since_power_on_s), loaded, start_s, end_s, gate)
+    recording = load(log, sensors=loaded.sensors, **reading).later(since_power_on_s)
+    recording = stretch_of(recording, loaded, start_s, end_s, gate)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     of_file, loaded = loaded, for_record(loaded, recording, names)
-    second = None
-    if on is not None:
-        second = load(on, sensors=loaded.sensors, **reading)
+    second = None if on is None else load(on, sensors=loaded.sensors, **reading)
     with held() as ending, Doing("diagnose") as doing:
         record, first, diagnosed, errors = _looked(recording, loaded, names, decimate, full_rate, ending, doing)
         with work.within(work.Work(lambda: ending.overdue)):
@@ -122,22 +119,21 @@ def diagnose(
                     if report is not None:
                         write_page(report, document, record, {})
                     write_json(document, json)
-                ending.check()
-                reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
-                raise UserError(f"{recording.path}: no axis can be judged ({reasons})")
+                raise _unjudged(recording, errors, ending)
             doing.now("held-out gain")
             sensor = recording.path.name.partition(".")[0] if model is None else None
             tree, read_out = extended(loaded, record, diagnosed, sensor)
             out = left_out(loaded, diagnosed)
             doing.now("what the axes share")
             shared = shared_by(diagnosed, loaded) if not ending.asked else None
+            quantity = None
             if shared is not None:
                 hidden.extend(tree, shared)
+                quantity = entry_of(shared, diagnosed, recording)
+                if second is not None:
+                    on_second = of_recording(second, loaded, 1.0 / shared.dt)
+                    quantity["gain_on"] = hidden.carried(shared, on_second.axes, events_of(on_second))
             document = to_document(recording, diagnosed, errors, tree, first, [finding for _, finding in out])
-            quantity = None if shared is None else entry_of(shared, diagnosed, recording)
-            if shared is not None and quantity is not None and second is not None:
-                on_second = of_recording(second, loaded, 1.0 / shared.dt)
-                quantity["gain_on"] = hidden.carried(shared, on_second.axes, events_of(on_second))
             add_sources(document, of_file, loaded)
             if second is not None:
                 doing.now(f"gain on {second.path}")
@@ -151,19 +147,20 @@ def diagnose(
                 doing.now("flights")
                 add_outages(document, loaded, tree, record, diagnosed, recording, second)
             if write_model is not None:
-                write_text(write_model, as_text(tree, recording.path, read_out))
-                note(f"{write_model}: {read_out}")
-                if out:
-                    causes = ", ".join(f"{name} {each.look.cause} ({each.look.gain:.1f} nats)" for name, each in out)
-                    note(f"{write_model}: a module leaves out {causes}: {NO_ROOM}")
+                write_extended(write_model, tree, recording.path, read_out, out)
             if report is not None:
                 doing.now("pictures")
-                given = options_given(axes, model, decimate, recording)
-                write_page(report, document, record, diagnosed, given)
-    if bounds is not None:
-        add_verdicts(document, bounds, junit, verdicts)
+                write_page(report, document, record, diagnosed, options_given(axes, model, decimate, recording))
+    add_verdicts(document, bounds, junit, verdicts)
     write_json(document, json)
     return Diagnosis(document)
+
+
+def _unjudged(recording: Recording, errors: Mapping[str, str], ending: Held) -> UserError:
+    """Why no axis has a result. A signal that came ends the command here."""
+    ending.check()
+    reasons = "; ".join(f"{name}: {reason}" for name, reason in errors.items())
+    return UserError(f"{recording.path}: no axis can be judged ({reasons})")
 
 
 def _looked(

@@ -13,6 +13,7 @@ from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
     from selfcal.batch.files import Named
+    from selfcal.batch.unit_table import Unit
 
 
 def fleet(
@@ -76,14 +77,13 @@ def fleet(
 
     import selfcal
     from selfcal.base.output import check_writable, write_json
+    from selfcal.batch.batch_summary import document_of, lines_of, summed_up
     from selfcal.batch.fail_on import check
-    from selfcal.batch.files import DATE_FORM
     from selfcal.batch.fleet import document_with, judged_units
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
-    from selfcal.batch.record import KILLED, ByContent, Options, Verbs, examined, own_pages, settings_of
     from selfcal.batch.spread import spread
-    from selfcal.batch.summary import document_of, lines_of, summed_up
+    from selfcal.batch.unit_record import KILLED, ByContent, Options, Verbs, examined, own_pages, settings_of
     from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
     from selfcal.batch.verdicts import Limits, check_options, write
     from selfcal.model.file import Model
@@ -103,9 +103,9 @@ def fleet(
         loaded.group_of(name)
     bounds = None if limits is None else Limits.load(limits, loaded)
     folder = Path(f"{output}.parts") if results is None else Path(results)
-    outputs = [Path(file) for file in (output, junit, verdicts, json, report, write_model) if file is not None]
-    inputs = [Path(file) for file in (model, limits, units_table) if file is not None]
-    named = _named(patterns, units_table, serial_from, outputs, [*inputs, folder, Path(f"{report}.units")])
+    outputs = (output, junit, verdicts, json, report, write_model)
+    others = (model, limits, units_table, folder, f"{report}.units")
+    named = _named(patterns, units_table, serial_from, outputs, others)
     verbs = Verbs(identify, run_diagnose)
     options = Options(
         None if model is None else str(Path(model).absolute()),
@@ -134,16 +134,11 @@ def fleet(
         Unit(source, record_of.get(source.path, {"error": f"is the same recording as {source.copy_of}"}))
         for source in named.sources
     ]
-    for unit in batch:
-        if unit.undated:
-            note(f"{unit.source.path}: leaves out the date '{short(unit.undated)}': write it as {DATE_FORM}")
-        if "damaged" in (known := unit.record.get("recording", {})):
-            note(f"{unit.source.path}: {known['damaged']['words']}")
+    _note(batch)
     batch.sort(key=lambda unit: unit.place)
     write_table(output, (row for unit in batch for row in rows_of(unit, version)))
     judged = [] if bounds is None else judged_units(batch, bounds)
-    if bounds is not None:
-        write(judged, junit, verdicts)
+    write(judged, junit, verdicts)
     summary = summed_up(batch, loaded)
     document = {**document_with(batch, fail_on, judged), **document_of(summary), "words": list(lines_of(summary))}
     if write_model is not None:
@@ -160,21 +155,33 @@ def fleet(
     return document
 
 
+def _note(batch: Sequence[Unit]) -> None:
+    """Name dates that are left out, and damaged files."""
+    from selfcal.batch.files import DATE_FORM
+
+    for unit in batch:
+        if unit.undated:
+            note(f"{unit.source.path}: leaves out the date '{short(unit.undated)}': write it as {DATE_FORM}")
+        if "damaged" in (known := unit.record.get("recording", {})):
+            note(f"{unit.source.path}: {known['damaged']['words']}")
+
+
 def _named(
     patterns: Sequence[Path | str],
     units_table: Path | str | None,
     serial_from: str | None,
-    outputs: Sequence[Path],
-    others: Sequence[Path],
+    outputs: Sequence[Path | str | None],
+    others: Sequence[Path | str | None],
 ) -> Named:
     """The recordings with their devices. `outputs`, `others`: the run's own files, which are no recordings."""
     from selfcal.batch.files import sources_of
 
     given = {Path(str(pattern)).resolve() for pattern in patterns}
-    for file in outputs:
+    own = [[Path(file) for file in files if file is not None] for files in (outputs, others)]
+    for file in own[0]:
         if file.resolve() in given:
             raise UserError(f"{file}: is one of the recordings: give it a name of its own")
-    named = sources_of([str(pattern) for pattern in patterns], units_table, serial_from, [*outputs, *others])
+    named = sources_of([str(pattern) for pattern in patterns], units_table, serial_from, own[0] + own[1])
     for copy, other in named.copies.items():
         note(f"{copy}: the same recording as {other}: counted once")
     return named

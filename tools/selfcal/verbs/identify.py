@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Unpack
 
@@ -33,9 +34,7 @@ def identify(
     axes: shared.Axes = (),
     model: shared.ModelFile = None,
     engine: Annotated[Literal["library", "reference", "fixed"], option("What computes")] = "library",
-    decimate: Annotated[
-        float | None, option("Rate of the block means instead of the model file's", metavar="HZ")
-    ] = None,
+    decimate: shared.Decimate = None,
     json: shared.Json = None,
     plot: Annotated[
         Path | str | None, option("Save the Allan deviations beside the model's (.png .pdf .svg)", metavar="FILE")
@@ -91,14 +90,12 @@ def identify(
     Numbers are in the recording's units. An axis without a result has its reason in its place: {"error": ...}. Raises
     UserError for what the user can put right, and if no axis has a result.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
     from selfcal.adequacy.checks import against
     from selfcal.adequacy.document import Identified, to_document
     from selfcal.adequacy.identify import chosen_axes, identify_axis, stretch_of, with_reasons
     from selfcal.bank.priors import add_sources, for_record
-    from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.base.output import check_picture, check_writable, print_line, write_json
+    from selfcal.base.progress import bar
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.logs.recording import list_of, load
@@ -109,9 +106,8 @@ def identify(
 
     check(fail_on)
     check_options(limits, junit, verdicts)
-    check_writable(
-        json, plot, None if export is None else export[1], junit, verdicts, inputs=(*list_of(log), model, limits)
-    )
+    exported = None if export is None else export[1]
+    check_writable(json, plot, exported, junit, verdicts, inputs=(*list_of(log), model, limits))
     check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
@@ -131,22 +127,14 @@ def identify(
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     of_file, loaded_model = loaded_model, for_record(loaded_model, recording, names)
     identified: dict[str, Identified | UserError] = {}
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with bar() as progress:
         subsets = sum(len(choices_of(offered(loaded_model, name))) for name in names)
         task = progress.add_task("identify", total=subsets)
         for name in names:
             progress.update(task, description=f"{name} ({engine})")
             try:
-                identified[name] = identify_axis(
-                    recording,
-                    name,
-                    loaded_model,
-                    engine,
-                    decimate,
-                    lambda: progress.advance(task),
-                    draw=plot is not None,
-                )
+                step, drawn = partial(progress.advance, task), plot is not None
+                identified[name] = identify_axis(recording, name, loaded_model, engine, decimate, step, draw=drawn)
             except UserError as error:
                 identified[name] = error
         with_reasons(identified, recording, loaded_model)
@@ -158,16 +146,15 @@ def identify(
             if isinstance(axis, Identified) and against(axis.judged.checks).keys() - LEFT_OUT
         ]
         if doubtful and suspicion:
-            from selfcal.diagnosis.suspicion import weigh_more_laws, with_added_laws
-
             progress.update(task, description="strongest suspicion")
             suspected = _suspect(document, recording, loaded_model, doubtful)
             if model is None:
+                from selfcal.diagnosis.suspicion import weigh_more_laws, with_added_laws
+
                 progress.update(task, description="more laws")
                 again = with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)
                 weigh_more_laws(document, recording, [name for name in doubtful if name not in again])
-    if bounds is not None:
-        add_verdicts(document, bounds, junit, verdicts)
+    add_verdicts(document, bounds, junit, verdicts)
     write_json(document, json)
     if export is not None:
         write_export(document, *export, overbound)
@@ -175,7 +162,7 @@ def identify(
         from selfcal.show.allan_plot import plot_allan
 
         plot_allan(document, plot, datasheet=datasheet)
-        console.print(f"plot: {plot}", highlight=False, markup=False, soft_wrap=True)
+        print_line(progress.console, f"plot: {plot}")
     return Identification(document)
 
 

@@ -6,12 +6,13 @@ import math
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
-from selfcal.verbs._shared import Axes, From, Json
+from selfcal.verbs._shared import Axes, From, Json, RunPlot
 
 if TYPE_CHECKING:
     from selfcal.logs.framelog import FrameLog
@@ -43,7 +44,7 @@ def monitor(
     bitrate: Annotated[int | None, option("Of the CAN bus, if it needs one", metavar="BIT/S")] = None,
     once: Annotated[bool, option("End when the port vanishes instead of waiting for it", "--once")] = False,
     json: Json = None,
-    plot: Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")] = None,
+    plot: RunPlot = None,
 ) -> Outcome:
     """Show what arrives by `channel`, or what the log `read` holds, until Ctrl-C, its end, or until `duration` (s) is
     over.
@@ -62,7 +63,7 @@ def monitor(
     from rich.console import Console
 
     from selfcal.base.ending import held
-    from selfcal.base.output import check_picture, check_writable, write_json
+    from selfcal.base.output import check_picture, check_writable, print_line, write_json
     from selfcal.logs.framelog import FrameLog, check_suffix
     from selfcal.show.plot import plot_run
     from selfcal.wire.dbc_file import check_node
@@ -92,17 +93,13 @@ def monitor(
     for kind in stream:
         check_stream(kind)
     on_stdout = [kind for kind in (wanted.split(":")[0] for wanted in stream) if kind in LINES]
-    if len([*on_stdout, *([json] if str(json) == "-" else [])]) > 1:
+    if len(on_stdout) + (str(json) == "-") > 1:
         raise UserError(f"--stream {on_stdout[0]} and another one, or --json -, are both for stdout: give one alone")
     check_writable(json, plot)
     name = str(read if channel is None else channel)
     models = KnownModels(model, start)
     streams = Streams(node=node)
-    console = Console(stderr=True)
-
-    def say(line: str) -> None:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
-
+    say = partial(print_line, Console(stderr=True))
     with held() as ending, patient(), ExitStack() as stack:
         source: Link | FrameLog
         if channel is None:

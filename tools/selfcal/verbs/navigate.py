@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Annotated, Any
 
 from selfcal.base.options import option
-from selfcal.verbs._shared import Json, Results, Scheduler, to_stderr
+from selfcal.verbs._shared import Json, Results, Scheduler, shown_by
 
 
 def navigate(
@@ -27,7 +26,7 @@ def navigate(
 
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.spread import record_seeds, spread
-    from selfcal.model.parts import LAWS
+    from selfcal.model.simulated_parts import LAWS
     from selfcal.studies.navigate import SCHEMA, TOGETHER, Job, rows_of, summary
     from selfcal.studies.navigation import JUDGED
 
@@ -44,14 +43,8 @@ def navigate(
         "nees_band_95": band.tolist(),
         "laws": {law: summary([row for row in rows if row["law"] == law]) for law in LAWS},
     }
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
-def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
-    """Print a table a time."""
-    from selfcal.studies.navigate import show as table
-
-    table(document, to_stderr=to_stderr(given))
-    return 0
+show = shown_by("studies.navigate")

@@ -35,10 +35,8 @@ def paper(
     `montecarlo`. `tracks`: a folder for the map errors of Section 4.2, a recording a track. All seeds follow from
     `seed`.
     """
-    from rich.console import Console
-    from rich.progress import Progress
-
     from selfcal.base.output import check_writable, write_text
+    from selfcal.base.progress import bar
     from selfcal.batch.spread import check_results, record_seeds
     from selfcal.model.file import Model
     from selfcal.studies.paper import DATA, EXPLAINED, page, with_reason
@@ -58,8 +56,7 @@ def paper(
     priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
     rows = section3.ensemble(priors, seeds, seed, scheduler, results)
     figures = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]
-    console = Console(stderr=True)
-    with Progress(console=console, transient=True, disable=not console.is_terminal) as progress:
+    with bar() as progress:
         task = progress.add_task("Figs 5 to 8", total=5)
         simulated = section4.simulated(seed)
         figures += section4.figures_5_and_6(default, simulated, False, seed)

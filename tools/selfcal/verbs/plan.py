@@ -70,7 +70,7 @@ def plan(
     other options are the recording's. `axis`: the first that the `simulate` entry states, else the first of all. A wish
     of a parameter is of the records whose law has it. `plot`: a picture of what is reached over the length.
     `tumble`: how many rests of which length `selfcal tumble` takes: document `selfcal.plan_tumble/1`; wishes are those
-    of `calibration/plan.py`.
+    of `calibration/tumble_plan.py`.
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
     it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
     prior's sd.
@@ -93,7 +93,7 @@ def plan(
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
     if tumble:
-        from selfcal.calibration.plan import plan_of
+        from selfcal.calibration.tumble_plan import plan_of
 
         if plot is not None or axis is not None:
             raise UserError("--tumble plans all axes together, and has no picture: leave --axis and --plot out")
@@ -102,8 +102,10 @@ def plan(
         return answer
     name = axis or next(iter(loaded.simulate["axes"]), loaded.axes[0])
     group = loaded.group_of(name)
-    columns = {one.name: one for one in loaded.regressors}
-    sizes = {key: (coefficient_unit(group.unit, one.unit), one.sd.get(group.name, 1.0)) for key, one in columns.items()}
+    columns = {regressor.name: regressor for regressor in loaded.regressors}
+    sizes = {
+        key: (coefficient_unit(group.unit, known.unit), known.sd.get(group.name, 1.0)) for key, known in columns.items()
+    }
     if response is not None:
         return _response(
             loaded, name, want, response, levels, input_lag_s, input, drive, records, seed, json, scheduler
@@ -121,7 +123,7 @@ def plan(
     plain = replace(loaded, regressors=())
     ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
     lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
-    samples = max((one for one in lengths if one is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
+    samples = max((known for known in lengths if known is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
     entries = []
     for k, wish in enumerate(wishes):
         column = columns.get(wish.parameter)
@@ -136,7 +138,7 @@ def plan(
             swings = cycling(loaded, name, wish, column, samples, seeds, scheduler)
             entry |= {"channel": column.column, "unit": column.channel_unit, "cycling": swings}
         entries.append(entry)
-    all_known = all(one["duration_s"] is not None for one in entries)
+    all_known = all(known["duration_s"] is not None for known in entries)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "model": str(loaded.path),
@@ -244,7 +246,7 @@ def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     if "levels" in document:
         from selfcal.batch.design import show as table
     elif given.get("tumble"):
-        from selfcal.calibration.plan import show as table
+        from selfcal.calibration.tumble_plan import show as table
     else:
         from selfcal.batch.plan import show as table
     table(document, to_stderr=to_stderr(given))

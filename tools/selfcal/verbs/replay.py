@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Unpack
 
 from selfcal.base.errors import UserError, note, say_once
@@ -38,7 +37,7 @@ def replay(
     end_s: shared.End = None,
     since_power_on_s: shared.SincePowerOn = 0.0,
     json: shared.Json = None,
-    plot: Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")] = None,
+    plot: shared.RunPlot = None,
     **reading: Unpack[Reading],
 ) -> Identification:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Unpack
 from selfcal.base.errors import UserError, called
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ, Reading
-from selfcal.verbs._shared import Axes, Json, ModelFile, Results, Scheduler, Workers, to_stderr
+from selfcal.verbs._shared import Axes, Decimate, Json, ModelFile, Results, Scheduler, Workers, to_stderr
 
 
 def rivals(
@@ -25,9 +25,7 @@ def rivals(
     seed: Annotated[int, option("Same seed, same records", metavar="N", min=0)] = 1,
     axes: Axes = (),
     model: ModelFile = None,
-    decimate: Annotated[
-        float | None, option("Rate of the block means instead of the model file's", metavar="HZ")
-    ] = None,
+    decimate: Decimate = None,
     only: Annotated[Sequence[str], option("Method to run (repeat for more); default: all", metavar="NAME")] = (),
     workers: Workers = None,
     scheduler: Scheduler = None,

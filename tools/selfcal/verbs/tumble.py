@@ -52,8 +52,8 @@ def tumble(
     `logs`: one recording, or a sequence of one a position, in order of time. `model`: the part's own model file: its
     law, noise and range; without one the law is of a rest of 20 min in the log, else the default model's prior.
     `latitude`, `height`, `gravity`: see `calibration/earth.py`. `output`: the YAML file; `export`: a format of
-    `calibration/export.py` and its file; `plot`: a picture of the residuals. `start_s`, `end_s`: the stretch to look
-    at, s. `fail_on`: `inadequate`; it is only checked here.
+    `tumble_export.py` and its file; `plot`: a picture of the residuals. `start_s`, `end_s`: the stretch to look at, s.
+    `fail_on`: `inadequate`; it is only checked here.
     Returns the document `selfcal.tumble/1` and writes it to `json`; gyros without an answer have an `error` there.
     Raises UserError for what the user can put right: fewer than three rests, a place that is none, logs that are not of
     accelerometers.
@@ -61,11 +61,11 @@ def tumble(
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.batch.fail_on import INADEQUATE
     from selfcal.calibration import accelerometer, gyroscope
-    from selfcal.calibration.document import document_of
     from selfcal.calibration.earth import place
-    from selfcal.calibration.export import FORMS, write
     from selfcal.calibration.rests import tumble_of
-    from selfcal.calibration.show import plot as picture
+    from selfcal.calibration.tumble_document import document_of
+    from selfcal.calibration.tumble_export import FORMS, write
+    from selfcal.calibration.tumble_show import plot as picture
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
 
@@ -74,8 +74,7 @@ def tumble(
         raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST_LOGS} at most")
     files = [path for log in each for path in list_of(log)]
     check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
-    if plot is not None:
-        check_picture(plot)
+    check_picture(plot)
     if export is not None and export[0] not in FORMS:
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     if fail_on not in (None, INADEQUATE):
@@ -96,15 +95,14 @@ def tumble(
         write(form, file, accel, gyro, document)
     if plot is not None:
         picture(document, plot)
-    if json is not None:
-        write_json(document, json)
+    write_json(document, json)
     return document
 
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> int:
     """Print the calibration."""
     from selfcal.batch.fail_on import exit_code
-    from selfcal.calibration.show import show as tables
+    from selfcal.calibration.tumble_show import show as tables
 
     tables(document, to_stderr=to_stderr(given))
     sensors = {name: document[name] for name in ("accelerometer", "gyroscope") if document[name] is not None}

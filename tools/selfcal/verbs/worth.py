@@ -39,7 +39,7 @@ def worth(
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.spread import record_seeds, spread
     from selfcal.model.file import Model
-    from selfcal.model.parts import LAWS
+    from selfcal.model.simulated_parts import LAWS
     from selfcal.studies import worth as study
 
     check_writable(json)

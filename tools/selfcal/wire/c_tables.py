@@ -20,8 +20,8 @@ from selfcal.model.laws import KINDS
 from selfcal.model.tables import AxisTable, PriorRow, Tables, gate_table
 from selfcal.wire.frames import AXES, carries
 
-#: SELFCAL_SAMPLE_MAX and SELFCAL_FIXED_LIMIT in selfcal_parts.h, SIGMA_BITS in bank_kernel_fixed.c.
-SAMPLE_MAX, FIXED_LIMIT, FIXED_SIGMA_BITS = 2.0**40, 3 * 2**25, 20
+#: SELFCAL_SAMPLE_MAX in selfcal_parts.h.
+SAMPLE_MAX = 2.0**40
 
 
 #: Nodes of the smallest grid, for a model without one.
@@ -67,12 +67,12 @@ def bank_bytes(tables: Tables, axes: int = 0) -> int:
 
 
 def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
-    """What of the model comes to nothing."""
+    """Parts of the model that have no effect."""
     if model.left_out:
         yield model.left_out
     if model.hidden_input is not None:
         yield f"{model.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"
-    measured = {name for name, one in model.simulate.get("axes", {}).items() if "hypothesis" in one}
+    measured = {name for name, axis in model.simulate.get("axes", {}).items() if "hypothesis" in axis}
     if measured and (others := [one.name for one in tables.axes if one.name not in measured]):
         yield f"{model.path}: wide priors, without a result in the file: {', '.join(others)}"
     if model.gate is not None and gate_table(model, tables) is None:
@@ -84,7 +84,7 @@ def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
 
 
 def assumption(tables: Tables) -> str:
-    """What the tables take for granted of the samples that they are fed with."""
+    """The rate and the interval that the tables assume of their samples."""
     samples = "1 sample" if tables.block == 1 else f"{tables.block} samples"
     make = "makes" if tables.block == 1 else "make"
     return f"{samples} at {tables.rate_hz:.7g} Hz {make} a bank sample of {tables.dt_s:.7g} s"
@@ -147,7 +147,7 @@ def core_of(target: str) -> str:
 
 
 def _values(model: Model, tables: Tables, target: str, start: str, hold: bool) -> dict[str, Any]:
-    """What the templates show."""
+    """Values of the templates."""
     return {
         "model": model,
         "tables": tables,
@@ -204,7 +204,8 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
     span = 2.0 * min(axis.range or SAMPLE_MAX, SAMPLE_MAX)
     least, most = (math.exp(limits[0]) / math.sqrt(dt_s) for limits in (axis.ln_min, axis.ln_max))
     sigma = max(least, min(most, span / math.sqrt(2.0)))
-    return max(math.ceil(math.log2(span / FIXED_LIMIT)), math.floor(math.log2(sigma) + 1e-5) - FIXED_SIGMA_BITS)
+    # SELFCAL_FIXED_LIMIT in selfcal_parts.h, and SIGMA_BITS in bank_kernel_fixed.c.
+    return max(math.ceil(math.log2(span / (3 * 2**25))), math.floor(math.log2(sigma) + 1e-5) - 20)
 
 
 def _f(value: float) -> str:

@@ -104,7 +104,7 @@ def new_key(path: Path | str) -> None:
 
 
 def build_flag(key: bytes) -> str:
-    """What gives an image this key: an entry of CFLAGS."""
+    """The entry of CFLAGS that gives an image this key."""
     low, high = struct.unpack("<2Q", key)
     return f"-DAPP_COMMAND_KEY=0x{low:016X}ULL,0x{high:016X}ULL"
 

@@ -18,7 +18,7 @@ FOREVER_S = 999_999.0
 
 
 def wait(module: subprocess.Popen[str]) -> str:
-    """What the firmware says until it ends."""
+    """Output of the firmware until it ends."""
     while module.poll() is None:
         time.sleep(0.2)
     return module.communicate()[0]

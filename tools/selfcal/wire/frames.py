@@ -13,12 +13,13 @@ import os
 import re
 import shlex
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, install
@@ -37,14 +38,10 @@ STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
 
-#: Largest evidence difference of its item, nats: that or more, or no evidence at all.
-LEAST_EVIDENCE = -(2**31) * 0.001
 
 COUNTER = 64  # the counter is modulo this
 JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward and backward are alike
-BACK_MS = 300_000  # a report may have been begun, and a corrected sample read, so long before what was sent before it
 FOREIGN_STATUSES = 2  # whole statuses in a row with another version, of a module that stated this version before
-TWINS = 3  # statuses that only two modules can have sent; a restart within a status looks like it
 RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is no stranger's from then
 
 
@@ -161,7 +158,7 @@ def crc12(data: bytes) -> int:
 
 
 def frame_crc(frame_id: int, data: bytes) -> int:
-    """What bits 52 to 63 of a frame with this id and these 8 bytes must be."""
+    """Checksum of a frame with this id and these 8 bytes: its bits 52 to 63."""
     return crc12(bytes((frame_id >> 8, frame_id & 0xFF, len(data))) + data[:6] + bytes((data[6] & 0x0F,)))
 
 
@@ -218,7 +215,8 @@ class AxisReport:
 
         def evidence(k: int) -> float:
             difference = v[f"h{k}_ln_evidence_diff"]
-            return best + (difference if difference > LEAST_EVIDENCE else -math.inf)
+            # The item's largest difference, nats, says that there is no evidence at all.
+            return best + (difference if difference > -(2**31) * 0.001 else -math.inf)
 
         def parameters(k: int) -> dict[str, Estimate]:
             there = [place for place in PLACE_NAMES if f"h{k}_{place}_mean" in v]
@@ -371,7 +369,7 @@ class Decoder:
         self._corrects = False  # what comes belongs to that sample
         #: Last value of each signal of the answers to commands.
         self.answer: dict[str, float] = {}
-        #: The same of the calibration by rests in several positions, since the last that came of one.
+        #: Last value of each signal of the calibration by rests in several positions.
         self.tumble: dict[str, float] = {}
         #: Latest module time of a frame, unwrapped, ms. It goes back only if the module starts anew.
         self.time_ms = 0
@@ -400,15 +398,14 @@ class Decoder:
         """
         if self._other is None or self._ours:
             return ""
-        older = (
-            "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
-        )
-        return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {older}"
+        step = "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
+        return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {step}"
 
     @property
     def twins(self) -> str:
         """What is wrong if two modules send as this node; empty if they do not. Their reports are of neither."""
-        return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= TWINS else ""
+        # A restart within a status looks like one.
+        return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= 3 else ""
 
     @property
     def surely_foreign(self) -> bool:
@@ -418,7 +415,8 @@ class Decoder:
     def feed(self, message: can.Message) -> list[AxisReport]:
         """Take a frame; return the reports that it closes (none, one or two)."""
         kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
-        if kind is None or not _is_plain(message):
+        special = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
+        if kind is None or special or not message.dlc == 8 == len(message.data):
             return self._refused()
         data = bytes(message.data)
         bits = int.from_bytes(data, "little")
@@ -444,7 +442,8 @@ class Decoder:
         self.statistics.received += 1
         self.statistics.lost = self._sent - self.statistics.received
         if "time_ms" in values:
-            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else BACK_MS)
+            # A report may have been begun, and a corrected sample read, 5 min before what was sent before it.
+            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else 300_000)
         else:
             told_ms = self._begun(second)
         if name == STATUS:
@@ -452,18 +451,16 @@ class Decoder:
             return self.flush()
         if self.foreign:
             return []
-        if name == CORRECTED:
-            if "time_ms" in values:
+        if not kind.axis:
+            if name == CORRECTED and "time_ms" in values:
                 self.corrected = {}  # an axis that is no longer sent has no part in it
                 self._corrects = True
-            if self._corrects:
+            if name == CORRECTED and self._corrects:
                 self.corrected.update(values)
-            return self.flush()
-        if name == TUMBLE:
-            self.tumble = values if "time_ms" in values else self.tumble | values
-            return self.flush()
-        if name == ANSWER:
-            self.answer.update(values)
+            elif name == TUMBLE:
+                self.tumble = values if "time_ms" in values else self.tumble | values
+            elif name == ANSWER:
+                self.answer.update(values)
             return self.flush()
         order = _order(kind, item)
         named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
@@ -610,12 +607,6 @@ def _order(kind: _Kind, item: int) -> int:
     return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
 
 
-def _is_plain(message: can.Message) -> bool:
-    """Whether a frame is a classic one of 8 bytes with an identifier of 11 bits."""
-    special = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
-    return not special and message.dlc == 8 == len(message.data)
-
-
 def _values(kind: _Kind, data: bytes) -> dict[str, float] | None:
     """Signals of a frame; None where the DBC has no such item, or a value cannot be."""
     try:
@@ -704,19 +695,16 @@ class Streams:
 
     @property
     def statistics(self) -> Statistics:
-        """Of all together. Frames of a passing stranger count as refused."""
+        """Counts of all nodes together. Frames of a passing stranger count as refused."""
         known = self.known
-        total = Statistics(**vars(self.strangers))
+        total = Counter(vars(self.strangers))
         for node, decoder in list(self.decoders.items()):
-            counted = decoder.statistics
-            total.damaged += counted.damaged
-            total.foreign += counted.foreign
-            if node in known:
-                total.received, total.lost = total.received + counted.received, total.lost + counted.lost
-                total.refused += counted.refused
-            else:
-                total.refused += counted.refused + counted.received
-        return total
+            counted = Counter(vars(decoder.statistics))
+            if node not in known:
+                counted["refused"] += counted.pop("received")
+                del counted["lost"]
+            total.update(counted)
+        return Statistics(**total)
 
 
 #: Bytes of a serial line without an end that are kept: a frame's line has 22.
@@ -781,15 +769,8 @@ class Link:
         self.closed = False
         return True
 
-    def open_again(self) -> None:
-        """Open the channel of a serial line once more; on other buses nothing happens."""
-        self._order("open")
-
-    def close_channel(self) -> None:
-        """Close the channel of a serial line, not the line; on other buses nothing happens."""
-        self._order("close")
-
-    def _order(self, name: str) -> None:
+    def order(self, name: Literal["open", "close"]) -> None:
+        """Open the channel of a serial line once more, or close it, not the line; on other buses nothing happens."""
         import can
         from can.interfaces.slcan import slcanBus
 
@@ -813,12 +794,6 @@ class Link:
 
     def __exit__(self, *_: object) -> None:
         self.close()
-
-
-#: Timeout of a write to a serial line, s: on a pseudo-terminal that nobody reads it would never end.
-WRITE_S = 1.0
-#: Frames that wait in a UDP socket while the host is busy: a report of six axes is 322, and a datagram takes 768 bytes.
-UDP_BUFFER = 4 << 20
 
 
 def open_bus(interface: str, channel: str, **options: Any) -> Link:
@@ -848,7 +823,8 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
         raise UserError(f"{interface} {channel}: {_reason(interface, channel, error)}") from error
     if isinstance(bus, slcanBus):
         _leave_out_line_feeds(bus.serialPortOrig)
-        bus.serialPortOrig.write_timeout = WRITE_S
+        # A write to a pseudo-terminal that nobody reads would never end.
+        bus.serialPortOrig.write_timeout = 1.0
         try:
             bus.serialPortOrig.exclusive = True
         except OSError as error:
@@ -859,7 +835,8 @@ def _bus(interface: str, channel: str, options: Mapping[str, Any]) -> can.BusABC
         import socket
 
         with socket.socket(fileno=os.dup(bus.fileno())) as same:
-            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UDP_BUFFER)
+            # Frames wait here while the host is busy: a report of six axes is 322 datagrams of 768 bytes.
+            same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, (4 << 20))
     return bus
 
 

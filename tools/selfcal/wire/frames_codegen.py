@@ -125,7 +125,7 @@ def fields(message: Message) -> list[Field]:
 
 
 def _shape(field: Field) -> tuple[object, ...]:
-    """What must be alike in all axis messages: everything but unit and comment."""
+    """Members that are alike in all axis messages: everything but unit and comment."""
     return (field.name, field.item, field.start, field.length, field.kind, field.scale)
 
 

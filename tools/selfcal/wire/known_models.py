@@ -35,7 +35,7 @@ class KnownModels:
         return BY_PLACE if any(math.isnan(value) for value in known) else self._named(*known)
 
     def advice(self, status: Mapping[str, float]) -> str:
-        """What to do where the names are places; empty if nothing is."""
+        """The remedy for names that are places; empty if the model is known."""
         if "model_id" not in status or "bank_block" not in status or self.names(status).known:
             return ""
         return f"names are places: give the model {int(status['model_id']):08x} that it was built with, --model FILE"

@@ -48,15 +48,13 @@ HEALTH = ("not_finite", "saturated", "stuck", "gaps", "blocks_lost")
 BAR, SPARK = (4, 30), (8, 40)
 #: Indentation of an axis's further lines.
 INDENT = 2
-#: Most lines of the status.
-STATUS_LINES = 2
-#: Silence after which contact is lost: s, and times the longest interval so far.
-SILENT_S, INTERVALS = 3.0, 3.0
+#: Silence after which contact is lost, s, or three times the longest interval so far.
+SILENT_S = 3.0
 #: Silence of a module before its second status, s: it sends a status every 10 s (STATUS_MS in port/app/app_frames.c),
 #: and a save takes up to 2 s.
 FIRST_S = 12.0
-#: Most characters that wait for a terminal, and the time for it to read them at the end, s.
-MOST_WAITING, DRAIN_S = 1 << 16, 1.0
+#: Most characters that wait for a terminal, which has 1 s to read them at the end.
+MOST_WAITING = 1 << 16
 BLOCKS = "▁▂▃▄▅▆▇█"
 #: Colours of a module's judgement of its model.
 ADEQUACY = {"inadequate": "red", "adequate": "green"}
@@ -124,7 +122,7 @@ def patient() -> Iterator[None]:
     try:
         yield
     finally:
-        if own.drain(DRAIN_S):
+        if own.drain(1.0):
             sys.stderr = before
 
 
@@ -169,7 +167,7 @@ class Contact:
     @property
     def lost(self) -> bool:
         """The module is not heard any more, or never was."""
-        return self.silent_s > max(FIRST_S if self.waiting else SILENT_S, INTERVALS * self._longest)
+        return self.silent_s > max(FIRST_S if self.waiting else SILENT_S, 3.0 * self._longest)
 
     @property
     def waiting(self) -> bool:
@@ -265,7 +263,7 @@ class View:
         self._console.print(self.renderable(whole=True))
 
     def renderable(self, *, whole: bool = False) -> RenderableType:
-        """What is to be seen now; unless `whole`, no higher than the terminal."""
+        """The view now; unless `whole`, no higher than the terminal."""
         width = self._console.width
         modules = {node: self._module(node) for node in self.streams.known}
         first = next(iter(modules.values()), None)
@@ -312,13 +310,14 @@ class View:
         return Text(f"{said}, {step}", "green" if done else "yellow")
 
     def _next_step(self, module: Module, shown: Sequence[str]) -> str:
-        """What to do about a module; "" where there is nothing."""
+        """The next step for a module; "" without one."""
         contact, status = self._contact_of(module), module.decoder.status
         if wrong := module.decoder.foreign or module.decoder.twins:
             return wrong
         if contact is not None and contact.lost and not module.decoder.finished:
             return "contact lost: check cable and power"
-        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if _told(status, name) == text), "")
+        told = {name: status_text(name, status[name]) for name in TROUBLE if name in status}
+        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if told.get(name) == text), "")
         if trouble:
             return f"{trouble}: see port/README.md"
         if said := tumble_text(module.decoder.tumble):
@@ -329,7 +328,7 @@ class View:
         return f"{names}: {REASONS.get(word, word)}" if word else ""
 
     def _lines(self, module: Module, width: int, height: int | None) -> list[Text]:
-        """What is to be seen of a module, below its title; `height` lines at most."""
+        """The lines of a module below its title, `height` at most."""
         foreign = module.decoder.foreign
         if foreign:
             return [*_flow([Text(word, "bold red") for word in foreign.split()], width, 1), self._counts(module)]
@@ -355,17 +354,11 @@ class View:
 
     @staticmethod
     def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
-        """What the record is too short for."""
+        """The law that the record is too short for."""
         judgements = [report.adequacy for report, _ in last.values()]
-        moved = max(
-            (
-                judgement.temperature_moved
-                for judgement in judgements
-                if judgement and judgement.temperature_moved is not None
-            ),
-            default=None,
-        )
-        if moved is None or moved >= TEMPERATURE_NEEDED:
+        known = [judged.temperature_moved for judged in judgements if judged and judged.temperature_moved is not None]
+        moved = max(known, default=TEMPERATURE_NEEDED)
+        if moved >= TEMPERATURE_NEEDED:
             return []
         said = f"temperature has moved {moved:.1f} of the {TEMPERATURE_NEEDED:g} degC that a temperature law needs"
         return [_line(Text(said, "dim"))]
@@ -395,7 +388,7 @@ class View:
         return Text.assemble((f"{name}   module time {time_s:.1f} s   ", "bold"), self._state(module))
 
     def _state(self, module: Module | None) -> Text:
-        """What the module is doing, as far as it is heard."""
+        """State of the module, as far as it is heard."""
         contact = self._contact_of(module)
         status = module.decoder.status if module is not None else {}
         finished = module is not None and module.decoder.finished
@@ -418,7 +411,7 @@ class View:
                 text = status_text(name, value)
                 trouble = TROUBLE.get(name) == text or name in ("sensor_fault", "axes_retired", "state_refused")
                 said.insert(0 if trouble else len(said), Text(f"{name} {text}", "red" if trouble else "dim"))
-        return _flow(said, width, 3)[:STATUS_LINES]
+        return _flow(said, width, 3)[:2]
 
     def _blocks(
         self,
@@ -469,12 +462,8 @@ def _calibration(values: Mapping[str, float]) -> list[str]:
     return said
 
 
-def _told(status: Mapping[str, float], name: str) -> str:
-    return status_text(name, status[name]) if name in status else ""
-
-
 def counted(s: Statistics) -> str:
-    """What became of the frames of a stream."""
+    """Counts of a stream's frames, in words."""
     foreign = f", {s.foreign} foreign" if s.foreign else ""
     return f"frames: {s.received} received, {s.lost} lost; {s.damaged} bad checksum, {s.refused} refused{foreign}"
 

@@ -34,15 +34,8 @@ from selfcal.wire.streams import Stream, content
 if TYPE_CHECKING:
     import can
 
-#: Silence after which a serial line is opened again, s: a module that saves is deaf for 1 to 2 s, and a restarted one
-#: waits for that.
-REOPEN_S = 3.0
-#: Interval of looks for a port that has gone, s.
-LOOK_S = 0.5
 #: Schema of the document of several modules.
 MODULES = "selfcal.modules/1"
-#: Most reports of an axis for the plot: beyond that every other report is dropped.
-KEPT = 2000
 
 
 @dataclass
@@ -85,7 +78,7 @@ class Run:
                 if once or not isinstance(self.source, Link):
                     return
                 if not self.source.reconnect():
-                    time.sleep(min(LOOK_S, left_s))
+                    time.sleep(min(0.5, left_s))
                 self.opened_s = time.monotonic()
             elif (heard := self._heard(left_s)) is not None:
                 frame, reports = heard
@@ -108,8 +101,9 @@ class Run:
             self.contact.heard(in_a_row=False, paced=any(contact.paced for contact in self.contacts.values()))
         if frame is not None:
             return frame, reports
-        if self.contact is not None and min(self.contact.silent_s, time.monotonic() - self.opened_s) > REOPEN_S:
-            cast(Link, self.source).open_again()  # a module that has restarted waits for that
+        # A module that saves is deaf for 1 to 2 s; a restarted one waits for the channel to be opened.
+        if self.contact is not None and min(self.contact.silent_s, time.monotonic() - self.opened_s) > 3.0:
+            cast(Link, self.source).order("open")  # a module that has restarted waits for that
             self.opened_s = time.monotonic()
         return None
 
@@ -175,7 +169,7 @@ class Run:
         return {"schema": MODULES, "modules": {str(node): entry for node, entry in documents.items()}}
 
     def farewell(self) -> list[str]:
-        """What went wrong at the end, if anything did."""
+        """Faults at the end, a line each."""
         if isinstance(self.source, FrameLog):
             damage = self.source.damage
             return [f"{self.name}: the log is damaged and ends early: {damage}"] if damage else []
@@ -205,7 +199,7 @@ def keep(history: dict[str, list[AxisReport]], report: AxisReport) -> None:
         history.clear()
     kept = history.setdefault(report.axis, [])
     kept.append(report)
-    if len(kept) > KEPT:
+    if len(kept) > 2000:
         del kept[1:-1:2]
 
 

@@ -51,10 +51,7 @@ MAGIC = b"SELFCAL2"
 #: Channels of every sample apart from the model's (port/port.h); not a number if the recording lacks them.
 SIDE = tuple(SIDE_CHANNELS.values())
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
-GONE_S = 2.0  # s without a frame after which none will come from firmware that has ended
 LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
-#: Longest silence of an emulated module, s: its reports are slow, and so may the machine be.
-EMULATED_TIMEOUT_S = 600.0
 #: Sources of a firmware, and the environment variables that its `make` file reads.
 SOURCES = (".c", ".h", ".ld", ".mk")
 #: Debian packages of the programs that build and run it.
@@ -81,13 +78,13 @@ class Target:
 
     @property
     def programs(self) -> tuple[str, ...]:
-        """Of PROGRAMS, those that it takes."""
+        """Members of PROGRAMS that build and run it."""
         return ("make", "arm-none-eabi-gcc", "qemu-system-arm") if self.board else ("make", "cc")
 
     @property
     def patience_s(self) -> float:
         """s that it may be silent."""
-        return EMULATED_TIMEOUT_S if self.board else TIMEOUT_S
+        return 600.0 if self.board else TIMEOUT_S
 
 
 TARGETS = {
@@ -99,7 +96,7 @@ TARGETS = {
 
 
 def tables_of(model: Model, rate_hz: float, axes: Sequence[str], target: str, start: Start | None) -> Tables:
-    """Of a firmware, with measured priors from `start`."""
+    """Tables of a firmware, with measured priors from `start`."""
     return warmed(make_tables(model, rate_hz, tuple(axes), target), start)
 
 
@@ -196,10 +193,13 @@ def _make(name: str, target: str, root: Path, folder: Path) -> None:
     try:
         command.append(f"CORE={target}")
         done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, check=False)
-    except OSError as error:
-        raise UserError(f"cannot build the firmware: make: {error.strerror}") from error
+    except OSError as failure:
+        raise UserError(f"cannot build the firmware: make: {failure.strerror}") from failure
     if done.returncode != 0:
-        complaint = _complaint(done.stderr)
+        # The compiler's first error, else the first line: a linker's, or make's own.
+        error = re.search(r":\d+: (?:fatal )?error: (.+)", done.stderr)
+        lines = (line for line in done.stderr.splitlines() if line.strip())
+        complaint = error[1] if error else next(lines, "make failed")
         remedy = ": take fewer axes (--axis), laws or nodes" if "does not fit the RAM" in complaint else ""
         raise UserError(f"cannot build the firmware: {complaint}{remedy}")
 
@@ -216,12 +216,6 @@ def check_programs(target: str) -> None:
             f"{what} is compiled, and there is no {' and no '.join(missing)} here: on Debian `apt install {packages}`; "
             "plain `replay` compiles nothing"
         )
-
-
-def _complaint(said: str) -> str:
-    """The compiler's first error in what `make` said, else the first line: a linker's, or make's own."""
-    error = re.search(r":\d+: (?:fatal )?error: (.+)", said)
-    return error[1] if error else next((line for line in said.splitlines() if line.strip()), "make failed")
 
 
 def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Path) -> None:
@@ -276,7 +270,7 @@ def run(
                 link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
             if link is not None and wire:
                 _watch(link, decoder, recording, model, history, module, TARGETS[target].patience_s)
-                link.close_channel()  # the emulator forgets what it holds of a line that is closed
+                link.order("close")  # the emulator forgets what it holds of a line that is closed
             said = before + _ending(module)
         if module.returncode != 0 or not decoder.finished:
             said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
@@ -337,7 +331,7 @@ def can_bus(channel: str) -> tuple[str, Link]:
 
 
 def _ending(module: subprocess.Popen[str]) -> str:
-    """What the firmware says from here on, its channel being closed."""
+    """Output of the firmware from here on, its channel being closed."""
     try:
         return module.communicate(timeout=TIMEOUT_S)[0]
     except subprocess.TimeoutExpired:
@@ -429,7 +423,8 @@ def _watch(
             if frame is None:
                 silent_s = time.monotonic() - heard
                 ended = module is not None and module.poll() is not None
-                if link.closed or silent_s > patience_s or (ended and silent_s > GONE_S):
+                # None will come from firmware that has ended 2 s ago.
+                if link.closed or silent_s > patience_s or (ended and silent_s > 2.0):
                     break
                 continue
             heard = time.monotonic()

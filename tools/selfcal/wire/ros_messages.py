@@ -12,8 +12,6 @@ from typing import Any
 
 from selfcal.base import units
 
-#: Levels of a status, as diagnostic_msgs has them.
-OK, WARN, STALE = 0, 1, 3
 #: Fields of an Imu by the letter of an axis, and their unit.
 _SENSORS = {"g": ("angular_velocity", "rad/s"), "a": ("linear_acceleration", "m/s^2")}
 
@@ -28,15 +26,18 @@ def diagnostics(report: Mapping[str, Any], at_s: float) -> dict[str, Any]:
     """The DiagnosticArray of one report's content (`streams.content`): a status of its axis."""
     judged, laws = report.get("adequacy", {}), report["laws"]
     likeliest = _likeliest(report)
-    level, told = OK, "calibrated"
+    # Levels as diagnostic_msgs has them: 0 OK, 1 WARN, 3 STALE.
+    level, told = 0, "calibrated"
     if not report["complete"] or likeliest is None:
-        level, told = STALE, "the report is not complete"
+        level, told = 3, "the report is not complete"
     elif judged.get("state") == "inadequate":
-        level, told = WARN, f"not adequate: {judged['suspicion']}"
+        level, told = 1, f"not adequate: {judged['suspicion']}"
     elif judged.get("state") == "not_judged":
         told = "calibrated, not judged"
     values = {"unit": report["unit"], "law": likeliest or "", "bias": _pair(report["bias"])}
-    values |= {key: _pair(one) for key, one in (laws.get(likeliest) or {}).items() if isinstance(one, Mapping)}
+    values |= {
+        key: _pair(estimate) for key, estimate in (laws.get(likeliest) or {}).items() if isinstance(estimate, Mapping)
+    }
     status = {
         "level": level,
         "name": f"selfcal: {report['axis']}",
@@ -59,10 +60,12 @@ def imu(reports: Mapping[str, Mapping[str, Any]], rate_hz: float, at_s: float) -
     for letter, (field, unit) in _SENSORS.items():
         known = [_known(reports.get(f"{letter}{axis}"), unit) for axis in "xyz"]
         covariance = [0.0] * 9
-        for k, one in enumerate(known):
-            if one is not None:
-                covariance[4 * k] = one[1] ** 2 * rate_hz + one[2] ** 2
-        message[field] = {axis: 0.0 if one is None else one[0] for axis, one in zip("xyz", known, strict=True)}
+        for k, numbers in enumerate(known):
+            if numbers is not None:
+                covariance[4 * k] = numbers[1] ** 2 * rate_hz + numbers[2] ** 2
+        message[field] = {
+            axis: 0.0 if numbers is None else numbers[0] for axis, numbers in zip("xyz", known, strict=True)
+        }
         message[f"{field}_covariance"] = [-1.0, *[0.0] * 8] if None in known else covariance
     return message
 
@@ -73,14 +76,18 @@ def _known(report: Mapping[str, Any] | None, unit: str) -> tuple[float, float, f
     if report is None or law is None:
         return None
     numbers = (report["bias"].get("mean"), report["laws"][law].get("N", {}).get("mean"), report["bias"].get("sd"))
-    if any(one is None for one in numbers):
+    if any(number is None for number in numbers):
         return None
     factor = units.factor(report["unit"], unit)
     return numbers[0] * factor, numbers[1] * factor, numbers[2] * factor
 
 
 def _likeliest(report: Mapping[str, Any]) -> str | None:
-    known = {law: one["probability"] for law, one in report["laws"].items() if one.get("probability") is not None}
+    known = {
+        law: estimate["probability"]
+        for law, estimate in report["laws"].items()
+        if estimate.get("probability") is not None
+    }
     return max(known, key=lambda law: known[law], default=None)
 
 

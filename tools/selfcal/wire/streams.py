@@ -88,7 +88,7 @@ def content(report: AxisReport, names: Names) -> dict[str, Any]:
 
 
 def topic(report: Mapping[str, Any]) -> str:
-    """Of a report's content."""
+    """Topic of a report's content."""
     return f"/selfcal/node{report['node']}/{report['axis']}"
 
 
@@ -128,7 +128,7 @@ class _Lines:
             self._print(line)
 
     def lines(self, report: Mapping[str, Any], at_s: float) -> Iterator[str]:
-        """Those of a report."""
+        """Lines of a report."""
         yield line_of(report, at_s)
 
     def _print(self, line: str) -> None:

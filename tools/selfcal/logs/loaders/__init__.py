@@ -61,7 +61,7 @@ FORMATS = (
 
 #: How a message lists what is read, and what is written.
 READ = (
-    f"{', '.join((*TEXT, ZIP, *(suffix for one in FORMATS for suffix in one.suffixes)))}; .gz of text; a ROS 2 folder"
+    f"{', '.join((*TEXT, ZIP, *(suffix for form in FORMATS for suffix in form.suffixes)))}; .gz of text; a ROS 2 folder"
 )
 WRITTEN = ".csv, .csv.gz or .npz"
 
@@ -120,7 +120,9 @@ def is_text(path: Path) -> bool:
 def is_recording(path: Path | str) -> bool:
     """Whether a name is a recording's: by its suffix, or a folder."""
     path = Path(path)
-    return path.is_dir() or is_text(path) or path.suffix.lower() in (ZIP, *(s for one in FORMATS for s in one.suffixes))
+    return (
+        path.is_dir() or is_text(path) or path.suffix.lower() in (ZIP, *(s for form in FORMATS for s in form.suffixes))
+    )
 
 
 def format_of(path: Path, *, frames: bool = False) -> Format | None:
@@ -129,24 +131,24 @@ def format_of(path: Path, *, frames: bool = False) -> Format | None:
     if not path.is_dir():
         _check_file(path)
     if frames:
-        return next(one for one in FORMATS if one.module == "can_log")
+        return next(form for form in FORMATS if form.module == "can_log")
     if path.is_dir():
         if any(True for pattern in _ROS_FOLDER for _ in path.glob(pattern)):
             for part in path.iterdir():
                 _check_file(part)
-            return next(one for one in FORMATS if one.module == "ros")
+            return next(form for form in FORMATS if form.module == "ros")
         raise UserError(f"{path}: is a folder: name a recording in it ({READ})")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     suffix = path.suffix.lower()
-    for one in FORMATS:
-        if any(head[at : at + len(sign)] == sign for at, sign in one.magic):
-            return one
-    for one in FORMATS:
-        if suffix in one.suffixes:
+    for form in FORMATS:
+        if any(head[at : at + len(sign)] == sign for at, sign in form.magic):
+            return form
+    for form in FORMATS:
+        if suffix in form.suffixes:
             if not head:
                 raise UserError(f"{path}: the file is empty")
-            return one
+            return form
     if is_text(path) or suffix == ZIP:
         if not head:
             raise UserError(f"{path}: the file is empty")
@@ -160,8 +162,8 @@ def _check_file(path: Path) -> None:
         raise UserError(f"{path}: is a pipe or a device: write it into a file first")
 
 
-def check_library(path: Path, one: Format) -> None:
+def check_library(path: Path, form: Format) -> None:
     """Raise UserError, with the line to type, where the library of a format is not installed."""
-    if one.library and importlib.util.find_spec(one.library) is None:
-        typed = install(f"selfcal[{one.extra}]" if one.extra else "selfcal")
-        raise UserError(f"{path}: is {one.name}, and {one.library} is not installed: {typed}")
+    if form.library and importlib.util.find_spec(form.library) is None:
+        typed = install(f"selfcal[{form.extra}]" if form.extra else "selfcal")
+        raise UserError(f"{path}: is {form.name}, and {form.library} is not installed: {typed}")

@@ -24,19 +24,14 @@ from selfcal.logs.loaders.table import Hints, Table, of_arrays
 BEGIN = b"H Product:Blackbox"
 #: Columns that are read: letter of the axes here by the name in the headers.
 _AXES = {"gyroADC": "g", "accSmooth": "a"}
-#: How a field's value is predicted, by the format's numbers.
-_PREVIOUS, _STRAIGHT, _AVERAGE, _MINTHROTTLE, _MOTOR_0, _INC, _1500, _VBATREF, _MINMOTOR = 1, 2, 3, 4, 5, 6, 8, 9, 11
-#: Fields of a frame, and bytes of a log's headers.
-_MOST_FIELDS, _MOST_HEADERS = 256, 1 << 18
-#: Microseconds between frames beyond which one of them is damaged.
-_JUMP = 10_000_000
+#: Fields of a frame at most.
+_MOST_FIELDS = 256
 #: Bytes of an event's data, by its number; a log's end is told apart by its text.
 _EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30: "vv", 40: "v"}
-_LOG_END = 255
 
 
 class _Damaged(Exception):
-    """A frame that is none."""
+    """The bytes are no frame."""
 
 
 @dataclass
@@ -62,9 +57,9 @@ class _Bytes:
         """Seven bits a byte, the lowest first."""
         value = shift = 0
         while shift < 35:
-            one = self.byte()
-            value |= (one & 0x7F) << shift
-            if one < 0x80:
+            byte = self.byte()
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
                 return value & 0xFFFFFFFF
             shift += 7
         raise _Damaged
@@ -98,15 +93,11 @@ def _three(data: _Bytes, wide: Sequence[Sequence[int]]) -> list[int]:
     value, left = tag & 0x3F, 6
     while left < total - 2:
         value, left = value << 8 | data.byte(), left + 8
-    found = []
     # The bits that no number takes stand before the first, and between bytes where numbers take six each.
     if bits == (6, 6, 6):
         return [_sign(value >> shift & 0x3F, 6) for shift in (16, 8, 0)]
-    at = sum(bits)
-    for one in bits:
-        at -= one
-        found.append(_sign(value >> at & (1 << one) - 1, one))
-    return found
+    ends = [sum(bits[k + 1 :]) for k in range(3)]
+    return [_sign(value >> end & (1 << count) - 1, count) for end, count in zip(ends, bits, strict=True)]
 
 
 def _four(data: _Bytes) -> list[int]:
@@ -120,9 +111,9 @@ def _four(data: _Bytes) -> list[int]:
         if held >= 0:
             value, held = held, -1
             return value
-        one = data.byte()
-        held = one & 0xF
-        return one >> 4
+        byte = data.byte()
+        held = byte & 0xF
+        return byte >> 4
 
     for k in range(4):
         count = (0, 1, 2, 4)[tag >> 2 * k & 3]
@@ -173,7 +164,7 @@ class _Log:
         """Read the headers. Raises ValueError where they describe no frames."""
         self.data = _Bytes(data)
         self.headers: dict[str, str] = {}
-        while data[self.data.at : self.data.at + 2] == b"H " and self.data.at < _MOST_HEADERS:
+        while data[self.data.at : self.data.at + 2] == b"H " and self.data.at < 1 << 18:
             end = data.find(b"\n", self.data.at)
             if end < 0:
                 break
@@ -191,12 +182,10 @@ class _Log:
                     self.kinds[ord(kind)] = _Frames(*parts)
         self.time = self.names.index("time")
         self.motor = self.names.index("motor[0]") if "motor[0]" in self.names else 0
-        self.constants = {
-            _MINTHROTTLE: self._number("minthrottle", 1150),
-            _1500: 1500,
-            _VBATREF: self._number("vbatref", 4095),
-            _MINMOTOR: self._number("motorOutput", self._number("minthrottle", 1150)),
-        }
+        least = self._number("minthrottle", 1150)
+        #: What predicts a field alone, by the format's numbers of predictors.
+        battery, motor = self._number("vbatref", 4095), self._number("motorOutput", least)
+        self.constants = {0: 0, 4: least, 8: 1500, 9: battery, 11: motor}
         self.step = max(1, self._number("P interval", 1, "/"))
         #: What could not be read so far.
         self.damaged = Damaged()
@@ -232,7 +221,8 @@ class _Log:
                 if kind == ord("P") and not history:
                     continue
                 values = self._predicted(values, frames.predictors, history if kind == ord("P") else [])
-                if history and not 0 < values[self.time] - history[-1][self.time] < _JUMP:
+                # Of frames 10 s apart one is damaged.
+                if history and not 0 < values[self.time] - history[-1][self.time] < 10_000_000:
                     raise _Damaged
             except (_Damaged, IndexError):
                 lost = begin if lost < 0 else lost
@@ -249,22 +239,15 @@ class _Log:
     def _predicted(self, values: list[int], predictors: Sequence[int], history: Sequence[list[int]]) -> list[int]:
         """The values with what they are predicted by. Raises _Damaged."""
         for place, predictor in enumerate(predictors):
-            if predictor == 0:
-                continue
+            before, last = (frame[place] for frame in history) if history else (0, 0)
             if predictor in self.constants:
                 values[place] += self.constants[predictor]
-            elif predictor == _MOTOR_0:
+            elif predictor == 5:
                 values[place] += values[self.motor]
-            elif predictor == _INC:
-                values[place] += history[-1][place] + self.step if history else 0
-            elif not history:
-                raise _Damaged
-            elif predictor == _PREVIOUS:
-                values[place] += history[-1][place]
-            elif predictor == _STRAIGHT:
-                values[place] += 2 * history[-1][place] - history[-2][place]
-            elif predictor == _AVERAGE:
-                values[place] += int((history[-1][place] + history[-2][place]) / 2)
+            elif predictor == 6:
+                values[place] += last + self.step if history else 0
+            elif history and predictor in (1, 2, 3):
+                values[place] += {1: last, 2: 2 * last - before, 3: int((last + before) / 2)}[predictor]
             else:
                 raise _Damaged
         return values
@@ -272,7 +255,8 @@ class _Log:
     def _event(self) -> bool:
         """Pass by an event; whether it is the log's end."""
         number = self.data.byte()
-        if number == _LOG_END:
+        # A log's end is known by its text.
+        if number == 255:
             if self.data.data[self.data.at : self.data.at + 11] == b"End of log\0":
                 return True
             raise _Damaged

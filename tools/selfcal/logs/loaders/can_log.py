@@ -28,7 +28,7 @@ def read(path: Path, hints: Hints) -> list[Table]:
     database = cantools.database.load_file(hints["dbc"], strict=False)
     if not isinstance(database, cantools.database.can.Database):
         raise UserError(f"{hints['dbc']}: not a database of CAN messages")
-    messages = {one.frame_id: one for one in database.messages}
+    messages = {known.frame_id: known for known in database.messages}
     stamps: dict[tuple[int, tuple[str, ...]], Any] = {}
     values: dict[tuple[int, tuple[str, ...]], Any] = {}
     undecoded: set[str] = set()
@@ -54,7 +54,7 @@ def read(path: Path, hints: Hints) -> list[Table]:
     for (number, names), times in stamps.items():
         message = messages[number]
         rows = np.array(values[number, names]).reshape(len(times), -1)
-        unit = {one.name: one.unit for one in message.signals}
+        unit = {signal.name: signal.unit for signal in message.signals}
         columns = {heading(name, unit[name]): rows[:, k] for k, name in enumerate(names)}
         alone = sum(other == number for other, _ in stamps) == 1
         source = message.name if alone else f"{message.name}/{_chosen(message, names)}"
@@ -64,4 +64,4 @@ def read(path: Path, hints: Hints) -> list[Table]:
 
 def _chosen(message: Any, names: tuple[str, ...]) -> str:
     """The signals of a multiplexed message that are not in all of its frames."""
-    return " ".join(one.name for one in message.signals if one.name in names and one.multiplexer_ids)
+    return " ".join(signal.name for signal in message.signals if signal.name in names and signal.multiplexer_ids)

@@ -34,10 +34,6 @@ from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
 _LEAST_S, _S_PER_BYTE = 60.0, 4e-6
-#: Bytes of memory of a reading: for any file, as libraries are large; a byte; and at most.
-_LEAST_BYTES, _PER_BYTE, _MOST_BYTES = 3 << 30, 40, 16 << 30
-#: Of prctl(2): the signal that a process gets when its parent ends.
-_PR_SET_PDEATHSIG = 1
 #: What comes before the JSON: its size.
 _SIZE = struct.Struct("=Q")
 
@@ -46,7 +42,7 @@ _SIZE = struct.Struct("=Q")
 Start = Callable[[Format, Path, Hints, int, str], int]
 
 
-def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None) -> list[Table]:
+def tables_of(path: Path, form: Format, hints: Hints, start: Start | None = None) -> list[Table]:
     """The tables of a file, by a child process. `start` starts it. Raises UserError."""
     ends = time.monotonic() + _seconds(path)
     pipe, its_end = os.pipe()
@@ -54,7 +50,7 @@ def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None)
     with temporary_folder() as folder:
         try:
             try:
-                number = (start or _spawned)(one, path, hints, its_end, folder)
+                number = (start or _spawned)(form, path, hints, its_end, folder)
             finally:
                 os.close(its_end)
             return _answered(pipe, ends)
@@ -72,10 +68,10 @@ def tables_of(path: Path, one: Format, hints: Hints, start: Start | None = None)
         raise UserError(f"{path}: reading it takes more than {_seconds(path):.0f} s: it is damaged, or too long")
     if code >= 0:
         raise UserError(
-            f"{path}: not {'a' if one.name[1] != 'n' else 'an'}{one.name[one.name.index(' ') :]} that reads"
+            f"{path}: not {'a' if form.name[1] != 'n' else 'an'}{form.name[form.name.index(' ') :]} that reads"
         )
-    what = one.name.split(" ", 1)[1]
-    raise UserError(f"{path}: not a sound {what}: {one.library or 'its reader'} fails at it (signal {-code})")
+    what = form.name.split(" ", 1)[1]
+    raise UserError(f"{path}: not a sound {what}: {form.library or 'its reader'} fails at it (signal {-code})")
 
 
 def _answered(pipe: int, ends: float) -> list[Table]:
@@ -84,13 +80,15 @@ def _answered(pipe: int, ends: float) -> list[Table]:
     if "error" in found:
         raise UserError(found["error"])
     tables = []
-    for one in found["tables"]:
+    for table in found["tables"]:
         arrays = {}
-        for name, kind, shape in one["columns"]:
+        for name, kind, shape in table["columns"]:
             dtype = np.dtype(kind)
             data = _received(pipe, math.prod(shape) * dtype.itemsize, ends)
             arrays[name] = np.frombuffer(data, dtype).reshape(shape)
-        tables.append(of_arrays(one["source"], arrays, one["meta"], tuple(one["notes"]), Damaged(**one["damaged"])))
+        tables.append(
+            of_arrays(table["source"], arrays, table["meta"], tuple(table["notes"]), Damaged(**table["damaged"]))
+        )
     return tables
 
 
@@ -113,16 +111,16 @@ def _received(pipe: int, size: int, ends: float) -> bytearray:
 def _bytes(path: Path) -> int:
     """Bytes of a file, or of a folder's files. A hole has none; a disk that packs files does so to a sixteenth."""
     found = [part.stat() for part in parts_of(path)]
-    return sum(min(one.st_size, 16 * 512 * one.st_blocks) for one in found)
+    return sum(min(status.st_size, 16 * 512 * status.st_blocks) for status in found)
 
 
 def _seconds(path: Path) -> float:
     return _LEAST_S + _S_PER_BYTE * _bytes(path)
 
 
-def _spawned(one: Format, path: Path, hints: Hints, answer: int, folder: str) -> int:
+def _spawned(form: Format, path: Path, hints: Hints, answer: int, folder: str) -> int:
     # -P: no module is imported from the folder that the user is in, where files of strangers may lie.
-    what = [one.module, str(path), json.dumps(dict(hints)), str(os.getpid())]
+    what = [form.module, str(path), json.dumps(dict(hints)), str(os.getpid())]
     command = [sys.executable, "-P", "-m", "selfcal.logs.loaders.child", *what]
     streams = [
         (os.POSIX_SPAWN_DUP2, answer, 1),
@@ -138,7 +136,8 @@ def _spawned(one: Format, path: Path, hints: Hints, answer: int, folder: str) ->
 def answer(module: str, path: Path, hints: Hints, to: int) -> None:
     """In the child: read, within the bounds, and write the answer to the descriptor `to`."""
     seconds = int(_seconds(path)) + 1
-    most = min(_MOST_BYTES, _LEAST_BYTES + _PER_BYTE * _bytes(path))
+    # Libraries are large: 3 GB for any file, 16 GB at most.
+    most = min(16 << 30, (3 << 30) + 40 * _bytes(path))
     _bound(resource.RLIMIT_AS, most, most)
     _bound(resource.RLIMIT_CPU, seconds, seconds + 5)
     # What it unpacks into files: each part of a folder, but for its index, into one.
@@ -167,7 +166,7 @@ def _bound(kind: int, soft: int, hard: int) -> None:
 
 
 def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[str, Any]:
-    """What the JSON says of a table, the bytes of whose columns join `arrays`."""
+    """The JSON of a table; the bytes of its columns join `arrays`."""
     if len(table.members) > MOST_COLUMNS:
         raise UserError(f"{path}: {table.source}: more than {MOST_COLUMNS} columns")
     columns = []
@@ -191,7 +190,8 @@ def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[st
 def main() -> None:
     """`python -m selfcal.logs.loaders.child MODULE PATH HINTS PARENT`: answers on stdout, and ends with its parent."""
     module, path, hints, parent = sys.argv[1:]
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    # PR_SET_PDEATHSIG of prctl(2): the signal that a process gets when its parent ends.
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL)
     if os.getppid() != int(parent):  # it has ended before
         return
     to = os.dup(1)

@@ -1,4 +1,4 @@
-"""What of a file could not be read. Loaders count it, `recording.py` tells it.
+"""Damage of a file. Loaders count it, `recording.py` reports it.
 
 A log is a row of messages. A loader says where a sound message ends; `walk` finds the stretches between sound messages.
 """
@@ -13,8 +13,6 @@ from pathlib import Path
 
 #: What is sliced and looked at by place.
 Bytes = mmap.mmap | bytes
-#: Messages in a row that make sure of a place in a form without checksums.
-_IN_A_ROW = 3
 
 
 @dataclass(frozen=True)
@@ -78,7 +76,8 @@ def walk(
     size = len(data)
 
     def begins(place: int) -> bool:
-        for _ in range(1 if checked else _IN_A_ROW):
+        # Without checksums three messages in a row make sure of a place.
+        for _ in range(1 if checked else 3):
             place = end_of(place)
             if place in (0, size):
                 break
@@ -111,7 +110,7 @@ def walk(
 def sifted(
     data: Bytes, at: int, end_of: Callable[[int], int], *, checked: bool = False
 ) -> tuple[Damaged, bytes | None]:
-    """What is damaged of the messages from `at` on, and the file without it; None where all is sound."""
+    """The damage of the messages from `at` on, and the file without it; None where all is sound."""
     damaged, kept, since = SOUND, list[bytes](), 0
     for begin, end, sound in walk(data, at, end_of, checked=checked):
         if not sound:

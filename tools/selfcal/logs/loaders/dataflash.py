@@ -40,7 +40,6 @@ _TLOG = {
     "SCALED_IMU3": _SCALED,
     "HIGHRES_IMU": ("time_usec", "us", "rad/s", "m/s^2"),
 }
-_ARDUPILOT = 3
 #: How a message of a DataFlash log begins, and the kind that describes the others; the first byte of MAVLink's frames.
 _HEAD, _FMT = b"\xa3\x95", 0x80
 _MAVLINK_2 = 0xFD
@@ -54,10 +53,10 @@ class _Rows:
         self.headings, self.values = headings, array("d")
 
     def table(self, source: str) -> Table:
-        """The table. A temperature of 0 throughout is none."""
+        """The table. Drop a temperature that is 0 throughout."""
         values = np.array(self.values).reshape(-1, len(self.headings))
         columns = {name: values[:, place] for place, name in enumerate(self.headings)}
-        return of_arrays(source, {name: one for name, one in columns.items() if name[:4] != "temp" or one.any()})
+        return of_arrays(source, {name: part for name, part in columns.items() if name[:4] != "temp" or part.any()})
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -77,7 +76,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: no message {', '.join(_SOURCES if binary else _TLOG)}")
     order = list(_DATAFLASH if binary else _TLOG)
     tables = [rows[kind].table(source) for source, rows in found.items() for kind in sorted(rows, key=order.index)]
-    return [replace(one, damaged=sum(lost, damaged)) for one in tables]
+    return [replace(part, damaged=sum(lost, damaged)) for part in tables]
 
 
 def _ends(data: Bytes) -> Callable[[int], int]:
@@ -204,7 +203,8 @@ def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str
             continue
         vehicle = message.get_srcSystem()
         if kind == "HEARTBEAT":
-            if message.autopilot == _ARDUPILOT:
+            # Its RAW_IMU is in counts but for ArduPilot, number 3.
+            if message.autopilot == 3:
                 ardupilot.add(vehicle)
             continue
         stamp, unit, gyro, accel = _TLOG[kind]

@@ -17,8 +17,6 @@ from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_META_BYTES
 from selfcal.logs.loaders.table import Hints, Table, check_numbers, of_groups, parse_meta
 
-#: Columns of a matrix.
-_WIDEST = 64
 _UNITS = ("unit", "units", "Unit", "Units")
 
 
@@ -54,8 +52,8 @@ def _text(dataset: Any) -> str:
     value = dataset[()]
     if isinstance(value, np.ndarray) and value.dtype.kind in "iu":
         return "".join(map(chr, value.ravel().tolist()))
-    one = value.ravel()[0] if isinstance(value, np.ndarray) else value
-    return one.decode() if isinstance(one, bytes) else str(one)
+    first = value.ravel()[0] if isinstance(value, np.ndarray) else value
+    return first.decode() if isinstance(first, bytes) else str(first)
 
 
 def _columns(label: str, dataset: Any) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -73,5 +71,5 @@ def _columns(label: str, dataset: Any) -> Iterator[tuple[str, NDArray[Any]]]:
         yield f"{label}{unit}", values.ravel()
         return
     across = values if values.shape[0] < values.shape[1] else values.T  # MATLAB's matrices lie transposed
-    for column in range(min(across.shape[0], _WIDEST)):
+    for column in range(min(across.shape[0], 64)):
         yield f"{label}:{column + 1}{unit}", across[column]

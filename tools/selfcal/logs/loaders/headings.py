@@ -64,9 +64,9 @@ class _Form:
     file: str = ""
     needs: str = ""
     before: str = ""
-    """What a line before the headings begins with."""
+    """How a line before the headings begins."""
     count: float = 1.0
-    """Of the time: units of one count."""
+    """Units of one count of the time."""
 
 
 _AXIS = r"(?P<axis>[xyz])"
@@ -86,7 +86,7 @@ _ACCEL = r"(?:acc|accl|accel|accelerometer|acceleration|lin(?:ear)?[_ ]?acc(?:el
 _FIRST = rf"{_BEFORE}(?P<axis>[xyz])(?:[ _-]axis)?[ _-]?"
 #: A rate of turn by the axis of a vehicle.
 _VEHICLE = {"roll": "x", "pitch": "y", "yaw": "z"}
-#: Any heading with an axis: its unit tells of which sensor.
+#: Any heading with an axis: its unit decides which sensor.
 _ANY = (
     r"(?P<source>.*?)[ ._/-]*(?P<axis>[xyz])(?:[ _-]?axis)?",
     r"(?P<axis>[xyz])(?:[ _-]axis)?[ ._/-]+(?P<source>[^[(]*)",
@@ -207,7 +207,7 @@ def number_of(keys: Sequence[str]) -> str | None:
 
 
 def sides_of(keys: Iterable[str]) -> Sensor | None:
-    """The temperature, with its time, of a table without axes; None where there is none."""
+    """The temperature, with its time, of a table without axes; None without one."""
     form = FORMS[-1]
     listed = list(keys)
     meant = _temperature(form, listed, "")
@@ -348,14 +348,14 @@ def _matching(pattern: str | tuple[str, ...], keys: Sequence[str]) -> Iterator[t
         ending = match.groupdict().get("unit")
         if ending is not None:
             named = _ENDINGS.get(ending.lower(), units.plain(ending))
-            if named == units.LSB or not units.known(named) or not any(units.same_kind(named, one) for one in _KINDS):
+            if named == units.LSB or not units.known(named) or not any(units.same_kind(named, kind) for kind in _KINDS):
                 continue
             unit = unit or named
         yield key, match, unit
 
 
 def _first(patterns: Sequence[str], text: str) -> re.Match[str] | None:
-    return next(filter(None, (re.fullmatch(one, text, re.IGNORECASE) for one in patterns)), None)
+    return next(filter(None, (re.fullmatch(pattern, text, re.IGNORECASE) for pattern in patterns)), None)
 
 
 def parse_scales(texts: Sequence[str]) -> dict[str, Scale]:

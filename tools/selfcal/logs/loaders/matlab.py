@@ -16,8 +16,8 @@ from selfcal.base.errors import UserError, short
 from selfcal.base.limits import MOST_META_BYTES, reading
 from selfcal.logs.loaders.table import Hints, Table, bounded, content, inflated, parse_meta, room, vectors
 
-#: Of a file of version 5 to 7: its header, the kinds of its elements, and the flags of an array.
-_MAT_HEADER, _MAT_ARRAY, _MAT_PACKED, _MAT_COMPLEX, _MAT_LOGICAL, _MAT_CHAR = 128, 14, 15, 0x800, 0x200, 4
+#: Bytes of the header of a file of version 5 to 7, and the class of a text.
+_MAT_HEADER, _MAT_CHAR = 128, 4
 #: Types of numbers by their class, by the kind of the element that holds them, and by the digit of version 4.
 _MAT_CLASSES = dict(enumerate(("f8", "f4", "i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8"), start=6))
 _MAT_KINDS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -48,7 +48,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _mat4(data: bytes) -> _Variables:
-    """Of a file of version 4. Raises ValueError, and EOFError where it is cut off."""
+    """Variables of a file of version 4. Raises ValueError, and EOFError where it is cut off."""
     at = 0
     while at < len(data):
         order = "<" if 0 <= struct.unpack_from("<i", data, at)[0] < 5000 else ">"
@@ -68,13 +68,13 @@ def _mat4(data: bytes) -> _Variables:
 
 
 def _mat5(data: memoryview, order: str) -> _Variables:
-    """Of a file of version 5 to 7, unpacked. Raises ValueError, and EOFError where it is cut off."""
+    """Variables of a file of version 5 to 7, unpacked. Raises ValueError, and EOFError where it is cut off."""
     at = _MAT_HEADER
     while at + 8 <= len(data):
         kind, size = struct.unpack_from(f"{order}II", data, at)
         body = _piece(data, at + 8, size)
         at += 8 + size
-        if kind == _MAT_ARRAY and size:
+        if kind == 14 and size:  # an array
             yield from _array(body, order)
 
 
@@ -83,7 +83,7 @@ def _array(body: memoryview, order: str) -> _Variables:
     flags, at = _element(body, 0, order)[1:]
     flag = struct.unpack_from(f"{order}I", flags)[0]
     of = flag & 0xFF
-    if flag & _MAT_LOGICAL or (of != _MAT_CHAR and of not in _MAT_CLASSES):  # other classes have other parts
+    if flag & 0x200 or (of != _MAT_CHAR and of not in _MAT_CLASSES):  # logical, or a class that has other parts
         return
     extents, at = _element(body, at, order)[1:]
     letters, at = _element(body, at, order)[1:]
@@ -99,7 +99,7 @@ def _array(body: memoryview, order: str) -> _Variables:
     shape = np.frombuffer(extents, f"{order}i4").tolist()
     if min(shape, default=0) < 0 or math.prod(shape) != values.size:
         raise ValueError("its length and its shape differ")
-    whole = np.complex128 if flag & _MAT_COMPLEX else np.dtype(_MAT_CLASSES[of])
+    whole = np.complex128 if flag & 0x800 else np.dtype(_MAT_CLASSES[of])
     yield name, values.astype(whole, copy=False).reshape(shape, order="F")
 
 
@@ -124,7 +124,7 @@ def _unpacked(path: Path, data: bytes, order: str) -> memoryview:
     while at + 8 <= len(data):
         kind, length = struct.unpack_from(f"{order}II", data, at)
         part = data[at : at + 8 + length]
-        if kind == _MAT_PACKED:
+        if kind == 15:  # packed
             part = inflated(path, zlib.decompressobj(), part[8:], most, size)
         parts.append(part)
         size, at = size + len(part), at + 8 + length

@@ -29,9 +29,9 @@ from selfcal.logs.loaders.table import Hints, Table, of_arrays
 #: Fields whose message is a stamp: seconds and nanoseconds by these names.
 _STAMPS = ("header/stamp", "timestamp", "stamp", "time")
 _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs", "nanos")
-#: The first and the last bytes of a file; a record's kind and length; kinds of records; bytes of the last one.
+#: The first and the last bytes of a file; a record's kind and length; the kind of a chunk.
 _MAGIC, _HEAD = b"\x89MCAP0\r\n", struct.Struct("<BQ")
-_MESSAGE, _CHUNK, _FOOTER_BYTES = 5, b"\x06", _HEAD.size + 20
+_CHUNK = b"\x06"
 #: Depth of a message's fields.
 _DEEPEST = 6
 #: What of a message's fields is a sensor's by convention.
@@ -94,7 +94,7 @@ def _stamp(fields: Mapping[str, float | int]) -> int | None:
     for name in _STAMPS:
         for second in _SECONDS:
             if f"{name}/{second}" in fields:
-                rest = next((fields[f"{name}/{one}"] for one in _NANOSECONDS if f"{name}/{one}" in fields), 0)
+                rest = next((fields[f"{name}/{part}"] for part in _NANOSECONDS if f"{name}/{part}" in fields), 0)
                 return int(fields[f"{name}/{second}"]) * 1_000_000_000 + int(rest)
     return None
 
@@ -113,9 +113,9 @@ def read(path: Path, _: Hints) -> list[Table]:
             if channel.message_encoding in ("cdr", "ros1"):
                 kind = kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
                 if kind in LAYOUTS:
-                    one = found.setdefault(topic, Topic(kind))
-                    if isinstance(one, Topic) and one.kind == kind:
-                        one.take(message.data, cdr=channel.message_encoding == "cdr")
+                    table = found.setdefault(topic, Topic(kind))
+                    if isinstance(table, Topic) and table.kind == kind:
+                        table.take(message.data, cdr=channel.message_encoding == "cdr")
                 continue
             if channel.message_encoding not in ("json", "protobuf"):
                 continue
@@ -131,7 +131,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: damaged: {replace(damaged, whole=bytes_of(path)).words}, and no other is a sensor's")
     if not found:
         raise no_topic(path, kinds)
-    return [replace(one.table(topic), damaged=damaged) for topic, one in found.items()]
+    return [replace(table.table(topic), damaged=damaged) for topic, table in found.items()]
 
 
 def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple[Any, Any, Any]]:
@@ -143,8 +143,8 @@ def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple
     from mcap.exceptions import UnsupportedCompressionError
 
     summary = _summary(data)
-    schemas = {one.id: one for one in summary if isinstance(one, of.Schema)}
-    channels = {one.id: one for one in summary if isinstance(one, of.Channel)}
+    schemas = {record.id: record for record in summary if isinstance(record, of.Schema)}
+    channels = {record.id: record for record in summary if isinstance(record, of.Channel)}
     count, at, unchecked = 0, len(_MAGIC), False
     while data[at : at + len(_MAGIC)] != _MAGIC and at < len(data):
         begin = at
@@ -156,21 +156,23 @@ def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple
             at = _next(data, begin)
             lost.append(Damaged(at - begin, 1))
             continue
-        for one in found:
-            if isinstance(one, of.Schema):
-                schemas[one.id] = one
-            elif isinstance(one, of.Channel):
-                channels[one.id] = one
-            elif isinstance(one, of.Message) and one.channel_id in channels:
+        for record in found:
+            if isinstance(record, of.Schema):
+                schemas[record.id] = record
+            elif isinstance(record, of.Channel):
+                channels[record.id] = record
+            elif isinstance(record, of.Message) and record.channel_id in channels:
                 count, unchecked = count + 1, unchecked or not checked
-                yield schemas.get(channels[one.channel_id].schema_id), channels[one.channel_id], one
+                yield schemas.get(channels[record.channel_id].schema_id), channels[record.channel_id], record
             elif (
-                isinstance(one, of.DataEnd) and unchecked and one.data_section_crc not in (0, zlib.crc32(data[:begin]))
+                isinstance(record, of.DataEnd)
+                and unchecked
+                and record.data_section_crc not in (0, zlib.crc32(data[:begin]))
             ):
                 raise UserError(f"{path}: the checksum of its data does not fit: a message in it is damaged")
-    stated = sum(one.message_count for one in summary if isinstance(one, of.Statistics))
-    if stated > count + sum(one.messages for one in lost):
-        lost.append(Damaged(0, stated - count - sum(one.messages for one in lost)))
+    stated = sum(record.message_count for record in summary if isinstance(record, of.Statistics))
+    if stated > count + sum(record.messages for record in lost):
+        lost.append(Damaged(0, stated - count - sum(record.messages for record in lost)))
 
 
 def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
@@ -184,7 +186,7 @@ def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
     if not (end := _end(data, at)):
         raise ValueError("no record")
     stream, kind = ReadDataStream(BytesIO(data[at + _HEAD.size : end])), data[at]
-    if kind == _MESSAGE:
+    if kind == 5:  # a message
         return end, [of.Message.read(stream, end - at - _HEAD.size)], False
     record = kinds[kind].read(stream) if kind in kinds else None
     if isinstance(record, of.Chunk):
@@ -193,7 +195,7 @@ def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
 
 
 def _end(data: Bytes, at: int) -> int:
-    """The end that a record at a place states; 0 where there is none."""
+    """The end that a record at a place states; 0 without a record."""
     if at + _HEAD.size > len(data):
         return 0
     kind, length = _HEAD.unpack_from(data, at)
@@ -217,7 +219,7 @@ def _next(data: Bytes, at: int) -> int:
 def _summary(data: Bytes) -> list[Any]:
     """The records of the summary, none where it is absent or damaged."""
     found: list[Any] = []
-    at = len(data) - _FOOTER_BYTES - len(_MAGIC)
+    at = len(data) - (_HEAD.size + 20) - len(_MAGIC)  # of the footer
     with suppress(Exception):
         end, (footer,), _ = _records(data, at)
         start = footer.summary_start
@@ -229,19 +231,14 @@ def _summary(data: Bytes) -> list[Any]:
 
 
 def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
-    """What makes a mapping of a message in JSON or protobuf."""
+    """The function that makes a mapping of a message in JSON or protobuf."""
     if channel.message_encoding == "json":
-        return _json
+        return lambda data: value if isinstance(value := json.loads(data), dict) else {}
     from mcap_protobuf.decoder import DecoderFactory
 
     decode = DecoderFactory().decoder_for("protobuf", schema)
     assert decode is not None
     return lambda data: _messages(decode(data))
-
-
-def _json(data: bytes) -> Mapping[str, Any]:
-    value = json.loads(data)
-    return value if isinstance(value, dict) else {}
 
 
 def _messages(message: Any) -> dict[str, Any]:

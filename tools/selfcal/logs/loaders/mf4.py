@@ -61,7 +61,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _formula(conversion: Any) -> str:
-    """The formula of a conversion, or of one within it; empty where there is none."""
+    """The formula of a conversion, or of one within it; empty without one."""
     from asammdf.blocks import v2_v3_constants, v4_blocks, v4_constants
 
     if conversion is None:
@@ -70,5 +70,5 @@ def _formula(conversion: Any) -> str:
     kind = v4_constants.CONVERSION_TYPE_ALG if new else v2_v3_constants.CONVERSION_TYPE_FORMULA
     if conversion.conversion_type == kind:
         return str(conversion.formula) or "''"
-    inner = (_formula(one) for one in conversion.referenced_blocks.values() if not isinstance(one, bytes | str))
+    inner = (_formula(block) for block in conversion.referenced_blocks.values() if not isinstance(block, bytes | str))
     return next(filter(None, inner), "")

@@ -99,7 +99,7 @@ def _r_pairs(node: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _r_text(node: Any) -> str:
-    """A symbol's or a string's text; empty where there is none."""
+    """A symbol's or a string's text; empty without one."""
     while node is not None and node.info.type.name in ("REF", "SYM"):
         node = node.referenced_object if node.info.type.name == "REF" else node.value
     return node.value.decode("utf-8", "replace") if node is not None and isinstance(node.value, bytes) else ""

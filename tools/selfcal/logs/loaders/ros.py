@@ -25,12 +25,6 @@ LAYOUTS = {"sensor_msgs/msg/Imu": 37, "sensor_msgs/msg/Temperature": 2}
 #: Place of the first axis, and its unit, by the first letter of the axes here.
 _AXES = {"g": (13, "rad/s"), "a": (25, "m/s^2")}
 _ROS_1 = b"#ROSBAG V2.0"
-#: Bytes before the content of a -wal, and the place in a database of the form that a reader has to know.
-_WAL_HEAD, _WAL_READ = 32, 19
-#: Places by which messages may lie out of the order of their stamps, as threads write them.
-_DISORDER = 64
-#: Share of accelerations of exactly 0 from which on a topic has the gyro and the accelerometer in turn.
-_IN_TURN = 0.1
 
 
 class Topic:
@@ -55,7 +49,8 @@ class Topic:
         values = np.array(self.values).reshape(-1, LAYOUTS[self.kind])
         stamps = np.array(self.stamps, np.int64)
         order = np.argsort(stamps, kind="stable")
-        if np.abs(order - np.arange(order.size)).max(initial=0) <= _DISORDER:
+        # Threads write messages a few places out of the order of their stamps.
+        if np.abs(order - np.arange(order.size)).max(initial=0) <= 64:
             stamps, values = stamps[order], values[order]
         notes: tuple[str, ...] = ()
         columns: dict[str, NDArray[np.float64] | NDArray[np.int64]] = {}
@@ -81,7 +76,8 @@ def _axes(values: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
     if len(found) == 2:
         none = (found["a"] == 0.0).all(axis=1, keepdims=True)  # at rest gravity is among the axes: no reading is 0
         found["a"] = np.where(none, np.nan, found["a"])
-        if none.mean() > _IN_TURN:
+        # A topic has the gyro and the accelerometer in turn.
+        if none.mean() > 0.1:
             found["g"] = np.where((found["g"] == 0.0).all(axis=1, keepdims=True), np.nan, found["g"])
     return {
         f"{letter}{axis}[{_AXES[letter][1]}]": triad[:, place]
@@ -122,13 +118,15 @@ def read(path: Path, _: Hints) -> list[Table]:
 def _has_wal(path: Path) -> bool:
     """Whether what is newest in a database is in a -wal beside it. Source: sqlite.org/fileformat2.html, 1.3.3 and 4."""
     log = path.with_name(f"{path.name}-wal")
-    if not log.is_file() or log.stat().st_size <= _WAL_HEAD:
+    # The content follows a head of 32 bytes.
+    if not log.is_file() or log.stat().st_size <= 32:
         return False
     with path.open("rb") as stream:
-        return stream.read(_WAL_READ + 1)[_WAL_READ:] == b"\2"
+        # Byte 19 of a database is the form that a reader has to know.
+        return stream.read(20)[19:] == b"\2"
 
 
 def no_topic(path: Path, kinds: object) -> UserError:
-    """What to raise for a bag without a topic that is read."""
+    """The error for a bag without a topic that is read."""
     there = ", ".join(sorted({str(kind) for kind in kinds})[:6]) or "none"  # type: ignore[attr-defined]
     return UserError(f"{path}: no message of sensor_msgs/Imu or sensor_msgs/Temperature (there are: {there})")

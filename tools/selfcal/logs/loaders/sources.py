@@ -12,8 +12,6 @@ from typing import Any
 
 from selfcal.base.errors import UserError, printable, short
 
-#: Times the rate of another sensor with the same axes from which on that other is a thinned out one.
-_OFTENER = 5.0
 #: Sources that a message lists.
 _MOST_LISTED = 30
 
@@ -71,7 +69,7 @@ def chosen(path: object, parts: Sequence[Part], wanted: Sequence[str]) -> tuple[
         near = _nearest(kept, sides)
         found += [part for source in near for part in sources[source]]
         if len(near) < len(sides):
-            notes.append(f"left out, add it by --source: {', '.join(one for one in sides if one not in near)}")
+            notes.append(f"left out, add it by --source: {', '.join(side for side in sides if side not in near)}")
     return found, of_dropped, notes
 
 
@@ -82,7 +80,7 @@ def _by_rate(
     sensors: Sequence[str],
 ) -> tuple[list[str], list[str]]:
     """The sources to read, and those left out for their lower rates. Raises UserError."""
-    if all(not axes[one] & axes[other] for k, one in enumerate(sensors) for other in sensors[:k]):
+    if all(not axes[sensor] & axes[other] for k, sensor in enumerate(sensors) for other in sensors[:k]):
         return list(sensors), []
     rate = {source: max(part.rate_hz for part in sources[source] if part.axes) for source in sensors}
     kept: list[str] = []
@@ -91,7 +89,7 @@ def _by_rate(
         others = [other for other in kept if axes[other] & axes[source]]
         if not others:
             kept.append(source)
-        elif all(rate[other] >= _OFTENER * rate[source] for other in others):
+        elif all(rate[other] >= 5.0 * rate[source] for other in others):
             dropped.append(source)
         else:
             raise UserError(f"{path}: several sensors: {_listed(sources, axes, sensors)}")
@@ -111,7 +109,7 @@ def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
 
 
 def _listed(sources: dict[str, list[Part]], axes: dict[str, frozenset[str]], names: Sequence[str]) -> str:
-    """What to type for each source, with its axes, rate and length."""
+    """The option to type for each source, with its axes, rate and length."""
     lines = []
     for name in names[:_MOST_LISTED]:
         part = max(sources[name], key=lambda one: (bool(one.axes), one.rate_hz))

@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.base.errors import UserError, short
+from selfcal.base.errors import UserError, few, short
 from selfcal.base.limits import (
     BLOCK_BYTES,
     MOST_COLUMNS,
@@ -23,9 +23,6 @@ from selfcal.base.limits import (
     reading,
 )
 from selfcal.logs.loaders.damage import SOUND, Damaged
-
-#: Channels that a note names.
-_MOST_NAMED = 6
 
 #: What the user states beside the file: `dbc`, the path of a CAN database.
 Hints = Mapping[str, str]
@@ -106,14 +103,14 @@ class Table:
 
     @property
     def where(self) -> str:
-        """What a message puts after the path."""
+        """The place that a message names after the path."""
         return self.line or (f"{self.source}: " if self.source else "")
 
     def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
         """The columns of the fields. Raises UserError."""
         count = math.prod(self.members[fields[0].key].shape)
-        for one in fields:
-            member, column = self.members[one.key], f"{path}: {self.where}column '{one.name}'"
+        for wanted in fields:
+            member, column = self.members[wanted.key], f"{path}: {self.where}column '{wanted.name}'"
             if len(member.shape) != 1:
                 raise UserError(f"{column} has {len(member.shape)} dimensions, not one")
             if member.dtype.kind not in "iuf":
@@ -131,9 +128,9 @@ class Table:
             raise UserError(f"{path}: {self.where}row {row + 1}: {column}{what}")
 
         started, columns = 0.0, list[NDArray[np.float64]]()
-        for one in fields:
-            array = self.members[one.key].read()
-            if one.name == "t" and array.dtype.kind in "iu":
+        for wanted in fields:
+            array = self.members[wanted.key].read()
+            if wanted.name == "t" and array.dtype.kind in "iu":
                 # Time since an epoch in ns does not fit a float64; a difference of two int64 fits a uint64.
                 bits = array.astype(np.uint64 if array.dtype.kind == "u" else np.int64).view(np.uint64)
                 back, started = array[1:] < array[:-1], float(array[0])
@@ -171,8 +168,7 @@ def of_groups(
 
 def left_out(names: Sequence[str], by: str) -> tuple[str, ...]:
     """The note on channels that are left out, if there are any. `by`: what their values take that is not done."""
-    more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
-    named = f"{', '.join(map(short, names[:_MOST_NAMED]))}{more}"
+    named = few(list(map(short, names)), 6)
     return (f"left out: {named}: their values come by {by}: export them as physical values",) if names else ()
 
 

@@ -18,8 +18,8 @@ from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import TIMES
 from selfcal.logs.loaders.table import Hints, Table, heading, left_out, of_groups
 
-#: Bytes before a segment's content; the bit of its second number that says in which order the others' bytes are.
-_LEAD, _BIG_ENDIAN, _NEVER_ENDED = 28, 1 << 6, 2**64 - 1
+#: Bytes before a segment's content.
+_LEAD = 28
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -84,8 +84,8 @@ def _cut(path: Path) -> Damaged:
             head = stream.read(_LEAD)
             if len(head) < _LEAD or head[:4] != b"TDSm":
                 return Damaged(size - at, 1)
-            length = int.from_bytes(head[12:20], "big" if head[4] & _BIG_ENDIAN else "little")
-            if length == _NEVER_ENDED:  # the writer did not come to its end
+            length = int.from_bytes(head[12:20], "big" if head[4] & 0x40 else "little")
+            if length == 2**64 - 1:  # the writer did not come to its end
                 return Damaged()
             at += _LEAD + length
     return Damaged(at - size, 1, at) if at > size else Damaged()

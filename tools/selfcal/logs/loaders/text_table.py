@@ -38,9 +38,6 @@ from selfcal.base.limits import (
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import RECEIVED, number_of
 
-#: Bytes of a file from which on reading it shows its progress.
-_SLOW_BYTES = 1 << 26
-
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
 #: What begins a comment.
 _COMMENT = re.compile(r"\s*(#|//|%)[#/% \t]*")
@@ -79,17 +76,15 @@ _NO_TEXT = re.compile("[\0\udc80-\udcff]")
 _SINGLE = {0xDC00 + code: chr(code) for code in b"\xa0\xb0\xb2\xb3\xb5\xb7\xb9\xba"}
 #: Texts in UTF-16, by the mark that they begin with.
 _WIDE = {codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM_UTF16_BE: "utf-16-be"}
-#: Lines that may be skipped at least, and their share at most, before a file is no recording.
-_SKIPPED_LEAST, _SKIPPED_MOST = 1000, 0.5
 
 
 #: A sampling rate in a comment, as Xsens writes it.
 _RATE = re.compile(r"(?:sampl\w+|update|output|data)[ _]?rate\W{1,4}(\d+(?:\.\d+)?) ?Hz", re.ASCII | re.IGNORECASE)
 
-#: Rows in which the sensors that take turns are looked for, so many sensors at most, and their names.
-LOOKED_AT, _MOST_NUMBERED, _WORD = 1000, 16, re.compile(r"\w[\w ./:-]{0,59}")
-#: Turns of a sensor at least, its rows in one turn at most, and how many times as many another may have.
-_TURNS, _LONGEST_TURN, _SELDOM = 5, 64, 8
+#: Rows in which the sensors that take turns are looked for, and their names.
+LOOKED_AT, _WORD = 1000, re.compile(r"\w[\w ./:-]{0,59}")
+#: Turns of a sensor at least.
+_TURNS = 5
 
 #: What opens a text in an archive: its bytes, and its packed size.
 Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
@@ -143,7 +138,7 @@ class TextReader:
         #: The column that numbers the sensors, and the cell of the one that is read.
         self._only: tuple[int, str] | None = None
         self.where = f"line {number}: "
-        headings = self._stated(self._headings(header))
+        headings = self._stated(_words(header) if self._separator == " " else header.split(self._separator))
         if len(headings) == len(self._cells(self._batch[0])) + 1 and headings[-1].strip().lower() == _COMMENT_OF_ROWS:
             del headings[-1]  # of LabVIEW, which writes the comment of a row only where there is one
         cells = self._cells(self._batch[0])
@@ -302,7 +297,7 @@ class TextReader:
         return text, header + 1, row + 1
 
     def _separated(self, header: str, row: str, number: int) -> str:
-        """What separates columns: the one sign of the header that splits the first row in as many cells."""
+        """The separator of columns: the one sign of the header that splits the first row in as many cells."""
         found = [sign for sign in _SEPARATORS if sign in header]
         if len(found) > 1:
             fitting = [sign for sign in found if row.count(sign) == header.count(sign)]
@@ -318,9 +313,6 @@ class TextReader:
         if self._separator == "," and _THOUSANDS.search(line):
             line = _THOUSANDS.sub(lambda cell: cell[0].replace(",", ""), line)
         return line.split() if self._separator == " " else line.split(self._separator)
-
-    def _headings(self, line: str) -> list[str]:
-        return _words(line) if self._separator == " " else line.split(self._separator)
 
     def _stated(self, headings: list[str]) -> list[str]:
         """The headings with the units that the cells of the first row have after their numbers: `0.02 sec`."""
@@ -409,7 +401,8 @@ class TextReader:
                     self._fail(row + number, None if bad.place is None else names[bad.place][1], bad.what)
                 self._skipped.append(row + number)
                 self.damaged += Damaged(len(line) + 1, 1)
-                if len(self._skipped) > _SKIPPED_LEAST + _SKIPPED_MOST * (row + number):
+                # With more lines skipped a file is no recording.
+                if len(self._skipped) > 1000 + 0.5 * (row + number):
                     raise UserError(
                         f"{self.path}: line {self._row + row + number}: {len(self._skipped)} lines so far are no rows "
                         f"of its columns; this one: {bad.what}"
@@ -485,7 +478,7 @@ def in_turn(keys: Sequence[str], columns: Sequence[Sequence[str]]) -> list[tuple
     numbering = number_of(keys)
     for key, cells in zip(keys, columns, strict=True):
         found = list(dict.fromkeys(cells))
-        if not 1 < len(found) <= _MOST_NUMBERED < len(cells) / 4 or not all(map(_WORD.fullmatch, found)):
+        if not 1 < len(found) <= 16 < len(cells) / 4 or not all(map(_WORD.fullmatch, found)):
             continue
         if key == numbering or not (any(map(_ROW.fullmatch, found)) or _keeps(cells)):
             return [(key, cell) for cell in found]
@@ -496,7 +489,8 @@ def _keeps(cells: Sequence[str]) -> bool:
     """Whether the words of a column last for many rows, come seldom, or come at random: they are no sensors."""
     runs = [len(list(run)) for _, run in groupby(cells)]
     rows_of = sorted(map(cells.count, set(cells)))
-    if len(runs) < _TURNS or sorted(runs)[len(runs) // 2] > _LONGEST_TURN or rows_of[0] * _SELDOM < rows_of[-1]:
+    # A sensor has five turns or more, of at most 64 rows each, and no other has eight times as many rows.
+    if len(runs) < _TURNS or sorted(runs)[len(runs) // 2] > 64 or rows_of[0] * 8 < rows_of[-1]:
         return True
     for word in set(cells):
         rows = [row for row, cell in enumerate(cells) if cell == word]
@@ -619,7 +613,7 @@ def _opened(path: Path, files: ExitStack) -> tuple[BinaryIO, int]:
         raise UserError(f"{path}: the file is empty")
     size = path.stat().st_size
     console = Console(stderr=True)
-    if size > _SLOW_BYTES and console.is_terminal:
+    if size > (1 << 26) and console.is_terminal:
         progress = wrap_file(raw, size, description="reading", console=console, transient=True)
         raw = files.enter_context(progress)
     if path.suffix.lower() == ".gz":

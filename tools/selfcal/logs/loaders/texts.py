@@ -37,7 +37,7 @@ class Text:
     open: Opened | None = None
 
 
-#: Of a line of headings whether one of them is known.
+#: Whether a line of headings has a known one.
 Knows = Callable[[Sequence[str]], bool]
 
 
@@ -57,10 +57,10 @@ class TextTable(Table):
             reader = TextReader(path, files, self.knows(self.text), skip_bad=self.skip_bad, opened=self.text.open)
             if self.only is not None:
                 reader.only(*self.only)
-            dated = next((place for place, one in enumerate(fields) if one.dates), None)
-            pairs = [(one.key, one.name) for one in fields]
-            read = reader.columns(pairs, [one.optional for one in fields], dated)
-        fields = [one for one, column in zip(fields, read, strict=True) if column is not None]
+            dated = next((place for place, wanted in enumerate(fields) if wanted.dates), None)
+            pairs = [(field.key, field.name) for field in fields]
+            read = reader.columns(pairs, [wanted.optional for wanted in fields], dated)
+        fields = [wanted for wanted, column in zip(fields, read, strict=True) if column is not None]
         columns = [column for column in read if column is not None]
         rows = columns[0].size
         if meta.get("rows", rows + reader.skipped) != rows + reader.skipped:
@@ -99,7 +99,7 @@ def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Tab
         beside = meta_place(text.path)
         meta = parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text")) if beside.is_file() else {}
         for only in turns or (None,):
-            source = "/".join(one for one in (text.source, ":".join(only or ())) if one)
+            source = "/".join(wanted for wanted in (text.source, ":".join(only or ())) if wanted)
             found.append(
                 TextTable(
                     source, {}, meta, name=text.name, headings=reader.keys, before=reader.before, line=reader.where,
@@ -126,8 +126,8 @@ def texts_in(path: Path) -> list[Text]:
     if len(found) > MOST_COLUMNS:
         raise UserError(f"{path}: more than {MOST_COLUMNS} tables")
     for names in _BETTER:
-        there = [name for name in names if any(one.source.lower() == name for one in found)]
-        found = [one for one in found if one.source.lower() not in there[1:]]
+        there = [name for name in names if any(wanted.source.lower() == name for wanted in found)]
+        found = [wanted for wanted in found if wanted.source.lower() not in there[1:]]
     if not found:
         raise UserError(f"{path}: no table ({', '.join(TEXT)}) is in the zip")
     return found

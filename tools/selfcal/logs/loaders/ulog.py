@@ -19,8 +19,8 @@ from selfcal.logs.loaders.damage import Bytes, mapped, sifted
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 Columns = dict[str, NDArray[Any]]
-#: Bytes before the first message, the kinds of messages, and bytes of the types of fields.
-_HEADER, _KINDS = 16, b"BFIMPQARDLCSO"
+#: Kinds of messages, and bytes of the types of fields.
+_KINDS = b"BFIMPQARDLCSO"
 _TYPES = {b"float": 4, b"double": 8, b"bool": 1, b"char": 1} | {
     f"{sign}int{bits}_t".encode(): bits // 8 for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
@@ -40,7 +40,8 @@ def read(path: Path, _: Hints) -> list[Table]:
     from pyulog import ULog
 
     with mapped(path) as data:
-        damaged, sound = sifted(data, _HEADER, _ends(data))
+        # A header of 16 bytes goes before the first message.
+        damaged, sound = sifted(data, 16, _ends(data))
     with path.open("rb") if sound is None else BytesIO(sound) as stream:
         log = ULog(stream, [*_SOURCES, "sensor_selection"])
     found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
@@ -49,7 +50,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         found.setdefault((_SOURCES[one.name], one.multi_id), {})[one.name] = one.data
     if not found:
         raise UserError(f"{path}: no topic {', '.join(_SOURCES)}")
-    lost = [one.duration for one in log.dropouts]
+    lost = [dropout.duration for dropout in log.dropouts]
     notes = (f"the logger dropped out {len(lost)} times, {sum(lost) / 1000:.3g} s together",) if lost else ()
     serial = log.msg_info_dict.get("sys_uuid", "")
     meta = {"serial": serial} if isinstance(serial, str) and serial else {}
@@ -128,7 +129,7 @@ def _triad(letter: str, values: Sequence[NDArray[Any]]) -> Columns:
 
 
 def _rate(data: Mapping[str, NDArray[Any]], name: str, place: int) -> NDArray[np.float64]:
-    """An increment over the interval that it was summed over, us; NaN where that is none."""
+    """An increment over the interval that it was summed over, us; NaN for an interval of 0."""
     interval = np.asarray(data[f"{name}_dt"], np.float64) * 1e-6
     increment = np.asarray(data[f"{name}[{place}]"], np.float64)
     return np.asarray(np.where(interval > 0.0, increment / np.where(interval > 0.0, interval, 1.0), np.nan))

@@ -10,8 +10,6 @@ from selfcal.adequacy.allan import overlapping
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Peak, Problem, Value, maximum, weights
 
-#: Largest distance of a slope from +-1/2: half-way to the flat part.
-SLOPE_TOLERANCE = 0.25
 #: Shortest record part that a point averages over: fewer windows say nothing.
 WINDOWS = 5
 
@@ -34,7 +32,8 @@ def slopes(problem: Problem) -> Answer:
     m, deviation, _ = curve(problem)
     ln_tau, ln_deviation = np.log(m * problem.dt_s), np.log(deviation)
     slope = np.gradient(ln_deviation, ln_tau) if m.size > 1 else np.array([-0.5])
-    falling, rising = np.abs(slope + 0.5) <= SLOPE_TOLERANCE, np.abs(slope - 0.5) <= SLOPE_TOLERANCE
+    # A slope within 1/4 of +-1/2 is half-way to the flat part.
+    falling, rising = np.abs(slope + 0.5) <= 0.25, np.abs(slope - 0.5) <= 0.25
     falling &= np.cumsum(~falling) == 0  # the first stretch alone: later points may fall by chance
     if not falling.any():
         falling[0] = True

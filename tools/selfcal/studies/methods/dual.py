@@ -17,8 +17,6 @@ from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value, ln_moments, logarithmic
 from selfcal.studies.methods.recursive import FORGET, KEEP
 
-#: Mean and variance of ln chi^2 of one degree of freedom.
-LN_MEAN, LN_VARIANCE = -1.270363, 0.5 * math.pi**2
 #: The parameters stay within this many sd of the prior's mean: a poor first step leads no further.
 REACH = 3.0
 #: Least square with a logarithm, a part of the innovation variance.
@@ -54,8 +52,10 @@ def _run(problem: Problem, law: str) -> dict[str, Value]:
         S, dS = float(PH @ ROW) + R, dPH @ ROW + dR
         e, de = value - float(x @ ROW), -dx @ ROW
         seen = np.array([-de, dS / S])
-        surprise = np.array([e, math.log(max(e * e / S, LEAST)) - LN_MEAN])
-        total = seen @ covariance @ seen.T + np.diag([S, LN_VARIANCE])
+        # Less the mean of ln chi^2 of one degree of freedom.
+        surprise = np.array([e, math.log(max(e * e / S, LEAST)) + 1.270363])
+        # With the variance of that ln chi^2.
+        total = seen @ covariance @ seen.T + np.diag([S, (0.5 * math.pi**2)])
         gain = np.linalg.solve(total, seen @ covariance).T
         ln = np.clip(ln + gain @ surprise, middle - REACH * sd, middle + REACH * sd)
         covariance = covariance - gain @ total @ gain.T

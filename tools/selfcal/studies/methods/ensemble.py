@@ -20,8 +20,6 @@ from selfcal.studies.methods.problem import Answer, Floats, Problem
 
 #: The method that errors are compared with.
 REFERENCE = "ml"
-#: Resamples of the paired bootstrap, and their seed.
-RESAMPLES, BOOTSTRAP_SEED = 2000, 1
 #: A law's weight counts as this at least: the log score of a sure and wrong choice stays finite.
 LEAST_WEIGHT = 1e-6
 
@@ -150,9 +148,7 @@ def _ratio(ours: Floats, theirs: Floats) -> tuple[float, float, float]:
     """Ratio of two rms errors of the same records, with 2.5 % and 97.5 % of a bootstrap that resamples the records."""
     if not ours.size or not theirs.any():
         return math.nan, math.nan, math.nan
-    counts = np.random.default_rng(BOOTSTRAP_SEED).multinomial(
-        ours.size, np.full(ours.size, 1.0 / ours.size), RESAMPLES
-    )
+    counts = np.random.default_rng(1).multinomial(ours.size, np.full(ours.size, 1.0 / ours.size), 2000)
     drawn = np.sqrt((counts @ ours**2) / (counts @ theirs**2))
     low, high = np.quantile(drawn, [0.025, 0.975])
     return _rms(ours) / _rms(theirs), float(low), float(high)

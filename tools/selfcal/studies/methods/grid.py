@@ -14,8 +14,8 @@ from selfcal.model.file import Prior
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, probabilities
 
-#: Nodes: of the ratio for a walk, of the ratio and of alpha, and of the white noise within its likelihood's width.
-WALK, MARKOV, NOISE = 160, (110, 40), 41
+#: Nodes of the ratio and of alpha, and of the white noise within its likelihood's width.
+MARKOV, NOISE = (110, 40), 41
 #: Width of the grid of white noise, in standard deviations of ln sigma_v.
 REACH = 7.0
 
@@ -48,7 +48,7 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     if law != "constant":
         drift = priors[NAMED[law].parameters[1]]
         low, high = ln_limits(drift)
-        ln_ratio = np.linspace(low - noise[1], high - noise[0], WALK if law == "random_walk" else MARKOV[0])
+        ln_ratio = np.linspace(low - noise[1], high - noise[0], 160 if law == "random_walk" else MARKOV[0])
     if law == "gauss_markov":
         ln_alpha = np.linspace(*ln_limits(priors["alpha"]), MARKOV[1])
         ends = np.where((np.arange(MARKOV[1]) % (MARKOV[1] - 1)) == 0, 0.5, 1.0)

@@ -17,8 +17,8 @@ Begin = Callable[[Problem, str, Floats, np.random.Generator], Floats]
 #: ln likelihood [particles] of a reading and the state after it, from the same, the state and the reading.
 Step = Callable[[Problem, str, Floats, Floats, float, np.random.Generator], tuple[Floats, Floats]]
 
-#: Particles a law; the seed of the draws.
-PARTICLES, SEED = 2000, 1
+#: Particles a law.
+PARTICLES = 2000
 #: Liu & West's discount of 0.99: the kernel keeps the parameters' mean and variance.
 SHRINK = (3.0 * 0.99 - 1.0) / (2.0 * 0.99)
 
@@ -41,7 +41,7 @@ def answer(problem: Problem, begin: Begin, step: Step) -> Answer:
 def filtered(problem: Problem, law: str, begin: Begin, step: Step) -> tuple[Floats, Floats, float]:
     """ln parameters [d, particles], their weights, and the ln evidence of all samples but the first, which gives the
     level."""
-    rng = np.random.default_rng(SEED)
+    rng = np.random.default_rng(1)
     ln_theta = np.array([_draw(problem.group.priors[name], rng) for name in NAMED[law].parameters])
     state = begin(problem, law, ln_theta, rng)
     ln_weight = np.zeros(PARTICLES)

@@ -13,12 +13,8 @@ import numpy as np
 from selfcal.studies.methods.arma_form import of_coefficients
 from selfcal.studies.methods.problem import Answer, Floats, Problem
 
-#: Start of the covariance of the coefficients: a thousand times their greatest square.
-START = 1e3
 #: Forgetting of the first sample, and the share that each further sample keeps of it: the early errors are poor.
 FORGET, KEEP = 0.05, 0.99
-#: A root of the error polynomial beyond it has no stable filter.
-STABLE = 0.99
 
 
 def recursive_least_squares(problem: Problem) -> Answer:
@@ -36,11 +32,11 @@ def coefficients(y: Floats, *, pole: bool) -> tuple[float, float, float]:
     """phi, theta and the variance of e in y[k] = phi y[k-1] + e[k] + theta e[k-1] + constant, in one pass. Without a
     `pole` phi is 1 for the sum of y and there is no constant."""
     d = 3 if pole else 1
-    x, P, gradient = np.zeros(d), START * np.eye(d), np.zeros(d)
+    x, P, gradient = np.zeros(d), 1e3 * np.eye(d), np.zeros(d)
     last, e, square, forget = 0.0, 0.0, 0.0, FORGET
     for value in y.tolist():
         row = np.array([e, last, 1.0][:d])
-        gradient = row - min(max(float(x[0]), -STABLE), STABLE) * gradient
+        gradient = row - min(max(float(x[0]), -0.99), 0.99) * gradient
         error = value - float(row @ x)
         x, P = update(x, P, gradient, error, 1.0 - forget)
         last, e = value, value - float(row @ x)

@@ -48,7 +48,7 @@ TRUTHS = {
 }
 #: A computed rms is consistent if it is this near to the real one; of SCATTER records that is 2.4 standard errors.
 NEAR = 1.25
-#: A median so many times the middle one, or as much below, is named.
+#: Factor between a median and the middle one from which on its record is named.
 FAR_OFF = 2.0
 #: Section 4.2, four areas: rms in mGal, correlation interval in min, white noise in mGal. The paper's Fig. 8 has 1 to
 #: 2, 50 to 200 and below 0.012. It does not give the interval between samples.
@@ -86,7 +86,7 @@ def _drawn(law: str, truth: Mapping[str, float], seed: int, count: int) -> list[
 
 @dataclass(frozen=True)
 class Rms:
-    """Of the logarithm of a parameter over an ensemble, at ALLAN_MARKS: the error, and what the method computes."""
+    """rms of the logarithm of a parameter over an ensemble, at ALLAN_MARKS: real, and as the method computes it."""
 
     real: Array
     computed: Array
@@ -129,7 +129,7 @@ def linear(model: Model, truth: Mapping[str, float], seed: int) -> dict[str, Rms
 
 
 def by_allan(model: Model, law: str, seed: int) -> dict[tuple[str, str], Rms]:
-    """The same of the Allan fit, its estimates kept within the bank's prior."""
+    """Errors of the Allan fit as `by_bank` has them, its estimates kept within the bank's prior."""
     group = replace(model.group_of(AXIS), axes=(AXIS,))
     laws = tuple(model.hypotheses)
     drawn = _drawn(law, TRUTHS[law], seed, SCATTER)
@@ -177,7 +177,7 @@ def _far_off(titles: Iterable[str], last_of: Mapping[str, Sequence[Estimate]]) -
     still have medians far apart."""
     said = []
     for name, estimates in last_of.items():
-        times = np.array([one.median for one in estimates]) / np.median([one.median for one in estimates])
+        times = np.array([estimate.median for estimate in estimates]) / np.median([one.median for one in estimates])
         k = int(np.argmax(np.abs(np.log(times))))
         if max(times[k], 1.0 / times[k]) > FAR_OFF:
             factor = f"{times[k]:.2g} times" if times[k] > 1.0 else f"1/{1.0 / times[k]:.2g} of"
@@ -409,7 +409,7 @@ def _stated(value: Value) -> float:
 
 
 def map_tables(model: Model) -> Tables:
-    """Of the axis `gravity` of paper.yaml, at the interval of Section 4.2."""
+    """Tables of the axis `gravity` of paper.yaml, at the interval of Section 4.2."""
     return make_tables(model, 1.0 / AREA_STEP_S, ("gravity",), bank_rate_hz=1.0 / AREA_STEP_S)
 
 

@@ -26,10 +26,10 @@ from selfcal.show.chart import Curve, Figure, Panel
 from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section4 import AREA_SAMPLES, AREA_STEP_S, MGAL, map_tables, of_map_error
 
-#: The field: rms, mGal, and length, km. The vessel: km between readings of AREA_STEP_S, at 8 knots.
-FIELD_MGAL, FIELD_KM, STEP_KM = 10.0, 12.0, 8.0 * 1.852 * AREA_STEP_S / 3600.0
-#: A track's own errors: slow ones, mGal and min, and white noise, mGal.
-SLOW_MGAL, SLOW_MIN, NOISE_MGAL = 1.0, 150.0, 0.01
+#: The field: rms, mGal, and length, km.
+FIELD_MGAL, FIELD_KM = 10.0, 12.0
+#: A track's own errors: slow ones over 150 min, and white noise, mGal.
+SLOW_MGAL, NOISE_MGAL = 1.0, 0.01
 #: Areas: tracks, all over the same width, km.
 TRACKS = {"area 1": 9, "area 2": 13, "area 3": 17, "area 4": 25}
 WIDTH_KM = 24.0
@@ -39,14 +39,15 @@ DRAWN = 4
 
 def left_out(tracks: int, rng: np.random.Generator) -> Array:
     """Differences of each track from the map of all others, mGal, [tracks, AREA_SAMPLES]."""
-    along, across = np.arange(AREA_SAMPLES) * STEP_KM, np.linspace(0.0, WIDTH_KM, tracks)
+    # The vessel makes 8 knots.
+    along, across = np.arange(AREA_SAMPLES) * (8.0 * 1.852 * AREA_STEP_S / 3600.0), np.linspace(0.0, WIDTH_KM, tracks)
     x, y = (grid.ravel() for grid in np.meshgrid(along, across))
     far = np.hypot(x[:, None] - x, y[:, None] - y) / FIELD_KM
     field = FIELD_MGAL**2 * (1.0 + far) * np.exp(-far)
     count = x.size
     # A covariance of smooth fields is singular but for rounding: 1e-9 of it is 0.6 microgal.
     truth = np.linalg.cholesky(field + 1e-9 * FIELD_MGAL**2 * np.eye(count)) @ rng.standard_normal(count)
-    steps = AREA_STEP_S / 60.0 / SLOW_MIN * np.abs(np.subtract.outer(np.arange(AREA_SAMPLES), np.arange(AREA_SAMPLES)))
+    steps = AREA_STEP_S / 60.0 / 150.0 * np.abs(np.subtract.outer(np.arange(AREA_SAMPLES), np.arange(AREA_SAMPLES)))
     slow = rng.standard_normal((tracks, AREA_SAMPLES)) @ np.linalg.cholesky(SLOW_MGAL**2 * np.exp(-steps)).T
     measured = truth + slow.ravel() + NOISE_MGAL * rng.standard_normal(count)
     return differences(field + (SLOW_MGAL**2 + NOISE_MGAL**2) * np.eye(count), measured, tracks)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,9 @@ from rich import box
 from rich.table import Table
 
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of, plotter, save_picture
+from selfcal.base.output import console_of, plotter, print_line, save_picture
 from selfcal.base.units import STANDARD_GRAVITY
-from selfcal.calibration.document import side_of
+from selfcal.calibration.tumble_document import side_of
 
 #: By group of parameters, in data sheets' units: word, unit, factor, and what is taken off before.
 SHEET = {
@@ -33,13 +34,10 @@ SHEET = {
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """The tables of both sensors, what is not identified, and what the residuals say."""
     console = console_of(to_stderr=to_stderr)
-
-    def line(text: str) -> None:
-        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
-
-    turns = [one for one in document["turns"] if one["left_out"] is None]
+    line = partial(print_line, console)
+    turns = [turn for turn in document["turns"] if turn["left_out"] is None]
     line(f"{len(document['rests'])} rests, {len(turns)} turns")
-    line(f"up, rest by rest: {', '.join(side_of(np.array(one['up'])) for one in document['rests'])}")
+    line(f"up, rest by rest: {', '.join(side_of(np.array(rest['up'])) for rest in document['rests'])}")
     gravity = document["gravity"]
     line(f"gravity {gravity['value']:.6g} m/s^2 ({gravity['source']}); scales take its error, which no rest shows")
     for sensor in ("accelerometer", "gyroscope"):
@@ -50,7 +48,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         if "error" in found:
             line(f"gyroscope: {found['error']}")
             continue
-        drift = dict.fromkeys(one["drift"] for name, one in document["noise"].items() if name[0] == sensor[0])
+        drift = dict.fromkeys(entry["drift"] for name, entry in document["noise"].items() if name[0] == sensor[0])
         line("")
         line(f"{sensor}; drift of the bias: {'; '.join(drift)}")
         if sensor == "gyroscope" and not document["earth_rate_known"]:
@@ -62,10 +60,10 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             table.add_column(heading, no_wrap=True, justify="right" if heading in ("median", "5 %", "95 %") else "left")
         for group in (key for of, key in SHEET if of == sensor and key in found):
             word, unit, size, zero = SHEET[sensor, group]
-            for name, one in found[group].items():
-                if one["identified"]:
-                    digits = max(0, 1 - math.floor(math.log10(max(size * one["sd"], 1e-12))))
-                    cells = [f"{size * (one[at] - zero):.{digits}f}" for at in ("median", "q05", "q95")]
+            for name, entry in found[group].items():
+                if entry["identified"]:
+                    digits = max(0, 1 - math.floor(math.log10(max(size * entry["sd"], 1e-12))))
+                    cells = [f"{size * (entry[at] - zero):.{digits}f}" for at in ("median", "q05", "q95")]
                     table.add_row(word, name, *cells, unit)
                 else:
                     table.add_row(word, name, "not identified", "", "", unit)
@@ -80,8 +78,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             line("residuals: " + (f"{size:.2f} of their sd, " if size is not None else "") + said)
         if found["adequate"] is False and not found["findings"]:
             line("  no single rest or turn, no square and no hysteresis explains it")
-        for one in found["findings"][:3]:
-            line(f"  {one['cause']} (by chance {one['p']:.1g})")
+        for entry in found["findings"][:3]:
+            line(f"  {entry['cause']} (by chance {entry['p']:.1g})")
     for text in document["notes"]:
         line(f"note: {text}")
 
@@ -95,7 +93,7 @@ def plot(document: Mapping[str, Any], path: Path | str) -> None:
     residual, sd = (micro * np.array([one[key] for one in rests]) for key in ("residual", "sd"))
     axes.axhline(0.0, color="0.6", linewidth=0.8)
     axes.errorbar(at, residual, 1.645 * sd, fmt="o", markersize=4, capsize=3, linewidth=1)
-    axes.set_xticks(at, [side_of(np.array(one["up"])) for one in rests], rotation=60, fontsize=8)
+    axes.set_xticks(at, [side_of(np.array(rest["up"])) for rest in rests], rotation=60, fontsize=8)
     axes.set_xlabel("side that is up, rest by rest")
     axes.set_ylabel("|f| - g, ug")
     axes.set_title(

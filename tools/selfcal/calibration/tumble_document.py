@@ -7,18 +7,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.document import recording_entry
 from selfcal.bank.result import HALF_90
+from selfcal.base.grid import Array
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
-from selfcal.calibration.fit import FALSE_ALARM, IDENTIFIED, Fit
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.rests import ACCEL, GYRO, Tumble
+from selfcal.calibration.tumble_fit import FALSE_ALARM, IDENTIFIED, Fit
 from selfcal.logs.recording import Recording
-
-Array = NDArray[np.float64]
 
 SCHEMA = "selfcal.tumble/1"
 AXES = ("x", "y", "z")
@@ -34,36 +32,36 @@ OF_GYRO = (
     *(("scale", name, "1") for name in GYRO),
     *(("misalignment", AXES[row] + AXES[column], "rad") for row, column in gyroscope.PLACES),
 )
-#: A turn that ends within this angle of where it began, and is longer than that angle, tells little, rad.
-SAME_SIDE, TURNED = math.radians(15.0), math.radians(30.0)
-#: Positions that would mend a calibration: at most so many are named.
-MOST_NAMED = 4
 
 
 def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyroscope | str | None) -> dict[str, Any]:
     """The whole answer, in SI units and degrees. `gyro`: None without gyros, a line where they have no answer."""
     place, tumble = accel.place, accel.tumble
-    notes = [*tumble.notes, *(f"{one}: left out" for one in tumble.left_out), *_told_of_turns(accel)]
+    notes = [*tumble.notes, *(f"{text}: left out" for text in tumble.left_out), *_told_of_turns(accel)]
     return {
         "schema": SCHEMA,
-        "recordings": [recording_entry(one) for one in recordings],
+        "recordings": [recording_entry(recording) for recording in recordings],
         "gravity": {"value": place.gravity, "sd": place.sd, "unit": "m/s^2", "source": place.words},
         "earth_rate_known": place.vertical is not None,
         "bias_at_s": accel.tumble.reference_s,
         "noise": {
-            name: {"N": math.sqrt(one.white), "unit": _density(name), "drift": one.words}
-            for name, one in tumble.noise.items()
-            if one.words
+            name: {
+                "N": math.sqrt(noise.white),
+                "unit": "m/s^2/sqrt(Hz)" if name in ACCEL else "rad/s/sqrt(Hz)",
+                "drift": noise.words,
+            }
+            for name, noise in tumble.noise.items()
+            if noise.words
         },
         "rests": _rests(accel),
         "turns": [
             {
-                "start_s": tumble.rests[one.first].at_s[1],
-                "end_s": tumble.rests[one.first + 1].at_s[0],
-                "log": tumble.rests[one.first].log,
-                "left_out": one.reason or None,
+                "start_s": tumble.rests[turn.first].at_s[1],
+                "end_s": tumble.rests[turn.first + 1].at_s[0],
+                "log": tumble.rests[turn.first].log,
+                "left_out": turn.reason or None,
             }
-            for one in tumble.turns
+            for turn in tumble.turns
         ],
         "accelerometer": {
             **_entries(accel.fit, 0, OF_ACCEL),
@@ -83,10 +81,6 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
         },
         "notes": notes,
     }
-
-
-def _density(name: str) -> str:
-    return "m/s^2/sqrt(Hz)" if name in ACCEL else "rad/s/sqrt(Hz)"
 
 
 def _entry(fit: Fit, at: int, unit: str, size: float) -> dict[str, Any]:
@@ -138,15 +132,15 @@ def _rests(accel: Accelerometer) -> list[dict[str, Any]]:
     sd = np.sqrt(np.diag(fit.root @ fit.root.T))
     return [
         {
-            "log": one.log,
-            "start_s": one.at_s[0],
-            "end_s": one.at_s[1],
+            "log": rest.log,
+            "start_s": rest.at_s[0],
+            "end_s": rest.at_s[1],
             "up": (f[k] / size[k]).tolist(),
             "residual": float(residual[k]),
             "sd": float(sd[k]),
             "unit": "m/s^2",
         }
-        for k, one in enumerate(tumble.rests)
+        for k, rest in enumerate(tumble.rests)
     ]
 
 
@@ -161,13 +155,13 @@ def _positions(accel: Accelerometer) -> list[str]:
     if fit.identified[own].all():
         return []
     rests = accel.tumble.rests
-    seconds = float(np.median([one.seconds for one in rests]))
+    seconds = float(np.median([rest.seconds for rest in rests]))
     white = max(accel.tumble.noise[name].white for name in ACCEL) / seconds
     noise = white + max(np.diag(accel.fit.root @ accel.fit.root.T).mean(), 0.0)
     covariance, named = fit.widened(), []
     inverse = np.linalg.inv(accel.matrix)
     candidates = [np.array(c, float) for c in np.ndindex(3, 3, 3) if 1 <= sum(abs(one - 1) for one in c) <= 2]
-    for _ in range(MOST_NAMED):
+    for _ in range(4):
         best, gained = None, 0.0
         weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
         for c in candidates:
@@ -210,13 +204,14 @@ def _told_of_turns(accel: Accelerometer) -> list[str]:
     tumble, told = accel.tumble, []
     f = accel.force(tumble.accel, tumble.warmth)
     u = f / np.linalg.norm(f, axis=1)[:, None]
-    for one in tumble.turns:
-        where = f"turn of {tumble.rests[one.first].at_s[1]:.6g} to {tumble.rests[one.first + 1].at_s[0]:.6g} s"
-        if one.reason:
-            told.append(f"{where}: {one.reason}: left out")
+    for turn in tumble.turns:
+        where = f"turn of {tumble.rests[turn.first].at_s[1]:.6g} to {tumble.rests[turn.first + 1].at_s[0]:.6g} s"
+        if turn.reason:
+            told.append(f"{where}: {turn.reason}: left out")
             continue
-        way = float(np.linalg.norm(one.gyro - tumble.rests[one.first].gyro, axis=1).sum()) * one.dt
-        apart = math.acos(float(np.clip(u[one.first] @ u[one.first + 1], -1.0, 1.0)))
-        if way > TURNED and apart < SAME_SIDE:
+        way = float(np.linalg.norm(turn.gyro - tumble.rests[turn.first].gyro, axis=1).sum()) * turn.dt
+        apart = math.acos(float(np.clip(u[turn.first] @ u[turn.first + 1], -1.0, 1.0)))
+        # A turn of more than 30 deg that ends within 15 deg of where it began tells little.
+        if way > math.radians(30.0) and apart < math.radians(15.0):
             told.append(f"{where}: {math.degrees(way):.0f} deg, and the same side is up: it tells little")
     return told

@@ -10,23 +10,22 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable
-from selfcal.base.output import console_of
+from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
+from selfcal.base.output import console_of, print_line
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import Noise, of_model
 from selfcal.calibration.rests import ACCEL, CUT_S, GYRO, PIECES, REST_S, UNITS, Rest, Tumble
 from selfcal.model.file import Model
-
-Array = NDArray[np.float64]
 
 SCHEMA = "selfcal.plan_tumble/1"
 #: Sides that are up, by rests: six flats; an edge pair in each plane as well; and the edges opposite and six corners.
@@ -41,8 +40,6 @@ LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
 #: A hand places the part off by so much, rad, sd of each of two angles. Placements that are drawn, and the share of
 #: them that have what is planned.
 PLACED, DRAWN, SHARE = math.radians(3.0), 10, 0.9
-#: Share of the mean square of a drift that is not known: from the top of three decades to their middle.
-MIDDLE = 0.014
 #: What may be wished: the sensor, the unit here, and where the sensor's parameters are.
 WISHES = {
     "accelerometer bias": ("accelerometer", "m/s^2", accelerometer.BIAS),
@@ -93,7 +90,8 @@ def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
         group = model.group_of(name)
         N = group.priors["N"].median * units.factor(group.unit, UNITS[name])
         own = of_model(model, name, UNITS[name], N)
-        noise[name] = replace(own.scaled(np.full(len(own.terms), MIDDLE)), wide=False)
+        # A drift that is not known: from the top of three decades to their middle.
+        noise[name] = replace(own.scaled(np.full(len(own.terms), 0.014)), wide=False)
     random = np.random.default_rng(count)
     found = [_of_placement(noise, _placed(random, POSITIONS[count]), length_s) for _ in range(DRAWN)]
     return {name: sorted(one[name] for one in found)[math.ceil(SHARE * DRAWN) - 1] for name in WISHES}
@@ -110,7 +108,7 @@ def _placed(random: np.random.Generator, positions: Sequence[tuple[int, int, int
 
 
 def _of_placement(noise: dict[str, Noise], readings: Array, length_s: float) -> dict[str, float]:
-    """The same for one placement with readings [n, 3]."""
+    """Half of the widest interval of each group for one placement with readings [n, 3]."""
     begin = (length_s + TURN_S) * np.arange(len(readings)) + 0.5 * CUT_S
     none, seconds = np.zeros(6), length_s - CUT_S
     rests = tuple(
@@ -153,7 +151,7 @@ def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
         "schema": SCHEMA,
         "model": str(model.path),
         "placed_deg": math.degrees(PLACED),
-        "wishes": [one.text for one in wishes],
+        "wishes": [wish.text for wish in wishes],
         "rows": rows,
     }
 
@@ -161,13 +159,10 @@ def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A line for each count of rests, and the shortest."""
     console = console_of(to_stderr=to_stderr)
-
-    def line(text: str) -> None:
-        console.print(printable(text), highlight=False, markup=False, soft_wrap=True)
-
+    line = partial(print_line, console)
     line("; ".join(document["wishes"]))
     line(f"{SHARE:.0%} of placements by hand, off by {document['placed_deg']:g} deg (sd), reach it with:")
-    met = [one for one in document["rows"] if one["rest_s"] is not None]
+    met = [row for row in document["rows"] if row["rest_s"] is not None]
     for one in document["rows"]:
         lost = f"; not identified: {', '.join(one['not_identified'])}" if one["not_identified"] else ""
         if one["rest_s"] is None:

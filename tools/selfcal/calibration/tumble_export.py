@@ -9,22 +9,21 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from selfcal.base.errors import UserError, remark
+from selfcal.base.grid import Array
 from selfcal.base.output import write_text
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer, matrix_of
 from selfcal.calibration.gyroscope import Gyroscope, gyro_matrix
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -56,8 +55,8 @@ def _unknown(document: Mapping[str, Any], sensor: str, groups: tuple[str, ...]) 
     return [
         f"{group} {name}"
         for group in groups
-        for name, one in document[sensor].get(group, {}).items()
-        if not one["identified"]
+        for name, entry in document[sensor].get(group, {}).items()
+        if not entry["identified"]
     ]
 
 
@@ -127,7 +126,7 @@ def _yaml(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, A
 
 
 def _head(mark: str, whole: Whole) -> str:
-    return "".join(f"{mark} {one}\n" for one in whole.lines)
+    return "".join(f"{mark} {line}\n" for line in whole.lines)
 
 
 def _c(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
@@ -135,18 +134,13 @@ def _c(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
     whole = _whole(accel, gyro, document)
 
     def vector(values: Array) -> str:
-        return (
-            "{"
-            + ", ".join(
-                f"{one:.9g}F" if "." in f"{one:.9g}" or "e" in f"{one:.9g}" else f"{one:.1f}F" for one in values
-            )
-            + "}"
-        )
+        texts = (f"{value:.9g}" for value in values)
+        return f"{{{', '.join(f'{text}F' if set('.e') & set(text) else f'{text}.0F' for text in texts)}}}"
 
     def matrix(values: Array) -> str:
         return "{" + ", ".join(vector(row) for row in values) + "}"
 
-    text = "".join(f"/* {one.replace('*/', '* /')} */\n" for one in whole.lines)
+    text = "".join(f"/* {line.replace('*/', '* /')} */\n" for line in whole.lines)
     text += "#ifndef SELFCAL_CALIBRATION_H\n#define SELFCAL_CALIBRATION_H\n\n"
     text += "/* f = accel_matrix (a - accel_bias), m/s^2 */\n"
     text += f"static const float accel_bias[3] = {vector(whole.bias)};\n"
@@ -177,38 +171,27 @@ def _kalibr(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str,
     M, Q = _lower(np.asarray(np.linalg.inv(whole.matrix)))
 
     def rows(values: Array) -> list[list[float]]:
-        return [[float(f"{one:.10g}") for one in row] for row in values]
+        return [[float(f"{value:.10g}") for value in row] for row in values]
 
     tree: dict[str, Any] = {"model": "scale-misalignment", "accelerometers": {"M": rows(np.tril(M))}}
-    biases = {"accelerometer_bias": [float(one) for one in whole.bias]}
+    biases = {"accelerometer_bias": [float(value) for value in whole.bias]}
     if whole.gyro_bias is not None and whole.gyro_matrix is not None and whole.G is not None:
         Mg, C = _lower(np.linalg.inv(whole.gyro_matrix) @ Q.T)
         A = whole.G / STANDARD_GRAVITY @ Q.T @ C.T
         tree["gyroscopes"] = {"M": rows(np.tril(Mg)), "A": rows(A), "C_gyro_i": rows(C)}
-        biases["gyroscope_bias"] = [float(one) for one in whole.gyro_bias]
+        biases["gyroscope_bias"] = [float(value) for value in whole.gyro_bias]
     note = "# Kalibr's frame i is this one turned by T_i_selfcal; biases are not in Kalibr's file: m/s^2, rad/s\n"
     beside = yaml.safe_dump({"T_i_selfcal": rows(Q), **biases}, default_flow_style=None, width=110)
     text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=110)
-    return _head("#", whole) + note + "".join(f"#   {one}\n" for one in beside.splitlines()) + str(text)
-
-
-def _px4(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
-    """corrected = (raw - OFF) SCALE (Accelerometer::Correct), gyros raw - OFF (Gyroscope::Correct), sensor's frame."""
-    return _diagonal(
-        accel, gyro, document, "param set CAL_ACC0_{}OFF", "param set CAL_ACC0_{}SCALE", "param set CAL_GYRO0_{}OFF"
-    )
-
-
-def _ardupilot(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
-    """corrected = (raw - OFFS) SCAL (AP_InertialSensor_Backend::_rotate_and_correct_accel), gyros raw - OFFS."""
-    return _diagonal(accel, gyro, document, "INS_ACCOFFS_{}", "INS_ACCSCAL_{}", "INS_GYROFFS_{}")
+    return _head("#", whole) + note + "".join(f"#   {line}\n" for line in beside.splitlines()) + str(text)
 
 
 def _diagonal(
-    accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any], off: str, scale: str, gyro_off: str
+    off: str, scale: str, gyro_off: str, accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
 ) -> str:
+    """By the names of a parameter of an axis: corrected = (raw - off) scale, gyros raw - off, in the sensor's frame."""
     whole = _whole(accel, gyro, document, diagonal=True)
-    lines = [f"# {one}" for one in whole.lines]
+    lines = [f"# {line}" for line in whole.lines]
     lines.append("# for the first sensor, in the frame and of the uncorrected readings that the log is of")
     for k, axis in enumerate("XYZ"):
         lines.append(f"{off.format(axis)} {whole.bias[k]:.7f}")
@@ -223,6 +206,8 @@ FORMS: dict[str, Callable[[Accelerometer, Gyroscope | None, Mapping[str, Any]], 
     "yaml": _yaml,
     "c": _c,
     "kalibr": _kalibr,
-    "px4": _px4,
-    "ardupilot": _ardupilot,
+    # Accelerometer::Correct and Gyroscope::Correct.
+    "px4": partial(_diagonal, "param set CAL_ACC0_{}OFF", "param set CAL_ACC0_{}SCALE", "param set CAL_GYRO0_{}OFF"),
+    # AP_InertialSensor_Backend::_rotate_and_correct_accel.
+    "ardupilot": partial(_diagonal, "INS_ACCOFFS_{}", "INS_ACCSCAL_{}", "INS_GYROFFS_{}"),
 }

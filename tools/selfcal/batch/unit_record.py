@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from selfcal.adequacy.checks import CHECK_LIMIT
-from selfcal.base.errors import UserError, first_line, printable
+from selfcal.base.errors import UserError, first_line
 from selfcal.base.output import whole
-from selfcal.batch.spread import Job, Row, spread
+from selfcal.batch.spread import Job, Row, make_folder, spread
 from selfcal.batch.unit_table import Unit
 from selfcal.readings.tests import TESTS
 
@@ -27,8 +27,6 @@ DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
-#: Fewest distinct readings with a known lattice.
-LEAST_DISTINCT = 8
 #: Most devices with a page of their own, and the characters that its name lacks.
 MOST_PAGES = 20
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
@@ -136,14 +134,14 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     checks = axis["checks"]
     failed = {name: check for name, check in checks.items() if not check["passed"]}
     marks = [name for name in failed if name in READINGS]
-    marks += [name for name, check in failed.items() if name in INNOVATIONS and _far(check)]
+    marks += [
+        name
+        for name, check in failed.items()
+        if name in INNOVATIONS and abs(float(check["value"])) > FAR * float(check["limit"]) / CHECK_LIMIT
+    ]
     lattice = checks.get("lattice", {})
-    known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= LEAST_DISTINCT else {}
+    known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= 8 else {}
     return {"marks": list(dict.fromkeys(marks)), **known}
-
-
-def _far(check: Mapping[str, Any]) -> bool:
-    return abs(float(check["value"])) > FAR * float(check["limit"]) / CHECK_LIMIT
 
 
 class ByContent:
@@ -155,17 +153,12 @@ class ByContent:
     def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
         self.folder = folder
         self.settings = json.dumps(settings, sort_keys=True, default=str)
-        try:
-            folder.mkdir(exist_ok=True)
-        except OSError as error:
-            raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
+        make_folder(folder)
 
     def place(self, job: Job) -> Path:
         """The file of a recording."""
-        return (
-            self.folder
-            / f"{hashlib.sha256(f'{job[1]} {self.settings}'.encode('utf-8', 'surrogateescape')).hexdigest()}.json"
-        )
+        named = hashlib.sha256(f"{job[1]} {self.settings}".encode("utf-8", "surrogateescape"))
+        return self.folder / f"{named.hexdigest()}.json"
 
     def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
         """The row of a recording; None without a row, or with a damaged one."""

@@ -7,20 +7,18 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array, Mask
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 #: Residuals [m], their derivatives [m, n] and their covariance [m, m] at parameters [n].
 Problem = Callable[[Array], tuple[Array, Array, Array]]
 
-#: Iterations and halvings of a step at most. A step below `NEAR`, in posterior sd, is taken as it is, and the last one
-#: is below `SETTLED`.
-ITERATIONS, HALVINGS, NEAR, SETTLED = 50, 8, 0.3, 1e-4
+#: Iterations and halvings of a step at most. A step below 0.3 posterior sd is taken as it is. The last step is below
+#: 1e-4 posterior sd.
+ITERATIONS, HALVINGS = 50, 8
 UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
 NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
 #: A parameter is identified if the data leave this share of its prior variance at most, with priors so much wider.
@@ -118,13 +116,13 @@ def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: 
     block = np.ix_(free, free)
     unit = np.sqrt(np.diag(prior))[free]
     r, J, R = problem(theta)
-    if not all(np.isfinite(one).all() for one in (r, J, R)):
+    if not all(np.isfinite(part).all() for part in (r, J, R)):
         raise UserError(UNSETTLED)
     apart = (theta - mean)[free] / unit
     try:
         inverse = np.linalg.inv(prior[block] / np.outer(unit, unit))
         root = np.asarray(np.linalg.cholesky(R))
-        white, columns = (solve_triangular(root, one, lower=True) for one in (r, J * free))
+        white, columns = (solve_triangular(root, part, lower=True) for part in (r, J * free))
         own = columns[:, free] * unit
         covariance = np.linalg.inv(own.T @ own + inverse)
     except np.linalg.LinAlgError:
@@ -146,12 +144,12 @@ def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | 
         step, sd = found.step, np.sqrt(np.diag(found.covariance))
         far = float(np.max(np.abs(step[sd > 0.0]) / sd[sd > 0.0]))
         following = linearized(problem, found.theta + step, mean, prior, held)
-        for _ in range(HALVINGS if far > NEAR else 0):
+        for _ in range(HALVINGS if far > 0.3 else 0):
             if following.squares < found.squares:
                 break
             step = 0.5 * step
             following = linearized(problem, found.theta + step, mean, prior, held)
         found = following
-        if far < SETTLED:
+        if far < 1e-4:
             return found
     raise UserError(UNSETTLED)

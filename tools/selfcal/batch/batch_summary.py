@@ -12,7 +12,7 @@ from scipy.special import gammaln
 
 from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
-from selfcal.base.errors import UserError
+from selfcal.base.errors import UserError, few
 from selfcal.batch.drift import Drift, Series, drifts_of
 from selfcal.batch.population import (
     FALSE_ALARM,
@@ -33,19 +33,12 @@ from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
 
-#: Rounds of the search for the shares of the laws.
-SHARE_ROUNDS = 100
 #: Evidence of a unit's law over the batch's law, nats: at most 1 in e^12 by chance.
 OTHER_LAW = 12.0
-#: Largest relative difference of equal lattices.
-LATTICE = 0.05
-#: Least weight of a recording over that of a normal prior, of a quantity or its logarithm, that says anything.
-LEAST_WEIGHT = 0.1
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
 #: Most devices of a line.
 MOST_NAMED = 20
-SECONDS_A_DAY = 86400.0
 #: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0
 
@@ -85,7 +78,11 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     left_out: dict[tuple[str, str], dict[str, None]] = {}
     for unit in units:
         if unit.error is None:
-            own = _in_group_units(unit, model)
+            axes = {
+                name: _converted(axis, model.group_of(name).unit, offered(model, name))
+                for name, axis in unit.axes.items()
+            }
+            own = Unit(unit.source, {**unit.record, "axes": axes})
             devices.setdefault(unit.device, []).append(own)
             for axis, reason in own.errors.items():
                 if axis not in unit.errors:
@@ -112,13 +109,8 @@ def summed_up(units: Sequence[Unit], model: Model) -> Batch:
     return Batch(devices, fitted, dict(sorted(unlike.items())), drifts, shared, others, unidentified)
 
 
-def _in_group_units(unit: Unit, model: Model) -> Unit:
-    """The recording with each axis in the unit of its group. An axis of another kind has an `error` instead."""
-    axes = {name: _converted(axis, model.group_of(name).unit, offered(model, name)) for name, axis in unit.axes.items()}
-    return Unit(unit.source, {**unit.record, "axes": axes})
-
-
 def _converted(axis: Mapping[str, Any], to: str, regressors: Sequence[Regressor]) -> Mapping[str, Any]:
+    """A result in the unit `to`. An axis of another kind has an `error` instead."""
     if "error" in axis or axis["bias_now"]["unit"] == to:
         return axis
     bias = axis["bias_now"]
@@ -189,7 +181,7 @@ def _laws(devices: Mapping[str, Sequence[Unit]]) -> dict[str, str]:
         laws = list(dict.fromkeys(law for nats in behind for law in nats))
         likelihood = np.exp([[-nats.get(law, math.inf) for law in laws] for nats in behind])
         share = np.ones(len(laws))
-        for _ in range(SHARE_ROUNDS if behind else 0):
+        for _ in range(100 if behind else 0):
             share = likelihood.T @ (1.0 / (likelihood @ share)) * share / len(behind)
         laws_of |= {axis: laws[int(np.argmax(share))]} if behind else {}
     return laws_of
@@ -217,7 +209,7 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
         for device, units in devices.items():
             for unit in units:
                 if "error" not in unit.axes.get(axis, {"error": ""}):
-                    day = None if unit.moment is None else unit.moment.timestamp() / SECONDS_A_DAY
+                    day = None if unit.moment is None else unit.moment.timestamp() / 86400.0
                     known = _of_recording(unit.axes[axis], law, group, regressors)
                     known_of.setdefault(axis, {}).setdefault(device, []).append((day, known))
     return known_of
@@ -269,7 +261,7 @@ def _coefficient(estimate: Mapping[str, Any], sd: float) -> Known | None:
 def _without(known: Known, mean: float, sd: float) -> Known | None:
     """A quantity without its normal prior. None: hardly anything is left."""
     own = known.s**-2 - sd**-2
-    if own < LEAST_WEIGHT * sd**-2:
+    if own < 0.1 * sd**-2:
         return None
     return replace(known, y=(known.y * known.s**-2 - mean * sd**-2) / own, s=own**-0.5)
 
@@ -345,7 +337,7 @@ def _marked(
             for mark in dict.fromkeys(mark for result in axes for mark in result.get("marks", [])):
                 marked.setdefault(mark, []).append((name, f"{axis} {mark}"))
             own = axes[-1].get("lattice", math.nan)
-            if abs(own / step - 1.0) > LATTICE:
+            if abs(own / step - 1.0) > 0.05:
                 unit = axes[-1]["bias_now"]["unit"]
                 yield axis, name, f"{axis} steps of {own:.3g} {unit}, the batch's are {step:.3g}"
             behind = _behind(axes[-1])
@@ -468,7 +460,7 @@ def lines_of(batch: Batch) -> Iterator[str]:
         )
     yield from unidentified_lines(batch)
     for (axis, reason), names in batch.left_out.items():
-        yield f"left out of the population: {axis} of {_some(names)}: {reason}"
+        yield f"left out of the population: {axis} of {few(names, MOST_NAMED)}: {reason}"
     yield from group_lines(batch)
 
 
@@ -479,12 +471,9 @@ def group_lines(batch: Batch) -> Iterator[str]:
         for apart in population.apart:
             yield f"{f'{apart.kind} {apart.name}'.strip()}: {apart_words(population.measured, apart, names)}"
     for shared in batch.shared:
-        yield f"{shared.kind} {shared.name}: {_shared_words(shared)}"
-
-
-def _some(names: Sequence[str]) -> str:
-    more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
-    return f"{', '.join(names[:MOST_NAMED])}{more}"
+        inside, outside = shared.inside, shared.outside
+        there = f"{inside[0]} of {inside[1]} units, {outside[0]} of {outside[1]} elsewhere"
+        yield f"{shared.kind} {shared.name}: {shared.cause} in {there}: {_whose(shared.kind)}"
 
 
 def unidentified_lines(batch: Batch) -> Iterator[str]:
@@ -518,18 +507,11 @@ def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> 
     if apart.against is None:
         return f"{measured.name} is {how} the other units', {sd_off(apart.log_p):.1f} sd: {_whose(apart.kind)}{also}"
     if apart.kind == TWO_GROUPS:
-        of = _some([names[device] for device in apart.members])
+        of = few([names[device] for device in apart.members], MOST_NAMED)
         return f"{measured.name} of {of} is {how} the others': no column of the batch explains it"
     other = f"{apart.kind} {apart.against}'s" if apart.against else f"the units' without a {apart.kind}"
     said = f"the two differ, {sd_off(apart.log_p):.1f} sd: which one is off, two alone do not show"
     return f"{measured.name} is {how} {other}, {said}{also}"
-
-
-def _shared_words(shared: Shared) -> str:
-    """How many units of a group have a cause, and whose it is."""
-    inside, outside = shared.inside, shared.outside
-    there = f"{inside[0]} of {inside[1]} units, {outside[0]} of {outside[1]} elsewhere"
-    return f"{shared.cause} in {there}: {_whose(shared.kind)}"
 
 
 def _whose(kind: str) -> str:
