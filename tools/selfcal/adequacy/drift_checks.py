@@ -25,7 +25,6 @@ from selfcal.likelihood.state import MEANS_MOST, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
-from selfcal.model.laws import Law
 from selfcal.model.tables import Tables
 
 #: A check fails from this worth on, nats: as seldom as one at four standard deviations (checks.py), searches counted.
@@ -49,7 +48,7 @@ def drift_checks(
     recording. Nothing where the record is too short, and where the likeliest law is no simple one: then the simple ones
     leave a drift that any column may take."""
     likeliest = max(result.probability, key=lambda law: result.probability[law])
-    simple = any(_simple(one.law) and one.name == likeliest for one in tables.hypotheses)
+    simple = any(not one.law.is_sum and one.name == likeliest for one in tables.hypotheses)
     state, cells = _state(blocks, tables)
     if np.isfinite(state.y).sum() < FEWEST or not simple:
         return {}
@@ -103,14 +102,6 @@ def _state(blocks: Blocks, tables: Tables) -> tuple[State, int]:
     mean, used = half_means(blocks.mean - np.nanmean(blocks.mean), cells)
     r = block_means(blocks.r, cells) * cells / np.maximum(used, 1)
     return State("", "", mean, tables.dt_s * cells, 0.0, r, block=tables.block * cells), cells
-
-
-def _simple(law: Law) -> bool:
-    """Whether a law is white noise and one open term at most, no oscillation."""
-    terms = law.terms
-    return (
-        not law.coloured_noise and len(terms) < 2 and not any(one.kind == "oscillation" or one.stated for one in terms)
-    )
 
 
 def _channels(state: State, begin: int, block: int, recording: Recording, others: Sequence[str]) -> Iterator[Shape]:

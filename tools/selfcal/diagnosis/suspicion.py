@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
@@ -23,9 +23,6 @@ from selfcal.likelihood.state import NET_LEAST, Look
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import bank_block, make_tables
-
-if TYPE_CHECKING:
-    from selfcal.likelihood.state import Look
 
 #: Rate of the means that are looked at, Hz, and how many of them at most: a longer record has longer ones.
 RATE_HZ, MOST = 1.0, 20_000
