@@ -67,6 +67,8 @@ NEAR = 30
 PLACES = 4
 #: Lines above the means' band that are looked at.
 FAST_LINES = 6
+#: A line is fitted with the drifts so often at most, or until it moves by less than this many turns in the record.
+LOCKED, HELD = 6, 0.02
 #: Multiples of a line that are looked at with it, if it is no slow one, and ln of the number of kinds of lines.
 MULTIPLES, LN_ALONE = 5, math.log(2.0)
 #: ln of the ways in which the phases of a line on the axes may go together.
@@ -328,14 +330,14 @@ def lines(seen: Seen) -> Iterator[Candidate]:
         most = 1 if turns[at] < SLOW_TURNS else min(MULTIPLES, (len(gains) - 1) // at)
         multiples = [k for k in range(1, most + 1) if usable[place[k * at]]]
         there = known[place[at * np.array(multiples)]]
-        f = _sharpest(weights, there[:1], at / padded, 0.5 / padded, multiples)
+        f = _sharpest(_of_multiples(weights, there[:1], multiples), at / padded, 0.5 / padded)
         waves = _waves(f, n, multiples[:1])
         if most == 1:  # the record ends, and a spectrum does not
             scale = own[place[at]]
             there[0] = information(seen.model, seen.y, waves).mean(axis=0) * np.outer(scale, scale)
         tried = [(LN_ALONE, f, waves)]
         if len(multiples) > 1:
-            f = _sharpest(weights, there, at / padded, 0.5 / padded, multiples)
+            f = _sharpest(_of_multiples(weights, there, multiples), at / padded, 0.5 / padded)
             waves, kinds = _waves(f, n, multiples), LN_ALONE + math.log(len(multiples) - 1)
             tried += [(kinds, f, waves[: 2 * count]) for count in range(2, len(multiples) + 1)]
         found = []
@@ -361,8 +363,9 @@ def _phased(waves: Array, score: Array, known: Array) -> Iterator[tuple[Act, flo
 
 
 def _waves(f: float, n: int, multiples: Sequence[int]) -> Array:
-    """Cosine and sine of multiples of a frequency, turns a sample: [2 k, n]."""
-    turns = 2.0 * math.pi * f * np.outer(multiples, np.arange(n))
+    """Cosine and sine of multiples of a frequency, turns a sample: [2 k, n]. Of a turn about the middle of the record
+    both have nothing in common, however slow."""
+    turns = 2.0 * math.pi * f * np.outer(multiples, np.arange(n) - 0.5 * (n - 1))
     return np.stack([np.cos(turns), np.sin(turns)], axis=1).reshape(-1, n)
 
 
@@ -412,18 +415,27 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
     return found
 
 
-def _sharpest(weights: Array, known: Array, f: float, reach: float, multiples: Sequence[int]) -> float:
-    """The best frequency about f, turns a sample, of a line by its multiples, each with its information [k, m, m]."""
-    t = np.arange(weights.shape[0])
+def _sharpest(gain: Callable[[Array], Array], f: float, reach: float) -> float:
+    """The frequency about f, turns a sample, of the highest of gains [tried]."""
     for _ in range(3):
         tried = f + reach * np.linspace(-1.0, 1.0, 7)
-        gain = np.zeros(tried.size)
-        for k, there in zip(multiples, known, strict=False):
-            z = np.exp(2j * math.pi * k * tried[:, None] * t) @ weights
-            gain += full(z.real, there) + full(z.imag, there)
-        f = float(tried[np.argmax(gain)])
+        f = float(tried[np.argmax(gain(tried))])
         reach /= 3.0
     return f
+
+
+def _of_multiples(weights: Array, known: Array, multiples: Sequence[int]) -> Callable[[Array], Array]:
+    """Gain of lines by their multiples, whose information [k, m, m] is much the same at all frequencies tried."""
+    t = np.arange(weights.shape[0])
+
+    def gain(tried: Array) -> Array:
+        total = np.zeros(tried.size)
+        for k, there in zip(multiples, known, strict=False):
+            z = np.exp(2j * math.pi * k * tried[:, None] * t) @ weights
+            total += full(z.real, there) + full(z.imag, there)
+        return total
+
+    return gain
 
 
 def transients(seen: Seen) -> Iterator[Candidate]:
@@ -499,9 +511,39 @@ def beside(seen: Seen, one: Candidate) -> Candidate:
     effect = sizes(one.columns @ seen.course.weights, known).T @ one.columns
     model = refitted(seen.model, seen.y - effect, seen.dt)
     found = course(model, seen.y, smooth=True)
-    less = min(0.0, found.ln_likelihood - seen.course.ln_likelihood)
-    known = information(model, seen.y, one.columns[:1])[0]
-    return replace(one, act=act(one.columns @ found.weights, known), more=less)
+    score, known = one.columns @ found.weights, information(model, seen.y, one.columns[:1])[0]
+    return _gained(seen, replace(one, act=act(score, known)), score, model, found)
+
+
+def _gained(seen: Seen, one: Candidate, score: Array, model: Joint, found: Course) -> Candidate:
+    """The candidate, of scores [p, m] at a new `model`, with what the records less its effect gain there. `found`: the
+    records at that model, which may suit them better without it too."""
+    gain = course(model, seen.y - one.effect).ln_likelihood - max(seen.course.ln_likelihood, found.ln_likelihood)
+    return replace(one, more=gain - 0.5 * float((one.act.size * score).sum()))
+
+
+def locked(seen: Seen, one: Candidate) -> Candidate:
+    """A line with the drifts fitted anew beside it, at the frequency that it has there: drifts that were fitted without
+    have swallowed the most of a slow one, and what they left lies elsewhere."""
+    n, multiples = seen.n, (1, *map(round, one.theta[1:]))
+    for k in range(LOCKED):
+        model = refitted(seen.model, seen.y - one.effect, seen.dt)
+        found, f = course(model, seen.y, smooth=True), one.theta[0] * seen.dt
+
+        def gain(tried: Array, model: Joint = model, weights: Array = found.weights) -> Array:
+            waves = np.vstack([_waves(float(each), n, multiples) for each in tried])
+            return full(waves @ weights, information(model, seen.y, waves)).reshape(tried.size, -1).sum(axis=1)
+
+        sharp = _sharpest(gain, f, 0.5 ** min(k, 2) / n)
+        waves = _waves(sharp, n, multiples)
+        known = information(model, seen.y, waves).reshape(len(multiples), 2, *model.correlation.shape).mean(axis=1)
+        phased = _phased(waves, waves @ found.weights, known)
+        acts, columns = next((acts, columns) for acts, _, columns in phased if len(columns) == len(one.columns))
+        one = replace(one, theta=(sharp / seen.dt, *one.theta[1:]), act=acts, columns=columns)
+        one = _gained(seen, one, columns @ found.weights, model, found)
+        if abs(sharp - f) * n < HELD:
+            break
+    return one
 
 
 def between_levels(seen: Seen, one: Candidate) -> Candidate:
@@ -581,7 +623,8 @@ class Search:
         """Look until nothing is worth `least`, nats. A candidate with the pattern of the quantity in the model is that
         one's own."""
         vain: list[Candidate] = []
-        for _ in range(MOST - len(self.several) - len(self.single)):
+        firm: list[Candidate] = []
+        while len(self.several) + len(self.single) < MOST:
             left = {
                 name: [one for one in each if not any(one is other for other in vain)]
                 for name, each in self.known.items()
@@ -593,6 +636,10 @@ class Search:
                 found = _best_of(beside(self.seen, one) for each in jumps for one in each if one.evidence > 0.0)
             if found is None or found.evidence < least:
                 return
+            if found.cause == "periodic" and not any(found is one for one in firm):
+                firm.append(locked(self.seen, found))
+                self.known["line"] = [firm[-1] if one is found else one for one in self.known["line"]]
+                continue
             own = self._is_own(found)
             if own and found.cause in JUMPS:
                 for time in found.theta:
