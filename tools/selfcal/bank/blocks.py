@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
@@ -27,7 +26,7 @@ class Blocks:
     """What the library's averager makes of a record, worked out on its own in double for the reference and the checks.
 
     `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
-    those used; `within_sd` of the samples about their block's mean, NaN with one sample a block; `kept_out` counts the
+    those used; `kept_out` counts the
     samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. `after`: samples from
     the last whole block to the last usable sample, missing ones included. `begin`: sample instants from the record's
     first one to the first block. Blocks beyond MOST_DENSE intervals are not
@@ -36,7 +35,6 @@ class Blocks:
 
     mean: NDArray[np.float64]
     r: NDArray[np.float64]
-    within_sd: float
     kept_out: Mapping[str, int]
     z: NDArray[np.float64]
     after: int = 0
@@ -128,18 +126,9 @@ def block_means(
     used = np.bincount(index, minlength=count)
     total = np.bincount(index, values, minlength=count)
     with np.errstate(invalid="ignore", divide="ignore"):
-        raw = total / used
         sums = [np.bincount(index, column, minlength=count) for column in rows.T]
         z = np.column_stack([np.empty((count, 0)), *sums]) / used[:, None]
-        mean = np.where(used * 2 >= block, raw, np.nan)
+        mean = np.where(used * 2 >= block, total / used, np.nan)
         r = np.where(used * 2 >= block, block / used, 1.0)
-    good = np.isfinite(mean)[index]
-    freedom = int(good.sum()) - int(np.isfinite(mean).sum())
-    scatter = raw[index]
-    np.subtract(values, scatter, out=scatter)
-    if not good.all():
-        scatter = scatter[good]
-    squares = float(np.square(scatter, out=scatter).sum())
-    within = math.sqrt(squares / freedom) if freedom > 0 else math.nan
     first = int(np.argmax(np.isfinite(mean))) if np.isfinite(mean).any() else 0
-    return Blocks(mean[first:], r[first:], within, counts, z[first:], after, begin + first * block)
+    return Blocks(mean[first:], r[first:], counts, z[first:], after, begin + first * block)

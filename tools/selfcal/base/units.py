@@ -12,7 +12,7 @@ import math
 import re
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 from typing import overload
 
 import numpy as np
@@ -247,21 +247,13 @@ def convert(value: float | NDArray[np.float64], unit: str, to: str) -> float | N
     return value * scale if shift == 0.0 else value * scale + shift / parse(to).size
 
 
-def per_second(unit: str) -> str:
-    """`unit` per second: `deg/s` -> `deg/s^2`, `deg/h` -> `deg/h/s`."""
+def by_seconds(unit: str, more: int) -> str:
+    """`unit` per second (1): `deg/s` -> `deg/s^2`, `deg/h` -> `deg/h/s`; times a second (-1): `deg`, `deg/h*s`."""
     match = re.search(r"/s(?:\^(\d+))?\Z", unit)
     if match is None:
-        return f"{unit}/s"
-    return f"{unit[: match.start()]}/s^{int(match[1] or 1) + 1}"
-
-
-def times_second(unit: str) -> str:
-    """`unit` times a second: `deg/s` -> `deg`, `m/s^2` -> `m/s`, `deg/h` -> `deg/h*s`."""
-    match = re.search(r"/s(?:\^(\d+))?\Z", unit)
-    if match is None:
-        return f"{unit}*s"
-    less = int(match[1] or 1) - 1
-    return unit[: match.start()] + ("" if less == 0 else "/s" if less == 1 else f"/s^{less}")
+        return f"{unit}/s" if more > 0 else f"{unit}*s"
+    exponent = int(match[1] or 1) + more
+    return unit[: match.start()] + ("" if exponent == 0 else "/s" if exponent == 1 else f"/s^{exponent}")
 
 
 def power(unit: str, exponent: int) -> str:
@@ -277,25 +269,22 @@ def power(unit: str, exponent: int) -> str:
     return "".join(factors)
 
 
+times_second = partial(by_seconds, more=-1)
+#: Unit of each parameter by the reading's: itself, per second, and times a second.
+_PARAMETERS = {
+    **dict.fromkeys(("bias", "sigma_m", "B", "bias_instability"), "{0}"),
+    **dict.fromkeys(("N", "arw"), "{0}/sqrt(Hz)"),
+    **dict.fromkeys(("K", "rrw"), "{1}/sqrt(Hz)"),
+    **dict.fromkeys(("Q", "quantization_noise"), "{2}"),
+    **{"alpha": "1/s", "spectral_ratio": "1", "markov_ratio": "1"},
+    **{"p1": "", "p2": ""},  # places of the wire that no model names
+}
+
+
 def parameter_unit(parameter: str, unit: str) -> str:
     """Unit of a model parameter (bias, N, K, sigma_m, B, alpha, and the ratios), of Q, or of a number of summary.py, of
     an axis that reads in `unit`."""
-    match parameter:
-        case "bias" | "sigma_m" | "B" | "bias_instability":
-            return unit
-        case "N" | "arw":
-            return f"{unit}/sqrt(Hz)"
-        case "K" | "rrw":
-            return f"{per_second(unit)}/sqrt(Hz)"
-        case "Q" | "quantization_noise":
-            return times_second(unit)
-        case "alpha":
-            return "1/s"
-        case "spectral_ratio" | "markov_ratio":
-            return "1"
-        case "p1" | "p2":  # places of the wire that no model names
-            return ""
-    raise ValueError(f"no such parameter: {parameter}")
+    return _PARAMETERS[parameter].format(unit, by_seconds(unit, 1), times_second(unit))
 
 
 #: Units of data sheets, of a parameter of an angular rate and of an acceleration; below, of the numbers of summary.py.

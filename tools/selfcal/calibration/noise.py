@@ -15,7 +15,6 @@ import numpy as np
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.bank.priors import known, laid
-from selfcal.bank.result import Estimate
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
 from selfcal.base.units import factor
@@ -131,11 +130,10 @@ def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise |
         return None
     size = factor(found.unit, unit) ** 2
     result = found.result
-
-    def both(estimate: Estimate) -> tuple[float, float]:
-        return estimate.mean**2 + estimate.sd**2, estimate.median
-
-    values = {law: {key: both(one) for key, one in own.items()} for law, own in result.parameters.items()}
+    values = {
+        law: {key: (estimate.mean**2 + estimate.sd**2, estimate.median) for key, estimate in own.items()}
+        for law, own in result.parameters.items()
+    }
     terms = of_laws(model.laws, result.probability, values)
     white = sum(share * values[law]["N"][0] for law, share in result.probability.items())
     return Noise(

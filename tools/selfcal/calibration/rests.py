@@ -205,8 +205,10 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     if sum(len(one.rests) for one in logs) > MOST:
         raise UserError(f"more than {MOST} rests: choose a stretch with --start and --end")
     ranges = {name: _range(model, name) if part_stated else math.inf for name in axes}
+    rows_of = [(log, rows) for log in logs for rows in log.rests]
     typical = {
-        name: _median([float(np.std(log.bridged[name][rows])) for log in logs for rows in log.rests]) for name in axes
+        name: float(np.median([np.std(log.bridged[name][rows]) for log, rows in rows_of])) if rows_of else 0.0
+        for name in axes
     }
     rests: list[Rest] = []
     turns: list[Turn] = []
@@ -226,7 +228,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
             end = rows.stop
     long_rest = None if part_stated else _long_rest(logs)
     noise = {name: _noise(logs, name, model, long_rest) for name in axes}
-    for name in (one for one in GYRO if gyros and one not in axes):
+    for name in (gyro for gyro in GYRO if gyros and gyro not in axes):
         notes.append(f"{name} is not recorded: it has no number, and turns take three gyros")
         noise[name] = Noise(1e6, (), "")  # it weighs nothing
     return Tumble(tuple(rests), tuple(turns), noise, tuple(left_out), tuple(notes))
@@ -283,21 +285,17 @@ def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording |
     return of_model(model, name, UNITS[name], None if white is None else math.sqrt(white))
 
 
-def _median(values: Sequence[float]) -> float:
-    return float(np.median(values)) if values else 0.0
-
-
 def _begins(recordings: Sequence[Recording]) -> tuple[list[float], list[str]]:
     """When each log begins on one clock, s, and what is assumed of it."""
     if len(recordings) == 1:
         return [0.0], []
     stamps = [recording.started_s for recording in recordings]
     if all(stamp is not None for stamp in stamps):
-        known = [float(one) for one in stamps if one is not None]
-        ends = [begin + one.duration_s for begin, one in zip(known, recordings, strict=True)]
+        known = [float(stamp) for stamp in stamps if stamp is not None]
+        ends = [begin + recording.duration_s for begin, recording in zip(known, recordings, strict=True)]
         if all(end <= begin for end, begin in zip(ends, known[1:], strict=False)):
-            return [one - known[0] for one in known], []
-    lengths = [one.duration_s + BETWEEN_S for one in recordings]
+            return [begin - known[0] for begin in known], []
+    lengths = [recording.duration_s + BETWEEN_S for recording in recordings]
     note = f"the logs have no stamps of one clock: taken in the order given, {BETWEEN_S:g} s apart"
     return [float(one) for one in np.cumsum([0.0, *lengths[:-1]])], [note]
 

@@ -28,14 +28,12 @@ from selfcal.calibration.gyroscope import Gyroscope, gyro_matrix
 
 @dataclass(frozen=True)
 class Whole:
-    """f = `matrix` (a - `bias`), w = `gyro_matrix` (y - `gyro_bias` - `G` f / g): m/s^2, rad/s, rad/s/g. Without gyros
-    these are None. `lines`: what the file says of itself."""
+    """f = `matrix` (a - `bias`), m/s^2. `gyro`: bias, rad/s, matrix and G, rad/s/g, of w = matrix (y - bias - G f / g);
+    None without gyros. `lines`: the file's head."""
 
     bias: Array
     matrix: Array
-    gyro_bias: Array | None
-    gyro_matrix: Array | None
-    G: Array | None
+    gyro: tuple[Array, Array, Array] | None
     lines: tuple[str, ...]
 
 
@@ -84,7 +82,7 @@ def _whole(
         lines.append(f"angles are left out: |f| is off by up to {1e6 * length:.0f} ppm, by direction,")
         lines.append(f"and f by up to {1e3 * np.linalg.norm(off, axis=1).max():.3g} mg")
     if gyro is None:
-        return Whole(bias, matrix, None, None, None, tuple(lines))
+        return Whole(bias, matrix, None, tuple(lines))
     known = gyro.fit.identified[gyro.of_accel :]
     lost = _unknown(document, "gyroscope", ("bias", "scale", "misalignment", "g_sensitivity"))
     if diagonal:
@@ -95,7 +93,7 @@ def _whole(
     own_held = ~known
     own_held[gyroscope.VERTICAL] = own_held[gyroscope.THERMAL] = own_held[gyroscope.LEVEL :] = False
     own = gyroscope.calibrate(accel, own_held).theta if own_held.any() else gyro.theta
-    return Whole(bias, matrix, own[gyroscope.BIAS], gyro_matrix(own), own[gyroscope.G].reshape(3, 3), tuple(lines))
+    return Whole(bias, matrix, (own[gyroscope.BIAS], gyro_matrix(own), own[gyroscope.G].reshape(3, 3)), tuple(lines))
 
 
 def _yaml(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
@@ -111,13 +109,14 @@ def _yaml(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, A
             "parameters": {key: document["accelerometer"][key] for key in ("bias", "scale", "misalignment")},
         },
     }
-    if whole.gyro_bias is not None and whole.gyro_matrix is not None and whole.G is not None:
+    if whole.gyro is not None:
+        gyro_bias, turned, G = whole.gyro
         tree["gyroscope"] = {
             "use": "w = matrix (y - bias - g_sensitivity f)",
             "unit": "rad/s",
-            "bias": whole.gyro_bias.tolist(),
-            "matrix": whole.gyro_matrix.tolist(),
-            "g_sensitivity": (whole.G / STANDARD_GRAVITY).tolist(),
+            "bias": gyro_bias.tolist(),
+            "matrix": turned.tolist(),
+            "g_sensitivity": (G / STANDARD_GRAVITY).tolist(),
             "parameters": {
                 key: document["gyroscope"][key] for key in ("bias", "g_sensitivity", "scale", "misalignment")
             },
@@ -145,11 +144,12 @@ def _c(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
     text += "/* f = accel_matrix (a - accel_bias), m/s^2 */\n"
     text += f"static const float accel_bias[3] = {vector(whole.bias)};\n"
     text += f"static const float accel_matrix[3][3] = {matrix(whole.matrix)};\n"
-    if whole.gyro_bias is not None and whole.gyro_matrix is not None and whole.G is not None:
+    if whole.gyro is not None:
+        gyro_bias, turned, G = whole.gyro
         text += "/* w = gyro_matrix (y - gyro_bias - gyro_g f), rad/s; gyro_g in rad/s per m/s^2 */\n"
-        text += f"static const float gyro_bias[3] = {vector(whole.gyro_bias)};\n"
-        text += f"static const float gyro_matrix[3][3] = {matrix(whole.gyro_matrix)};\n"
-        text += f"static const float gyro_g[3][3] = {matrix(whole.G / STANDARD_GRAVITY)};\n"
+        text += f"static const float gyro_bias[3] = {vector(gyro_bias)};\n"
+        text += f"static const float gyro_matrix[3][3] = {matrix(turned)};\n"
+        text += f"static const float gyro_g[3][3] = {matrix(G / STANDARD_GRAVITY)};\n"
     return text + "\n#endif\n"
 
 
@@ -175,11 +175,12 @@ def _kalibr(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str,
 
     tree: dict[str, Any] = {"model": "scale-misalignment", "accelerometers": {"M": rows(np.tril(M))}}
     biases = {"accelerometer_bias": [float(value) for value in whole.bias]}
-    if whole.gyro_bias is not None and whole.gyro_matrix is not None and whole.G is not None:
-        Mg, C = _lower(np.linalg.inv(whole.gyro_matrix) @ Q.T)
-        A = whole.G / STANDARD_GRAVITY @ Q.T @ C.T
+    if whole.gyro is not None:
+        gyro_bias, turned, G = whole.gyro
+        Mg, C = _lower(np.linalg.inv(turned) @ Q.T)
+        A = G / STANDARD_GRAVITY @ Q.T @ C.T
         tree["gyroscopes"] = {"M": rows(np.tril(Mg)), "A": rows(A), "C_gyro_i": rows(C)}
-        biases["gyroscope_bias"] = [float(value) for value in whole.gyro_bias]
+        biases["gyroscope_bias"] = [float(value) for value in gyro_bias]
     note = "# Kalibr's frame i is this one turned by T_i_selfcal; biases are not in Kalibr's file: m/s^2, rad/s\n"
     beside = yaml.safe_dump({"T_i_selfcal": rows(Q), **biases}, default_flow_style=None, width=110)
     text = yaml.safe_dump(tree, sort_keys=False, default_flow_style=None, width=110)
@@ -196,8 +197,8 @@ def _diagonal(
     for k, axis in enumerate("XYZ"):
         lines.append(f"{off.format(axis)} {whole.bias[k]:.7f}")
         lines.append(f"{scale.format(axis)} {whole.matrix[k, k]:.7f}")
-    if whole.gyro_bias is not None:
-        lines += [f"{gyro_off.format(axis)} {whole.gyro_bias[k]:.8f}" for k, axis in enumerate("XYZ")]
+    if whole.gyro is not None:
+        lines += [f"{gyro_off.format(axis)} {whole.gyro[0][k]:.8f}" for k, axis in enumerate("XYZ")]
     return "\n".join(lines) + "\n"
 
 

@@ -365,11 +365,7 @@ def _cause(regressor: Stated, model: Model) -> str:
         return {"time": "ramp"}.get(regressor.kind, regressor.kind)
     if regressor.column in model.axes:
         return "vibration" if regressor.input == "variance" else "cross_axis"
-    return _channel(regressor.column)
-
-
-def _channel(column: str) -> str:
-    return next((cause for cause, (name, _) in SIDE_CHANNELS.items() if name == column), "")
+    return next((cause for cause, (name, _) in SIDE_CHANNELS.items() if name == regressor.column), "")
 
 
 def smoothed(values: Array, window: int) -> Array:

@@ -11,13 +11,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rich import box
-from rich.table import Table
 from scipy.stats import binom
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, note, printable
-from selfcal.base.output import console_of, plotter, print_line, save_picture
+from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
 from selfcal.diagnosis.record import Record
@@ -90,11 +88,8 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
         return [_about(Input(acts, acts, record.axes[name].unit))]
     if name not in record.channel_names.values():
         known = name in dict(SIDE_CHANNELS.values())
-        reason = (
-            "does not change, or is a copy of an axis"
-            if known
-            else "is neither temp, nor supply, nor an axis of the model"
-        )
+        reason = "does not change, or is a copy of an axis"
+        reason = reason if known else "is neither temp, nor supply, nor an axis of the model"
         raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
     unit = recording.columns[name].unit
     values = units.convert(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
@@ -415,9 +410,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         line(f"influence: no structure holds, the nearest is {document['structure']}")
     line(f"evidence {document['evidence_gain_nats']:.1f} nats, {document['net_nats']:.1f} net of the search")
     if "estimate" in document:
-        table = Table(box=box.SIMPLE_HEAD)
-        for heading in ("", "median", "5 %", "95 %", "unit"):
-            table.add_column(heading, no_wrap=True)
+        table = table_of(("", "median", "5 %", "95 %", "unit"))
         for key, one in document["estimate"].items():
             table.add_row(WORDS[key], *(f"{one[at]:.4g}" for at in ("median", "q05", "q95")), one["unit"])
         console.print(table)
@@ -437,9 +430,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         return
     line("")
     line(f"other methods, means of {document['methods_step_s']:g} s; in brackets 90 % if the answer holds")
-    table = Table(box=box.SIMPLE_HEAD)
-    for heading in ("", "order", "static gain", "delay, s", "agrees"):
-        table.add_column(heading, no_wrap=True)
+    table = table_of(("", "order", "static gain", "delay, s", "agrees"))
     for name, one in document["methods"].items():
         cells = []
         for key in ("gain", "delay_s"):

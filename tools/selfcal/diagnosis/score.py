@@ -86,8 +86,12 @@ def gain(
     cut = replace(cut, marks=np.union1d(cut.marks, np.concatenate([*horizons.values(), cut.edges])))
     old, new = (_sequential(state, cut.marks, horizons) for state in (before, after))
     scores, later = cut.scores(old[0]), cut.scores(new[0])
-    at = int(np.searchsorted(cut.edges, _begin(before, after, split), "right")) - 1
-    later[at] -= _price(look, before, after, split) / cut.sizes[at]
+    added = _added(before, after)
+    if added and not any(column[:split].any() for column in added):
+        # Columns that are nothing before the scored samples pay for the search where they begin.
+        first = split + min(int(np.argmax(column[split:] != 0.0)) for column in added)
+        piece = int(np.searchsorted(cut.edges, first, "right")) - 1
+        later[piece] -= max(0.0, look.gain - look.net) / cut.sizes[piece]
     sd = float((later - scores).std(ddof=1)) / math.sqrt(PIECES)
     return _held_out(cut, scores, later, sd, before.unit, _errors(after, old, new, cut.marks, horizons))
 
@@ -144,18 +148,6 @@ def _added(before: State, after: State) -> list[Array]:
     """The columns that a finding has added."""
     known = {regressor.name for regressor in before.regressors}
     return [column.values for column in after.regressors if column.name not in known]
-
-
-def _begin(before: State, after: State, split: int) -> int:
-    """The first scored sample that the finding's columns change."""
-    return split + min((int(np.argmax(column[split:] != 0.0)) for column in _added(before, after)), default=0)
-
-
-def _price(look: Look, before: State, after: State, split: int) -> float:
-    """Nats that the search costs where the finding's columns are nothing before the scored samples."""
-    added = _added(before, after)
-    late = bool(added) and not any(column[:split].any() for column in added)
-    return max(0.0, look.gain - look.net) if late else 0.0
 
 
 def _prior(state: State) -> Array:

@@ -26,7 +26,9 @@ def write_page(path: Path | str, document: Mapping[str, Any], curves: Curves) ->
 
 def page(document: Mapping[str, Any], curves: Curves) -> str:
     """The page of a document `selfcal.compare/1`."""
-    names = _short(document["recordings"])
+    recordings = document["recordings"]
+    short = [Path(log).name for log in recordings]  # whole paths where two names are equal
+    names = dict(zip(recordings, short if len(set(short)) == len(short) else recordings, strict=True))
     axes = [_axis(name, entry, document, curves.get(name, {}), names) for name, entry in document["axes"].items()]
     changes = [(axis.name, change) for axis in axes for change in axis.changes]
     changes.sort(key=lambda change: -abs(change[1].get("distance_sd", np.inf)))
@@ -65,12 +67,6 @@ def _axis(
     quantities = [document["quantities"].get(log, {}).get(name, {}) for log in names]
     changes = entry if compared else entry["changes"]
     return _Axis(name, "" if compared else entry["error"], changes, quantities, _deviations(name, curves, names))
-
-
-def _short(recordings: Sequence[str]) -> dict[str, str]:
-    """File names of the recordings; whole paths where two names are equal."""
-    short = [Path(log).name for log in recordings]
-    return dict(zip(recordings, short if len(set(short)) == len(short) else recordings, strict=True))
 
 
 def _deviations(name: str, curves: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]) -> Markup:

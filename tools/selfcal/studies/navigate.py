@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 from scipy import optimize
 
-from selfcal.base.output import console_of
+from selfcal.base.output import console_of, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
@@ -151,16 +149,14 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     low, high = document["nees_band_95"]
     for time, when in TIMES.items():
         title = f"{when}: rms errors, {document['parts']} parts of each law"
-        table = Table(box=box.SIMPLE_HEAD, title=title, title_justify="left")
-        for heading in ("law of the parts", "noise that the filter is told", *FIGURES.values(), "it is"):
-            table.add_column(heading, no_wrap=True)
+        headings = ("law of the parts", "noise that the filter is told", *FIGURES.values(), "it is")
+        table = table_of(headings, title)
         for law, filters in document["laws"].items():
             for name, times in filters.items():
                 figures = times[time]
                 cells = [f"{figures[figure]:.3g}" for figure in FIGURES]
-                word = (
-                    "too sure" if figures["nees"] > high else "too cautious" if figures["nees"] < low else "consistent"
-                )
+                sure, careful = figures["nees"] > high, figures["nees"] < low
+                word = "too sure" if sure else "too cautious" if careful else "consistent"
                 last = name == list(filters)[-1]
                 table.add_row(law if name == "sheet" else "", TITLES[name], *cells, word, end_section=last)
         console.print(table)

@@ -65,7 +65,7 @@ def replay(
     from selfcal.show.results import Identification
     from selfcal.wire.frames import names_of
     from selfcal.wire.on_wire import places, sent
-    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, check_sent, document_of, run, run_here
+    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, check_sent, document_of, run
 
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
@@ -101,12 +101,10 @@ def replay(
         gate_of(recording, loaded_model, tuple(names))
     sent_model, rows = sent(loaded_model, recording, taken) if foreign else (loaded_model, recording)
     on_wire = list(taken.values())
-    if target == "host" and transport is None:
-        reports, said = run_here(rows, sent_model, on_wire, report_every, gate, known)
-    else:
-        firmware = build(sent_model, recording.rate_hz, on_wire, target, start=known)
-        how = transport or "slcan"
-        reports, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel)
+    here = target == "host" and transport is None
+    firmware = None if here else build(sent_model, recording.rate_hz, on_wire, target, start=known)
+    how = transport or "slcan"
+    reports, said = run(firmware, rows, sent_model, on_wire, report_every, target, gate, how, channel, known)
     history = {
         name: [replace(report, axis=name) for report in reports[sent_as]]
         for name, sent_as in taken.items()

@@ -10,6 +10,7 @@ import re
 import textwrap
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 
 from cantools.database.can import Database, Message
@@ -124,9 +125,8 @@ def fields(message: Message) -> list[Field]:
     return sorted(members, key=lambda field: (field.item, field.start))
 
 
-def _shape(field: Field) -> tuple[object, ...]:
-    """Members that are alike in all axis messages: everything but unit and comment."""
-    return (field.name, field.item, field.start, field.length, field.kind, field.scale)
+#: Members that are alike in all axis messages: everything but unit and comment.
+_shape = attrgetter("name", "item", "start", "length", "kind", "scale")
 
 
 def _first(database: Database, suffix: str) -> Message:

@@ -16,6 +16,7 @@ import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -240,7 +241,7 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
 
 
 def run(
-    firmware: Path,
+    firmware: Path | None,
     recording: Recording,
     model: Model,
     axes: Sequence[str],
@@ -249,56 +250,44 @@ def run(
     gate: bool = False,
     transport: str = "slcan",
     channel: str = "",
-) -> tuple[dict[str, list[AxisReport]], dict[str, str]]:
-    """Play the recording through the firmware; the complete reports of each axis, and why axes have no calibration to
-    rely on at the end. Prints the frame counts, and the gate's."""
-    period_s = period_of(recording, model, report_every, target)
-    history: dict[str, list[AxisReport]] = {name: [] for name in axes}
-    with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
-        rows = Path(name) / "rows.bin"
-        write_rows(recording, model, axes, rows)
-        decoder = Decoder(from_start=True)
-        with ExitStack() as stack:
-            link, more = None, ["--timeout", f"{TIMEOUT_S:g}"]
-            if transport == "can":  # listening first: on a bus nobody waits for a listener
-                bus, link = can_bus(channel)
-                stack.enter_context(link)
-                more += ["--can", bus]
-            module, wire, before = stack.enter_context(running(firmware, rows, period_s, target, gate, more))
-            if link is None and wire:
-                # The firmware is ready at once: python-can's pause after opening is for modules that restart.
-                link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
-            if link is not None and wire:
-                _watch(link, decoder, recording, model, history, module, TARGETS[target].patience_s)
-                link.order("close")  # the emulator forgets what it holds of a line that is closed
-            said = before + _ending(module)
-        if module.returncode != 0 or not decoder.finished:
-            said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
-            raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
-    return history, reasons(decoder.status, decoder.corrected)
-
-
-def run_here(
-    recording: Recording,
-    model: Model,
-    axes: Sequence[str],
-    report_every: float | None,
-    gate: bool = False,
     start: Start | None = None,
 ) -> tuple[dict[str, list[AxisReport]], dict[str, str]]:
-    """As `run`, by the application in this process. Nothing is compiled."""
-    check_forms(model)
-    tables = tables_of(model, recording.rate_hz, axes, "host", start)
-    period_s = period_of(recording, model, report_every, "host")
+    """Play the recording through the firmware; None: by the application in this process, with measured priors from
+    `start`. The complete reports of each axis, and why axes have no calibration to rely on at the end. Prints the
+    frame counts, and the gate's."""
+    if firmware is None:
+        check_forms(model)
+    period_s = period_of(recording, model, report_every, target)
     history: dict[str, list[AxisReport]] = {name: [] for name in axes}
+    decoder = Decoder(from_start=True)
     with tempfile.TemporaryDirectory(prefix="selfcal-") as name:
         rows = Path(name) / "rows.bin"
         write_rows(recording, model, axes, rows)
-        decoder = Decoder(from_start=True)
-        try:
-            _watch(Played(model, tables, rows, ms(period_s), gate), decoder, recording, model, history)
-        except ValueError as error:  # std::invalid_argument
-            raise UserError(f"{recording.path}: {error}") from error
+        watch = partial(_watch, decoder=decoder, recording=recording, model=model, history=history)
+        if firmware is None:
+            tables = tables_of(model, recording.rate_hz, axes, "host", start)
+            try:
+                watch(Played(model, tables, rows, ms(period_s), gate))
+            except ValueError as error:  # std::invalid_argument
+                raise UserError(f"{recording.path}: {error}") from error
+        else:
+            with ExitStack() as stack:
+                link, more = None, ["--timeout", f"{TIMEOUT_S:g}"]
+                if transport == "can":  # listening first: on a bus nobody waits for a listener
+                    bus, link = can_bus(channel)
+                    stack.enter_context(link)
+                    more += ["--can", bus]
+                module, wire, before = stack.enter_context(running(firmware, rows, period_s, target, gate, more))
+                if link is None and wire:
+                    # The firmware is ready at once: python-can's pause after opening is for modules that restart.
+                    link = stack.enter_context(open_bus("slcan", wire, bitrate=500000, sleep_after_open=0.0))
+                if link is not None and wire:
+                    watch(link, module=module, patience_s=TARGETS[target].patience_s)
+                    link.order("close")  # the emulator forgets what it holds of a line that is closed
+                said = before + _ending(module)
+            if module.returncode != 0 or not decoder.finished:
+                said = said.strip().replace(str(rows), str(recording.path)).replace(rows.name, str(recording.path))
+                raise UserError(said or f"the firmware stopped before its last report (exit code {module.returncode})")
     return history, reasons(decoder.status, decoder.corrected)
 
 

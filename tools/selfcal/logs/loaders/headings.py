@@ -191,7 +191,8 @@ def sensors_of(
     """
     native = [key for key in keys if key not in taken and split(key)[0] in own]
     if native or any(name in own for name in taken.values()):
-        return [Sensor("", _native(keys, taken))]
+        warm = {} if "temp" in taken.values() else _temperature(FORMS[-1], _free(FORMS[-1], keys, taken), "")
+        return [Sensor("", warm | _native_time(keys, taken))]
     for form in FORMS:
         if form.before and before is not None and not any(line.startswith(form.before) for line in before):
             continue
@@ -212,12 +213,6 @@ def sides_of(keys: Iterable[str]) -> Sensor | None:
     listed = list(keys)
     meant = _temperature(form, listed, "")
     return Sensor("", {**meant, **_time(form, listed, {}, "")}) if meant else None
-
-
-def _native(keys: Sequence[str], taken: Mapping[str, str]) -> dict[str, Meaning]:
-    """The time and the temperature of a table whose axes need no form."""
-    warm = {} if "temp" in taken.values() else _temperature(FORMS[-1], _free(FORMS[-1], keys, taken), "")
-    return warm | _native_time(keys, taken)
 
 
 def _native_time(keys: Sequence[str], taken: Mapping[str, str]) -> dict[str, Meaning]:
@@ -280,12 +275,12 @@ def _axes(form: _Form, keys: Sequence[str]) -> Iterator[tuple[str, str, re.Match
     yield from told
 
 
-def _kind(unit: str | None) -> str | None:
-    """`g` for a unit of a rate of turn, `a` for one of an acceleration, None for others."""
+def _kind(unit: str | None, kinds: Sequence[tuple[str, str]] = (("g", "rad/s"), ("a", "m/s^2"))) -> str | None:
+    """`g` for a unit of a rate of turn, `a` for one of an acceleration, None for others. `kinds`: names of units."""
     name = units.plain(unit) if unit is not None else units.LSB
     if name == units.LSB or not units.known(name):
         return None
-    return next((letter for letter, kind in (("g", "rad/s"), ("a", "m/s^2")) if units.same_kind(name, kind)), None)
+    return next((letter for letter, kind in kinds if units.same_kind(name, kind)), None)
 
 
 def _fits(unit: str | None) -> bool:
@@ -295,18 +290,13 @@ def _fits(unit: str | None) -> bool:
     )
 
 
-def _is_time(unit: str) -> bool:
-    name = units.plain(unit)
-    return name != units.LSB and units.known(name) and units.same_kind(name, "s")
-
-
 def _time(form: _Form, keys: Sequence[str], taken: Mapping[str, str], source: str) -> dict[str, Meaning]:
     """The best time column for a source."""
     if "t" in taken.values():
         return {}
     for pattern, unit in form.times:
         for key, match, stated in _matching(pattern, keys):
-            if (stated or unit == "") and not _is_time(stated or ""):
+            if (stated or unit == "") and _kind(stated or "", (("t", "s"),)) is None:
                 continue
             if (match.groupdict().get("source") or source).strip("/. ") == source:
                 return {key: Meaning("t", stated or unit, form.count)}

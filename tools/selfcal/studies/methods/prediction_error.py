@@ -7,8 +7,7 @@ import warnings
 import numpy as np
 from statsmodels.tsa.arima.model import ARIMA
 
-from selfcal.studies.methods.arma_form import of_coefficients
-from selfcal.studies.methods.problem import Answer, Problem, Value
+from selfcal.studies.methods.problem import Answer, Problem, Value, of_coefficients
 
 _ORDER = {"random_walk": (0, 1, 1), "gauss_markov": (1, 0, 1)}
 

@@ -189,3 +189,19 @@ def information_criteria(ln_likelihood: Mapping[str, float], n: int) -> dict[str
     aic = {law: 2.0 * len(NAMED[law].parameters) - 2.0 * value for law, value in ln_likelihood.items()}
     bic = {law: math.log(n) * len(NAMED[law].parameters) - 2.0 * value for law, value in ln_likelihood.items()}
     return {"AIC": weights(aic), "BIC": weights(bic)}
+
+
+def of_coefficients(law: str, phi: float, theta: float, variance: float, dt_s: float) -> dict[str, Value]:
+    """The parameters by the equivalent ARMA form: a random walk under white noise is ARIMA(0,1,1), Gauss-Markov
+    ARMA(1,1). Coefficients that belong to no such sum give no answer.
+
+    Both sides of y[k] - phi y[k-1] = e[k] + theta e[k-1], e of `variance`, have equal covariances at lags 1 and 0. A
+    random walk has phi = 1."""
+    white = -theta * variance / phi if phi else math.nan
+    step = (1.0 + theta**2) * variance - (1.0 + phi**2) * white
+    parameters = {"N": root(white * dt_s)}
+    if law == "random_walk":
+        return parameters | {"K": root(step / dt_s)}
+    stable = 0.0 < phi < 1.0
+    parameters["sigma_m"] = root(step / (1.0 - phi**2)) if stable else Value(math.nan)
+    return parameters | {"alpha": Value(-math.log(phi) / dt_s if stable else math.nan)}

@@ -10,8 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from selfcal.studies.methods.arma_form import of_coefficients
-from selfcal.studies.methods.problem import Answer, Floats, Problem
+from selfcal.studies.methods.problem import Answer, Floats, Problem, of_coefficients
 
 #: Forgetting of the first sample, and the share that each further sample keeps of it: the early errors are poor.
 FORGET, KEEP = 0.05, 0.99

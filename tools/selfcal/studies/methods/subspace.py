@@ -11,9 +11,8 @@ import numpy as np
 from scipy import linalg
 from statsmodels.tsa.stattools import levinson_durbin
 
-from selfcal.studies.methods.arma_form import of_coefficients
 from selfcal.studies.methods.autocorrelation import PART
-from selfcal.studies.methods.problem import Answer, Floats, Problem
+from selfcal.studies.methods.problem import Answer, Floats, Problem, of_coefficients
 
 #: Lags at most; of a short record PART: as many parameters take ten samples each.
 MOST = 60

@@ -254,7 +254,7 @@ def figures_5_and_6(model: Model, records: Mapping[str, Array], real_ones: bool,
                 title,
                 "time, s",
                 f"rms, {unit}",
-                [Curve("computed (14)", t, _sd(seen, name) / scale), their_rms, real_rms],
+                [Curve("computed (14)", t, _numbers(seen, name, "sd") / scale), their_rms, real_rms],
                 log_y=True,
             )
             for title, seen in reports.items()
@@ -294,8 +294,8 @@ def figures_5_and_6(model: Model, records: Mapping[str, Array], real_ones: bool,
     ]
 
 
-def _sd(seen: Sequence[AxisResult], name: str) -> Array:
-    return np.array([one.parameters["random_walk"][name].sd for one in seen])
+def _numbers(seen: Sequence[AxisResult], name: str, key: str) -> Array:
+    return np.array([getattr(result.parameters["random_walk"][name], key) for result in seen])
 
 
 def _span(values: Array) -> str:
@@ -303,9 +303,8 @@ def _span(values: Array) -> str:
 
 
 def _parameter(title: str, seen: Sequence[AxisResult], name: str, t: Array, line: Sequence[Curve]) -> Panel:
-    estimates = [one.parameters["random_walk"][name] for one in seen]
     unit, scale, _ = SHOWN[name]
-    low, middle, high = (np.array([getattr(e, key) for e in estimates]) / scale for key in ("q05", "median", "q95"))
+    low, middle, high = (_numbers(seen, name, key) / scale for key in ("q05", "median", "q95"))
     curves = [Curve("median", t, middle), *line]
     return Panel(title, "time, s", unit, curves, [Band("5 to 95 %", t, low, high, "spread")], log_y=name == "K")
 
