@@ -532,7 +532,8 @@ def locked(seen: Seen, one: Candidate) -> Candidate:
 
         def gain(tried: Array, model: Joint = model, weights: Array = found.weights) -> Array:
             waves = np.vstack([_waves(float(each), n, multiples) for each in tried])
-            return full(waves @ weights, information(model, seen.y, waves)).reshape(tried.size, -1).sum(axis=1)
+            gains = full(waves @ weights, information(model, seen.y, waves))
+            return np.asarray(gains.reshape(tried.size, -1).sum(axis=1))
 
         sharp = _sharpest(gain, f, 0.5 ** min(k, 2) / n)
         waves = _waves(sharp, n, multiples)
