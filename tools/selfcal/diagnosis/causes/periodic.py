@@ -17,13 +17,15 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit, fit, moved
-from selfcal.likelihood.state import Look, Regressor, State, interval, net
+from selfcal.likelihood.state import ALIKE, Look, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array, Mask
 
 #: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
 TURNS_LEAST, BAND_TURNS = 1.5, 3.0
 #: A line of fewer turns is as slow as a drift: its gain must hold beside one of two terms, and its search costs more.
 SLOW_TURNS = 30.0
+#: Lines of two axes are one if their frequencies are so near, turns in the record.
+SAME = 0.25
 #: Widths of a band in bins of the periodogram.
 BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
 #: A band must show this much, nats net of the search, before it is fitted; and explain this much more than a line.
@@ -194,15 +196,45 @@ def _line(state: State, record: Record) -> list[Look]:
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
-    """The look at a line of a known frequency, and multiples of it."""
+    """The look at a line of a known frequency, and multiples of it: several axes have them in common."""
     multiples = [round(k) for k in theta[1:] if k * theta[0] < 0.5 * record.rate_hz]
-    return columns.located(state, "periodic", shape(state, record, theta[0], multiples=multiples))
+    known = shape(state, record, theta[0], multiples=multiples)
+    return columns.located(state, "periodic", replace(known, sharper=None))
 
 
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    """Lines that axes have in common have one frequency, that of the axis that shows it best. Returns the axes whose
+    model changed."""
+    lines = [
+        (name, finding)
+        for name, one in found.items()
+        for finding in one.findings
+        if finding.look.cause == "periodic" and finding.columns and finding.record is None
+    ]
+    first: list[tuple[str, float]] = []
+    changed = []
+    for name, finding in sorted(lines, key=lambda line: -line[1].look.gain):
+        one, hz = found[name], _hz(finding.look)
+        common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME), hz)
+        multiples = finding.look.estimate.get("harmonics", [])
+        free = one.state.without({column.name for column in finding.columns})
+        look = at(free, record, (common, *multiples))
+        after = free if common == hz else free.refit(**look.changes)
+        if common == hz or after.best.ln_likelihood < one.state.best.ln_likelihood - ALIKE:
+            first.append((name, hz))
+            continue
+        look = replace(look, gain=finding.look.gain, net=finding.look.net)
+        own = finding.before.refit(**at(finding.before, record, (common, *multiples)).changes)
+        one.findings[one.findings.index(finding)] = replace(finding, look=look, after=own)
+        one.state = after
+        changed.append(name)
     for one in found.values():
         _harmonics(one)
-    return []
+    return changed
+
+
+def _hz(look: Look) -> float:
+    return float(look.estimate["frequency_hz"]["median"])
 
 
 def _harmonics(one: Diagnosed) -> None:
