@@ -625,7 +625,8 @@ class Search:
         one's own."""
         vain: list[Candidate] = []
         firm: list[Candidate] = []
-        while len(self.several) + len(self.single) < MOST:
+        turns = MOST - len(self.several) - len(self.single)
+        while turns > 0:
             left = {
                 name: [one for one in each if not any(one is other for other in vain)]
                 for name, each in self.known.items()
@@ -641,6 +642,7 @@ class Search:
                 firm.append(locked(self.seen, found))
                 self.known["line"] = [firm[-1] if one is found else one for one in self.known["line"]]
                 continue
+            turns -= 1
             own = self._is_own(found)
             if own and found.cause in JUMPS:
                 for time in found.theta:
