@@ -25,7 +25,7 @@ from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import CODES, PIECE, PIECES, Uneven, fit_of, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
-from selfcal.readings.lost_words import Recurring, recurring_of
+from selfcal.readings.lost_words import Recurring, is_limit, recurring_of
 from selfcal.readings.misread import ABOUT_ZERO, Misread, misread_of, spans_of
 from selfcal.readings.motion import Moved, moves_of
 
@@ -574,6 +574,8 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
             worth = max(worth, (count - 2) * math.log(100.0))
         if worth < nats_of("saturation") or count < 0.5 * expected:
             continue
+        if not is_limit(y[~at_edge], sign * edge, count, 2.0 * half):
+            continue  # the others do not come near it: a word that the logger shows for lost ones
         mask = np.zeros(values.size, bool)
         mask[rows[at_edge]] = True
         limits[sign * edge] = mask
