@@ -41,6 +41,8 @@ LEVEL, SQUARES = 9, 1.29
 WINDOW_S, SIDE, SIDE_S, SIDE_SQUARES = 32.0, 8, 10.0, 30
 #: Probability, a record, that axes at rest move together, and that one moves alone.
 SHARE = SHARES["motion"]
+#: Share of its windows by which an axis' own loudness counts: of an axis alone at most the rest may be loud.
+OWN = 0.9
 #: Quantiles of the means of windows that show their spread without the loud ones: the median, and one sd below it.
 QUIETER = (0.1587, 0.5)
 #: Nats by which the search over windows costs all axes together less than as many windows apart: of 250 clean records
@@ -127,7 +129,8 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
 def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, float]:
     """Begin and end of a stretch, s, a margin more on either side."""
     begin, end, length_s = one.begin * energy.piece_s, one.end * energy.piece_s, recording.duration_s
-    return begin - MARGIN_S if begin > EDGE_S else 0.0, end + MARGIN_S if end < length_s - EDGE_S else length_s
+    margin_s = max(MARGIN_S, 3.0 * energy.piece_s)  # the first loud samples may look like single wild ones
+    return begin - margin_s if begin > EDGE_S else 0.0, end + margin_s if end < length_s - EDGE_S else length_s
 
 
 def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
@@ -167,8 +170,11 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
 def _scaled(y: Array, size: int = LEVEL) -> Array:
     """Values [n] about their level over their noise; empty where most are alike: below the lattice, or bridged."""
     apart = y - _level(y, size)
-    there = np.abs(apart[apart != 0.0])
-    return apart * (MEDIAN_SD / float(np.median(there))) if 2 * there.size > apart.size else np.zeros(0)
+    size_of = np.abs(apart)
+    noise = float(np.median(size_of)) if apart.size else 0.0
+    if size > LEVEL and noise > 0.0:
+        noise = float(np.median(size_of[size_of > 0.0]))  # a long still stretch shows no noise
+    return apart * (MEDIAN_SD / noise) if noise > 0.0 else np.zeros(0)
 
 
 def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> list[Array]:
@@ -243,6 +249,8 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     for length in lengths:
         begin = np.arange(0, pieces - length + 1, max(1, length // 4))
         nats, inside, wide = _nats(energy, begin, length, wide)
+        own = np.quantile(nats, OWN, axis=2, keepdims=True) / math.log(0.5 / (1.0 - OWN))
+        nats = nats / np.maximum(1.0, own)
         nats, others = nats[:-1], nats[-1]
         loudest = nats.max(axis=1)
         alone = np.where(inside, loudest, 0.0)
