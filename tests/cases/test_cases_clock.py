@@ -355,6 +355,27 @@ def test_rows_lost_in_a_pattern_are_missing_and_told(
     assert "missing, at regular intervals" in note
 
 
+@pytest.mark.parametrize(
+    ("tick_s", "rates_hz"), [(0.02, (50.0, 40.0)), (0.008, (100.0, 125.0)), (0.1, (10.0, 9.0)), (0.005, (200.0, 150.0))]
+)
+def test_a_change_to_a_slower_rate_within_the_tick_is_no_loss(
+    tick_s: float, rates_hz: tuple[float, float], tmp_path: Path
+) -> None:
+    """The stamps have the tick of the faster rate, so the slower one skips ticks in a pattern. Rates to a tick over the
+    shorter part of 3000 rows; the change lies within 10 rows of row 3000."""
+    time = np.concatenate([np.arange(3000) / rates_hz[0], 3000 / rates_hz[0] + np.arange(4000) / rates_hz[1]])
+    stamps = tick_s * np.floor(time / tick_s + 0.4)
+    (change,) = rate_changes(stamps - stamps[0])
+    assert abs(change.row - 3000) <= 10
+    assert 1.0 / np.array([change.before_s, change.after_s]) == pytest.approx(rates_hz, rel=1e-3)
+    log = tmp_path / "log.csv"
+    rows = "\n".join(
+        f"{t:.3f},{v:.4f}" for t, v in zip(stamps, np.random.default_rng(1).normal(size=7000), strict=True)
+    )
+    log.write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
+    assert "the sampling rate changes" in load(log).notes[0]
+
+
 @pytest.mark.parametrize("pattern", ["110", "11110", "101101"])
 def test_a_pattern_of_ticks_names_the_rate_that_loses_rows(pattern: str, tmp_path: Path) -> None:
     """A slower sensor stamped in ticks of 0.01 s writes the same, as 66.7 Hz does. The line names the rate to state."""

@@ -115,14 +115,42 @@ def test_a_map_of_the_readings_is_named_in_both_verbs(read: Callable[[Array, Ran
             ]
 
 
-@pytest.mark.parametrize("bit", [1, 3])
-@pytest.mark.parametrize("level", [0, 613])
-def test_a_bit_that_never_changes_is_named(bit: int, level: int) -> None:
-    """Codes of noise of 14 steps with one bit at 1, or at 0. Codes with every bit are sound."""
-    x = np.rint(14.0 * np.random.default_rng([96, bit]).standard_normal(9000)).astype(int) + level
+@pytest.mark.parametrize(("bit", "noise"), [(1, 14.0), (3, 14.0), (4, 9.0)])
+@pytest.mark.parametrize("level", [0, 613, 793])
+def test_a_bit_that_never_changes_is_named(bit: int, noise: float, level: int) -> None:
+    """Codes of noise of some steps with one bit at 1, or at 0. Codes with every bit are sound. Of 793 a bit of 16 steps
+    changes in the tails alone."""
+    x = np.rint(noise * np.random.default_rng([96, bit]).standard_normal(9000)).astype(int) + level
     for kind, code in (("bit_set", x | (1 << bit)), ("bit_clear", x & ~(1 << bit)), (None, x)):
         found = look(a_recording(40.0, gx=0.02 * code), "gx", MODEL.group_of("gx")).misread
         assert (None if found is None else found.kind) == kind
+
+
+@pytest.mark.parametrize("share", [0.04, 0.15])
+@pytest.mark.parametrize("level", [7.4, -3.2, 0.9])
+def test_a_lost_fraction_is_no_limit(level: float, share: float) -> None:
+    """A share of the readings of two decimals is printed without them. A whole number comes too often: that is named,
+    and not a limit."""
+    random = np.random.default_rng([97, round(100.0 * share)])
+    y = np.round(level + 0.25 * random.standard_normal(9000), 2)
+    lost = random.random(y.size) < share
+    seen = look(a_recording(25.0, gx=np.where(lost, np.trunc(y), y)), "gx", MODEL.group_of("gx"))
+    assert seen.clipped is None
+    assert seen.recurring is not None
+    assert seen.recurring.value == round(seen.recurring.value)
+    assert 0.0 < seen.recurring.share < 1.1 * share
+
+
+@pytest.mark.parametrize("share", [0.25, 0.4])
+def test_a_word_far_off_is_no_dead_band(share: float) -> None:
+    """A share of the readings is 17 in place of some 1.5, on a lattice that is fine beside their spread."""
+    random = np.random.default_rng([98, round(100.0 * share)])
+    y = 0.012 * np.rint((1.5 + 0.2 * random.standard_normal(9000)) / 0.012)
+    seen = look(a_recording(25.0, gx=np.where(random.random(y.size) < share, 17.004, y)), "gx", MODEL.group_of("gx"))
+    assert seen.uneven is None and seen.clipped is None
+    assert seen.recurring is not None
+    assert seen.recurring.value == pytest.approx(17.004)
+    assert abs(seen.recurring.share - share) < 0.02
 
 
 @pytest.mark.parametrize(("noise", "undone"), [(5.0, True), (22.0, True), (47.0, False)])

@@ -324,12 +324,17 @@ def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
     if len(parts) < 2:
         return []
     level = [math.exp(float(np.median(value[a:b]))) for a, b in parts]
-    ends = [0, *(_bend(time, *found, size) for found in zip(pairwise(parts), pairwise(level), strict=True)), n]
+    lattice = common_step(np.diff(time), 1e-6 * min(level)) if max(level) > 1.05 * min(level) else 0.0
+    # The longest step without a loss: stamps are rounded up at most to the next place of their lattice.
+    most = [max(1.5 * step, 1.001 * lattice * math.ceil(step / lattice - 1e-3) if lattice else 0.0) for step in level]
+    pairs = zip(pairwise(parts), pairwise(level), pairwise(most), strict=True)
+    ends = [0, *(_bend(time, *found, size) for found in pairs), n]
     spans = [slice(a, b) for a, b in pairwise(ends)]
-    if any(b - a < 2 * _STEPS for a, b in pairwise(ends)) or _lossy_parts(time, spans, level):
+    if any(b - a < 2 * _STEPS for a, b in pairwise(ends)) or _lossy_parts(time, spans, level, lattice):
         return []
     own = [np.diff(time[one.start : one.stop + 1]) for one in spans]
-    exact = [float(each[np.abs(each - step) < 0.5 * step].mean()) for each, step in zip(own, level, strict=True)]
+    kept = [each[(each > 0.5 * step) & (each < last)] for each, step, last in zip(own, level, most, strict=True)]
+    exact = [float(each.mean()) for each in kept]
     scatter = max(1e-3, _scatter(value, parts))
     return [
         Change(row, *intervals, min(1e6, 0.5 * n * math.log(intervals[1] / intervals[0]) ** 2 / scatter**2))
@@ -385,23 +390,33 @@ def _scatter(value: NDArray[np.float64], parts: list[tuple[int, int]]) -> float:
 
 
 def _bend(
-    time: NDArray[np.float64], parts: tuple[tuple[int, int], tuple[int, int]], level: tuple[float, float], size: int
+    time: NDArray[np.float64],
+    parts: tuple[tuple[int, int], tuple[int, int]],
+    level: tuple[float, float],
+    most: tuple[float, float],
+    size: int,
 ) -> int:
-    """First row of the second of two parts [first piece, piece after], with intervals `level`, s: the row farthest from
-    the line of the mean interval, gaps left out."""
+    """First row of the second of two parts [first piece, piece after], with intervals `level`, s, of `most`: the row
+    farthest from the line of the mean interval, gaps left out."""
     (begin, a), (b, end) = parts
     first = max(0, (max(begin + 1, a - 1)) * size)
     last = min(time.size - 1, min(end, b + 2) * size + (_STEPS if end - b > 2 else 0))
     each = np.diff(time[first : last + 1])
-    line = np.cumsum(np.where(each < 1.5 * max(level), each - 0.5 * sum(level), 0.0))
+    line = np.cumsum(np.where(each < max(most), each - 0.5 * sum(level), 0.0))
     return first + 1 + int(np.argmax(line) if level[0] > level[1] else np.argmin(line))
 
 
-def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[float]) -> bool:
-    """Whether a part is no slower one: it lies on the grid of the fastest part, and on none of its own interval."""
+def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[float], lattice: float) -> bool:
+    """Whether a part is no slower one: it lies on the grid of the fastest part, and on none of its own interval, nor
+    are its stamps rounded to a coarse `lattice`."""
     fastest = min(level)
     heads = [(time[one][:_STRETCH], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
-    return any(not _even(head, step) and _even(head, fastest) for head, step in heads)
+    coarse = [lattice > _COARSE * fastest and in_pattern(np.rint(np.diff(head) / lattice)) for head, _ in heads]
+    return any(
+        not _even(head, step) and _even(head, fastest)
+        for (head, step), rounded in zip(heads, coarse, strict=True)
+        if not rounded
+    )
 
 
 def common_step(steps: NDArray[np.float64], tolerance: float) -> float:

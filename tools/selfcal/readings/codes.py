@@ -35,6 +35,8 @@ SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 
 CELLS, PILE, PILE_SHARE = 4.0, 20, 0.01
 #: Times that it is commoner than the next one, at least.
 STANDS_OUT = 3.0
+#: Quantiles of the readings that all codes and dead bands lie between.
+INNER = (0.01, 0.99)
 #: Times that the shares and the levels are found in turn.
 TURNS = 3
 #: Chance of a reading that the noise and the codes, or a map, do not make.
@@ -194,8 +196,9 @@ def _pile(y: Array) -> tuple[float, float, float] | None:
     largest = np.sort(counts)[::-1]
     if largest[0] < max(PILE, PILE_SHARE * y.size, STANDS_OUT * float(largest[1:2].sum())):
         return None
-    step = float(np.diff(y).std()) / math.sqrt(2.0) / CELLS
-    return (float(unique[np.argmax(counts)]), step, 1.0 / CELLS) if step > 0.0 else None
+    value, step = float(unique[np.argmax(counts)]), float(np.diff(y).std()) / math.sqrt(2.0) / CELLS
+    low, high = np.quantile(y[y != value], INNER)
+    return (value, step, 1.0 / CELLS) if step > 0.0 and low < value < high else None  # beyond, it is a lost word
 
 
 def _candidates(count: Array, fit: _Fit) -> Iterator[_Read]:

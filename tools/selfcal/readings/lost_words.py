@@ -27,15 +27,13 @@ COMMON, CODES = 0.2, 8
 #: Readings of a value whose neighbours are looked at, at most; these on either side, and how far off they may be, in
 #: the noise.
 SAMPLED, AROUND, NEAR = 50_000, 8, 3.0
-#: ln of the count over the expected one, over the largest of any other value, at least.
+#: On a coarse lattice ln of the count over the expected one, over the largest of any other value, at least.
 OVER_OTHERS = 2.5
 #: Counts of three codes from which on they alone show the next one's.
 MANY = 30.0
 #: The others come close to a limit of the part: within this many of their standard deviations, or at the next value,
 #: are this share of its own readings, or of the others. At the largest of some hundred normal readings are fewer.
 CLOSE, CLOSE_OWN, CLOSE_OTHERS = 0.5, 0.5, 0.05
-#: Readings that begin beyond a dead band at least, within half its width and half the noise. A tail has fewer.
-GAP_FULL = 20
 #: Neighbours whose mean is the level of a lost word among the readings. Of few the mean would follow their noise, and
 #: the words left would follow them.
 LEVEL = 1001
@@ -88,8 +86,7 @@ def _too_often(y: Array, sigma: float, rate_hz: float) -> tuple[float, float, fl
     """The value to which readings [n] come too often, its evidence, and the share of its readings that are too many.
     `sigma`: their noise.
 
-    ln of the counts is smooth over the values: neighbours show the expected count. Codes of unequal width show as much
-    excess at other values too. A dead band takes its counts from its neighbours, and a limit takes all beyond it. In
+    ln of the counts is smooth over the values: neighbours show the expected count. A limit takes all beyond it. In
     motion a part comes to its limits. On a lattice coarser than the noise a word shows that has no neighbours.
     """
     value, counts = np.unique(y[_no_stuck(y)], return_counts=True)
@@ -115,19 +112,15 @@ def _too_often(y: Array, sigma: float, rate_hz: float) -> tuple[float, float, fl
     lattice = lattice_of(others, rate_hz)
     if lattice is not None and lattice.coarseness > COARSEST and expected[top] >= 1.0:
         return None
-    beside = _is_beside(others, word)
-    smooth = 0.0 if beside else float(expected[top])
-    expected, sd = _beside_codes(np.where(np.arange(count.size) == top, smooth, count))
-    sd = np.sqrt(sd**2 + 1.0 / (count + 0.5))
-    chance = math.sqrt(2.0 * math.log(2.0 * count.size)) * sd  # the largest of as many
-    at_others = np.delete(np.abs(np.log((count + 0.5) / expected)) - chance, top)
+    smooth = 0.0 if _is_beside(others, word) else float(expected[top])
+    if 4.0 * step > COARSEST * sigma and smooth > 0.0:  # counts are not smooth: the others show how much
+        expected, sd = _beside_codes(np.where(np.arange(count.size) == top, smooth, count))
+        chance = math.sqrt(2.0 * math.log(2.0 * count.size)) * np.sqrt(sd**2 + 1.0 / (count + 0.5))
+        at_others = np.delete(np.abs(np.log((count + 0.5) / expected)) - chance, top)
+        if excess[top] < OVER_OTHERS * max(0.0, float(at_others.max(initial=0.0))):
+            return None
     spacing = step or float(np.median(np.diff(value)))
-    if (
-        (not beside and excess[top] < OVER_OTHERS * max(0.0, float(at_others.max(initial=0.0))))
-        or _has_gaps(others, word, sigma, spacing)
-        or _is_limit(others, word, int(own.sum()), spacing)
-        or not _rests(y, own, sigma)
-    ):
+    if is_limit(others, word, int(own.sum()), spacing) or not _rests(y, own, sigma):
         return None
     return word, float(worth[top]) - math.log(value.size), 1.0 - smooth / (float(count[top]) + 0.5)
 
@@ -139,20 +132,7 @@ def _is_beside(others: Array, value: float) -> bool:
     return abs(off - round(off)) > 0.1
 
 
-def _has_gaps(others: Array, value: float, sigma: float, step: float) -> bool:
-    """Whether the `others` [n], a `step` apart, leave a gap on either side of a value and begin at once beyond it: a
-    dead band."""
-    offset = others - value
-    above, below = offset[offset > 0.0], -offset[offset < 0.0]
-    if not (above.size and below.size):
-        return False
-    gap = min(float(above.min()), float(below.min()))
-    edge = gap + 0.5 * min(gap - step, sigma)
-    most = max(np.count_nonzero(above < edge), np.count_nonzero(below < edge))
-    return gap > 1.5 * step and int(most) > GAP_FULL
-
-
-def _is_limit(others: Array, value: float, count: int, step: float) -> bool:
+def is_limit(others: Array, value: float, count: int, step: float) -> bool:
     """Whether a value at the edge of all readings has the `count` that a limit of the part makes of their noise: the
     `others` [n] come close to it."""
     if float(others.min()) < value < float(others.max()):

@@ -19,7 +19,7 @@ from scipy.special import ndtr
 
 from selfcal.base.grid import Array, counts_of_pieces, noise_of
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import ODD, PIECE, ln_of
+from selfcal.readings.codes import INNER, ODD, PIECE, ln_of
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 
 #: Noises of a jump at least, jumps at least, the share of them that have one size, and how far off they are, in noises.
@@ -28,8 +28,8 @@ JUMP, JUMPS_LEAST, ALIKE, OFF = 12.0, 5, 0.9, 6.0
 LIKE_NOISE = 0.3
 #: Share of the readings that bytes of two readings are at most.
 TORN_MOST = 0.25
-#: Bits at least of a count that goes round; share of the readings below and above the codes that must all come.
-BITS_LEAST, INNER = 5, (0.1, 0.9)
+#: Bits at least of a count that goes round.
+BITS_LEAST = 5
 #: Noises of a reading in the circle of a count from which on each reading has its turn.
 WHOLE = 8.0
 #: Pieces of a record that have a level each, at most.

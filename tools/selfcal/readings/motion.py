@@ -4,8 +4,9 @@ Energy is that of second differences of the readings and of short means, about a
 none. A window is compared with its louder side, at its own length. So noise that grows, breathes or stays loud is no
 motion. At rest the mean of n squares exceeds r times its expectation with a probability below
 exp(-n (r - 1 - ln r) / 2) (Chernoff). Axes are independent at rest: the sensor moves where those but the loudest are
-louder together, or where one is so loud that no other window of its record is. A hand that turns slowly, or pushes,
-shows in the level (`away`).
+louder together, or where one is so loud that no other window of its record is. A hand that pushes shows in the level:
+how far it is from a long running median, beyond any noise. At an end of the record one side is missing and noise may
+have grown: an axis alone moves there where most of its readings are pushed.
 """
 
 from __future__ import annotations
@@ -17,21 +18,19 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from scipy.ndimage import maximum_filter1d, median_filter
-from scipy.special import bdtrc, fdtrc, gammaincinv
+from scipy.ndimage import median_filter
+from scipy.special import fdtrc, gammaincinv
 
-from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means, runs
-from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
+from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means
+from selfcal.logs.recording import SIDE_CHANNELS, Recording
 from selfcal.readings.budget import SHARES
 
-Interval = tuple[int, int]
 Time = TypeVar("Time", int, float)
 
 #: Length of a piece, s, and pieces at most.
 PIECE_S, PIECES_MOST = 0.1, 40_000
-#: Lengths of the means whose differences are taken beside the readings', and of the blocks that hands are looked for
-#: in, s: a knock is short, and a hand that turns slowly shows in long ones alone. Readings in one at least: with fewer
-#: each sample is a block, as no median leaves one out.
+#: Lengths of the means whose energy is taken beside the readings', s: a knock is short, and a hand that turns slowly
+#: shows in long ones alone. Pushes are looked for in the shortest ones. Readings in one at least.
 BANDS_S, BAND_LEAST = (0.1, 0.5), 5
 #: Standard deviations of the median about a wild reading at most, and of itself at least.
 WILD = (3.0, 8.0)
@@ -59,32 +58,12 @@ TINY = 1e-300
 SHARED = 0.05
 #: Standard deviations of a correlation by chance from which on axes depend on each other, and that of a copy.
 CORRELATED, COPY = 5.0, 0.999
-
-#: The minutes about a block that its level and its noise are compared with, s. What lasts longer than half is no motion
-#: but the record's own. At either end of the record they lie on one side.
-AROUND_S = 240.0
-#: A block is loud from so many times the usual deviation of its level on: of 10^6 normal blocks none is. Or from so
-#: many times the usual noise within it on, in a longer stretch of more: noise changes by itself.
-LOUD, LOUD_WITHIN, LOUD_LASTING = 8.0, 7.0, 12.0
-#: The usual deviation is at least this share of the record's own, so that a still stretch makes no other one loud.
+#: Usual deviations from which on a deviation from the level is a push, and seconds whose running median is that level.
+PUSH, PUSH_S = 8.0, 10.0
+#: The noise beside a window is at least this share of the record's own: a still stretch makes no other one loud.
 STILL = 0.5
-#: Loud blocks closer than this are one stretch, s; it begins and ends so much beyond them, s.
-APART_S, MARGIN_S = 2.0, 0.5
-#: A stretch this close to an end of the record reaches it, s: hands began before it, or ended after.
-EDGE_S = 5.0
-#: A stretch holds so many loud samples at least, and in this share of its blocks the level leaps or the spread is loud:
-#: two jumps of the bias are still between. In a stretch this short, s, two such blocks are enough: in, and out.
-SAMPLES_LEAST, ROUGH_LEAST, ROUGH_COUNT, SHORT_S = 3, 0.2, 4, 5.0
-#: Of the leaps of a stretch so much goes back at least: a jump and a transient go one way.
-BACK_LEAST = 0.1
-#: So many stretches on one level, alike to this share of it, or a long one, are a bias with two levels.
-ALIKE_LEAST, ALIKE = 2, 0.2
-#: Probability, a record, that samples which are loud by chance make a stretch.
-CHANCE = 1e-5
-#: More than this share of a record is no exception.
-SHARE_MOST = 0.25
-#: Deviations beyond this count no more: the evidence of a stretch is certain long before. No bias has such two levels.
-DEVIATION_MOST = 100.0
+#: A stretch begins and ends so much beyond its pieces, s. This close to an end of the record it reaches it, s.
+MARGIN_S, EDGE_S = 0.5, 5.0
 
 
 @dataclass(frozen=True)
@@ -99,20 +78,22 @@ class Moved:
 
 @dataclass(frozen=True)
 class Energy:
-    """Squares of axes over their variance, summed in pieces of `piece_s`: `sums` and `counts` [axes, bands, pieces], of
-    single readings and of means of BANDS_S. `apart`: the readings of each axis about their level, over their noise [n],
-    and the piece that each is in [n]."""
+    """Squares of axes over their variance, `most` [axes] at most, in pieces of `piece_s`: `sums`, `counts` and the sums
+    of their own `squares` [axes, bands, pieces], of single readings, of means of BANDS_S, and of pushes. `apart`: the
+    readings of each axis about their level, over their noise [n], and the piece that each is in [n]."""
 
     piece_s: float
     sums: Array
     counts: Array
+    squares: Array
     apart: tuple[tuple[Array, Rows], ...]
+    most: Array
 
     @cached_property
-    def before(self) -> tuple[Array, Array]:
-        """Sums and counts of all pieces before each one, and of all, [axes, bands, pieces + 1] each."""
-        sums, counts = (np.pad(np.cumsum(one, axis=2), ((0, 0), (0, 0), (1, 0))) for one in (self.sums, self.counts))
-        return sums, counts
+    def before(self) -> tuple[Array, ...]:
+        """Sums, counts and squares of all pieces before each one, and of all, [axes, bands, pieces + 1] each."""
+        every = (self.sums, self.counts, self.squares)
+        return tuple(np.pad(np.cumsum(one, axis=2), ((0, 0), (0, 0), (1, 0))) for one in every)
 
 
 @dataclass(frozen=True)
@@ -148,7 +129,8 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
 def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, float]:
     """Begin and end of a stretch, s, a margin more on either side."""
     begin, end, length_s = one.begin * energy.piece_s, one.end * energy.piece_s, recording.duration_s
-    return begin - MARGIN_S if begin > EDGE_S else 0.0, end + MARGIN_S if end < length_s - EDGE_S else length_s
+    margin_s = max(MARGIN_S, 3.0 * energy.piece_s)  # the first loud samples may look like single wild ones
+    return begin - margin_s if begin > EDGE_S else 0.0, end + margin_s if end < length_s - EDGE_S else length_s
 
 
 def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
@@ -157,7 +139,7 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     length_s = max(float(clock.time_s[-1]) + 1.0 / clock.rate_hz for clock in clocks)
     piece_s = max(PIECE_S, 1.0 / max(clock.rate_hz for clock in clocks), length_s / PIECES_MOST)
     count = math.ceil(length_s / piece_s - 1e-6)
-    sums, counts = np.zeros((2, len(names), 1 + len(BANDS_S), count))
+    sums, counts, squares = np.zeros((3, len(names), 2 + len(BANDS_S), count))
     there = [np.isfinite(recording.columns[name].values) for name in names]
     tame = [_tame(recording.columns[name].values[each]) for name, each in zip(names, there, strict=True)]
     scaled_rows = [_scaled(own) for own, _ in tame]
@@ -165,24 +147,34 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     readings = []
     for k, (clock, own) in enumerate(zip(clocks, rows, strict=True)):
         time = clock.time_s[there[k]]
-        for band, size in enumerate([1, *(round(band_s * clock.rate_hz) for band_s in BANDS_S)]):
-            if band and not BAND_LEAST <= size <= own.size // SIDE_SQUARES:
+        sizes = [1, *(round(band_s * clock.rate_hz) for band_s in BANDS_S)]
+        sizes.append(sizes[1] if sizes[1] >= BAND_LEAST else 1)
+        for band, size in enumerate(sizes):
+            pushes, more = band == len(sizes) - 1, size > 1
+            if (band and not (pushes or more)) or (more and not BAND_LEAST <= size <= own.size // SIDE_SQUARES):
                 continue
             means, at = block_means(own, size), block_means(time, size)
-            scaled = _scaled(means)
+            around = round(PUSH_S * clock.rate_hz / size) if pushes else LEVEL
+            scaled = _scaled(_tame(means, around)[0] if pushes else means, around)
+            if pushes:
+                scaled = np.maximum(np.abs(scaled) - PUSH, 0.0)
             piece = np.minimum((at[: scaled.size] / piece_s + 1e-6).astype(np.int64), count - 1)
-            sums[k, band] = np.bincount(piece, np.minimum(scaled**2, tame[k][1]), minlength=count)
-            counts[k, band] = np.bincount(piece, minlength=count)
+            square = np.minimum(scaled**2, tame[k][1])
+            for power, total in enumerate((counts, sums, squares)):
+                total[k, band] = np.bincount(piece, square**power, minlength=count)
             if not band:
                 readings.append((scaled_rows[k], piece))
-    return Energy(piece_s, sums, counts, tuple(readings))
+    return Energy(piece_s, sums, counts, squares, tuple(readings), np.array([one for _, one in tame]))
 
 
-def _scaled(y: Array) -> Array:
+def _scaled(y: Array, size: int = LEVEL) -> Array:
     """Values [n] about their level over their noise; empty where most are alike: below the lattice, or bridged."""
-    apart = y - _level(y)
-    noise = float(np.median(np.abs(apart))) / MEDIAN_SD if apart.size else 0.0
-    return apart / noise if noise > 0.0 else np.zeros(0)
+    apart = y - _level(y, size)
+    size_of = np.abs(apart)
+    noise = float(np.median(size_of)) if apart.size else 0.0
+    if size > LEVEL and noise > 0.0:
+        noise = float(np.median(size_of[size_of > 0.0]))  # a long still stretch shows no noise
+    return apart * (MEDIAN_SD / noise) if noise > 0.0 else np.zeros(0)
 
 
 def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> list[Array]:
@@ -211,20 +203,20 @@ def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> li
     return found
 
 
-def _level(y: Array) -> Array:
+def _level(y: Array, size: int = LEVEL) -> Array:
     """Running median of readings [n]."""
-    found: Array = median_filter(y, LEVEL, mode="nearest")
+    found: Array = median_filter(y, max(LEVEL, min(size, y.size // 4)) | 1, mode="nearest")
     return found
 
 
-def _tame(y: Array) -> tuple[Array, float]:
+def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
     """Readings [n] with those at their level that are wild by themselves; and the square that is as rare as a wild one,
     in variances."""
-    level = _level(y)
+    level = _level(y, size)
     apart = y - level
     noise = float(np.median(np.abs(apart))) / MEDIAN_SD
-    middle = median_filter(apart, BAND_LEAST, mode="nearest")
-    wild = (np.abs(apart) > WILD[1] * noise) & (np.abs(middle) < WILD[0] * noise)
+    apart = np.abs(apart)
+    wild = (apart > WILD[1] * noise) & (median_filter(apart, BAND_LEAST, mode="nearest") < WILD[0] * noise)
     return np.where(wild, level, y), 2.0 * math.log(y.size / (1.0 + float(wild.sum())))
 
 
@@ -232,13 +224,13 @@ def stretches(energy: Energy) -> list[Stretch]:
     """The stretches in which the sensor moves. Those that are found no longer hide others beside them."""
     found: list[Stretch] = []
     while more := _loud_windows(energy, found):
-        sums, counts = energy.sums.copy(), energy.counts.copy()
+        sums, counts, squares = energy.sums.copy(), energy.counts.copy(), energy.squares.copy()
         margin = math.ceil(MARGIN_S / energy.piece_s)
         for one in more:
             gone = slice(max(0, one.begin - margin), one.end + margin)
-            sums[..., gone] = counts[..., gone] = 0.0
+            sums[..., gone] = counts[..., gone] = squares[..., gone] = 0.0
         found += more
-        energy = replace(energy, sums=sums, counts=counts)
+        energy = replace(energy, sums=sums, counts=counts, squares=squares)
     together = [one for one in found if one.axes.sum() > 1]
     return [one for one in found if one.axes.sum() == 1] if together and _of_one_source(energy, together) else found
 
@@ -259,20 +251,19 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         nats, inside, wide = _nats(energy, begin, length, wide)
         own = np.quantile(nats, OWN, axis=2, keepdims=True) / math.log(0.5 / (1.0 - OWN))
         nats = nats / np.maximum(1.0, own)
-        nats, as_one = nats[:-1], nats[-1]
+        nats, others = nats[:-1], nats[-1]
         loudest = nats.max(axis=1)
         alone = np.where(inside, loudest, 0.0)
-        together = np.max([_together(nats[:, band], as_one[band]) for band in used], axis=0)
         looks = math.log(used.size * pieces / length)
         singly = alone.max(axis=0) - looks - math.log(axes * len(lengths))
-        for net, several in ((together - looks + FEWER, True), (singly, False)):
+        for net, several in ((others.max(axis=0) - looks + FEWER, True), (singly, False)):
             for at in np.flatnonzero(net > (-PART if several else -1.0) * math.log(SHARE)):
                 which = loudest[:, at] > TOGETHER if several else np.arange(axes) == np.argmax(alone[:, at])
                 if several == (which.sum() > 1):
                     found.append((float(net[at]), int(begin[at]), length, which))
     taken = np.zeros(pieces, bool)
     apart: list[Stretch] = []
-    for net, first, length, which in sorted(found, key=lambda one: -one[0]):
+    for net, first, length, which in sorted(found, key=lambda one: (one[3].sum() == 1, -one[0])):
         if not taken[first : first + length].any():
             a, b = _ends(energy, *_ends(energy, first, first + length, which), which)
             nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
@@ -286,24 +277,11 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     return [one for one in apart if max(one.net, together * (one.axes.sum() > 1)) > sure]
 
 
-def _together(nats: Array, as_one: Array) -> Array:
-    """ln of one over the chance of the nats [axes, windows] of all axes but the loudest: those of the next ones, as
-    many as make it least, or what all `as_one` [windows] have beyond it. Each is exponential at rest, and so many have
-    the gamma distribution."""
-    axes, windows = nats.shape
-    total = np.zeros(windows)
-    least: Array = np.maximum(as_one - nats.max(axis=0), 0.0) * float(axes > 1)
-    for k, more in enumerate(np.sort(nats, axis=0)[-2::-1]):
-        total += more
-        tail = np.log(np.sum([total**j / math.factorial(j) for j in range(k + 1)], axis=0))
-        least = np.maximum(least, total - tail - math.log(math.comb(axes - 1, k + 1)))
-    return least
-
-
 def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
-    """Nats of windows of a length over their louder side [axes and all as one, bands, windows]. Whether an axis has
-    both sides [axes, windows]. How much wider than of white noise the means lie, `wide` at least [axes, bands]."""
-    sums, counts = energy.before
+    """Nats of windows of a length over their louder side [axes, and all but the loudest as one, bands, windows].
+    Whether an axis has both sides, or is pushed most of the time [axes, windows]. How much wider than of white noise
+    the means lie, `wide` at least [axes, bands]."""
+    sums, counts, squares = energy.before
     pieces = energy.sums.shape[2]
     each = counts[..., -1:] / pieces
 
@@ -319,19 +297,31 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
     there = [(one >= side * each / SIDE) & (one > 0.0) for one in (n_left, n_right)]
     level = np.maximum(np.where(there[0], left, 0.0), np.where(there[1], right, 0.0))
     beside = np.maximum(np.where(there[0], n_left, 0.0), np.where(there[1], n_right, 0.0))
-    known = (level > 0.0) & (n > 0.0)
+    known = (beside > 0.0) & (n > 0.0)
     ratio = np.where(known, own / np.maximum(level, STILL**2), 1.0)
+    # Pushes are rare and large, also in noise that has grown: their own spread beside the window counts.
+    ends = np.clip([begin - 1 - side, begin - 1, begin + length + 1, begin + length + 1 + side], 0, pieces)
+    second, fourth, many = (
+        one[:, -1, ends[1]] - one[:, -1, ends[0]] + one[:, -1, ends[3]] - one[:, -1, ends[2]]
+        for one in (sums, squares, counts)
+    )
+    heavy = np.ones_like(own)
+    heavy[:, -1] = np.maximum(0.5 * (fourth * many / np.maximum(second**2, 1.0) - 1.0), 1.0)
     wide = np.maximum(
         wide, [[_spread(*row) for row in zip(*rows, strict=True)] for rows in zip(own, n, known, strict=True)]
     )
-    own_free, side_free = (np.maximum(one * known / (SQUARES * wide[..., None]), 0.5) for one in (n, beside))
-    ratio = np.concatenate([ratio, [(ratio * own_free).sum(axis=0) / own_free.sum(axis=0)]])
-    own_free, side_free = (np.concatenate([one, [one.sum(axis=0)]]) for one in (own_free, side_free))
+    own_free, side_free = (np.maximum(one * known / (SQUARES * wide[..., None] * heavy), 0.5) for one in (n, beside))
+    ratio_least = np.maximum(ratio, 1.0)
+    loudest = np.argmax(own_free * (ratio_least - 1.0 - np.log(ratio_least)), axis=0)
+    quiet = np.arange(len(ratio))[:, None, None] != loudest
+    of_others = [(one * quiet).sum(axis=0) for one in (ratio * own_free, own_free, side_free)]
+    ratio = np.concatenate([ratio, [of_others[0] / np.maximum(of_others[1], 0.5)]])
+    own_free, side_free = (np.concatenate([a, [b]]) for a, b in ((own_free, of_others[1]), (side_free, of_others[2])))
     ratio = np.maximum(ratio, 1.0)
     nats = 0.5 * own_free * (ratio - 1.0 - np.log(ratio))
     near = nats > 1.0
     nats[near] = -np.log(np.maximum(fdtrc(own_free[near], side_free[near], ratio[near]), TINY))
-    return nats, (there[0] & there[1]).any(axis=1), wide
+    return nats, (there[0] & there[1]).any(axis=1) | (own[:, -1] > 0.5 * energy.most[:, None]), wide
 
 
 def _spread(means: Array, counts: Array, known: Mask) -> float:
@@ -364,7 +354,10 @@ def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
     ratio, level = _ratio(energy, begin, end)
     r = ratio[axes][..., None]
     own = energy.sums[axes] / level[axes][..., None] * (1.0 - 1.0 / r) - energy.counts[axes] * np.log(r)
-    gain = 0.5 / SQUARES * own.sum(axis=(0, 1))
+    gains = 0.5 / SQUARES * own.sum(axis=0)
+    long = gains[-2]  # its blocks are longer than a piece
+    fine = gains.sum(axis=0) - long
+    gain = fine if fine[begin:end].sum() > long[begin:end].sum() else fine + long
     middle = begin + int(np.argmax(gain[begin:end]))
     reach = []
     for part in (gain[middle:], gain[middle::-1]):
@@ -390,151 +383,6 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
     mean = np.maximum(np.linalg.eigvalsh(loud_ones @ loud_ones.T) / np.count_nonzero(inside), 1.0)
     nats = 0.5 * np.count_nonzero(inside) / SQUARES * (mean - 1.0 - np.log(mean))
     return float(nats[:-1].sum()) < -math.log(SHARE)
-
-
-def loud(y: Array, rate_hz: float, lsb: float = 0.0) -> Moved | None:
-    """The stretches in which readings [n] on an even grid, NaN where missing, are far louder than in the minutes about
-    them. `lsb`: their lattice. O(n)."""
-    block = round(BANDS_S[0] * rate_hz)
-    block = block if block >= BAND_LEAST else 1
-    level, noise = _blocks(y, block)
-    found = _loud_blocks(y, rate_hz, lsb, block, level, noise)
-    share = round(BANDS_S[1] * rate_hz / block)
-    if share >= BAND_LEAST:
-        found += _loud_blocks(y, rate_hz, lsb, block * share, *_blocks(level, share), knocks=False)
-    intervals = joined([interval for interval, _ in found])
-    if not found or sum(b - a for a, b in intervals) > SHARE_MOST * y.size:
-        return None
-    most = max(1, round(EDGE_S * rate_hz))
-    intervals = [(a if a > most else 0, b if b < y.size - most else y.size) for a, b in intervals]
-    # Blocks of several lengths show the same stretch: it counts once.
-    nats = sum(max(nats for (a, b), nats in found if first <= a and b <= end) for first, end in intervals)
-    times = tuple((a / rate_hz, b / rate_hz) for a, b in intervals)
-    return Moved(times, nats, nats - len(intervals) * math.log(y.size))
-
-
-def _loud_blocks(
-    y: Array, rate_hz: float, lsb: float, block: int, level: Array, noise: Array, *, knocks: bool = True
-) -> list[tuple[Interval, float]]:
-    """Stretches and their nats by blocks of one length, which have a level and a noise. `knocks`: short ones too."""
-    known = np.isfinite(level)
-    around = min(max(9, round(AROUND_S * rate_hz / block)), level.size // 3) | 1
-    if known.sum() < 3 * around // 2:
-        return []
-    level = bridged(level)
-    leap = np.diff(level, prepend=level[0])
-    sizes = [np.abs(level - _middle(level, around))]
-    leaps = _over(np.abs(leap), around, lsb) > LOUD * math.sqrt(0.5)
-    away = _over(sizes[0], around, lsb)
-    rough = leaps
-    if block > 1:
-        sizes.append(bridged(noise))
-        noise = _over(sizes[1], around, lsb) / MEDIAN_SD
-        rough, away = leaps | (noise > LOUD_WITHIN), np.maximum(away, LOUD / LOUD_WITHIN * noise)
-    apart = max(2, round(APART_S * rate_hz / block))
-    # Still blocks on another level, before a jump or behind it, are no part of a stretch.
-    far = known & (away > LOUD) & maximum_filter1d(rough, 2 * apart + 1)
-    parts = runs(far, apart - 1)
-    if not parts:
-        return []
-    wild = away > LOUD if block == 1 else _wild(y, level, sizes[1], around, block, lsb) if knocks else far
-    begins = np.diff(wild, prepend=False) & wild
-    margin = max(1, round(MARGIN_S * rate_hz))
-    found: list[tuple[Interval, float]] = []
-    moving = np.zeros(level.size, bool)
-    for a, b in parts:
-        knock = (b - a) * block <= SHORT_S * rate_hz
-        if knock:
-            own = slice(a * block, b * block)
-            others = max(1, int(begins.sum()) - int(begins[own].sum()))
-            rare = knocks and _rare(int(wild[own].sum()), (b - a) * block, others, y.size)
-        else:
-            rare = _rare(int(far[a:b].sum()), b - a, len(parts), level.size)
-            rare = rare and not _alike(sizes[0][a:b][far[a:b]])
-        within, least = (LOUD_WITHIN, 2.0) if knock else (LOUD_LASTING, max(ROUGH_COUNT, ROUGH_LEAST * (b - a)))
-        inside = np.arange(a, b)[far[a:b]] if knock else np.arange(a, b)
-        moved = leap[a : b + 1][leaps[a : b + 1]]
-        back = min(moved.clip(min=0.0).sum(), -moved.clip(max=0.0).sum()) > BACK_LEAST * np.abs(moved).sum()
-        shaken = (back or (noise[a:b] > within).sum() >= 2) and rough[a : b + 1].sum() >= least
-        against = (LOUD / MEDIAN_SD if knock else LOUD_LASTING, within)
-        if rare and shaken and far[a:b].sum() >= 2 and _louder(sizes, against, inside, around // 2):
-            moving[a:b] = far[a:b]
-            square = np.minimum(away[a:b][far[a:b]], DEVIATION_MOST) ** 2
-            nats = 0.5 * float((square - 1.0 - np.log(square)).sum())
-            found.append(((max(0, a * block - margin), min(y.size, b * block + margin)), nats))
-    two_levels = len(found) >= ALIKE_LEAST and _alike(sizes[0][moving])
-    return [] if two_levels and float(np.median(away[moving])) < DEVIATION_MOST else found
-
-
-def _alike(levels: Array) -> bool:
-    """Whether all the loud levels are as far away: a bias with two levels makes such stretches."""
-    middle = float(np.median(levels))
-    return float(np.median(np.abs(levels - middle))) < ALIKE * middle
-
-
-def _rare(count: int, of: int, stretches: int, n: int) -> bool:
-    """Whether `count` loud ones of `of` are no chance where `stretches` of them lie scattered among n."""
-    return count >= SAMPLES_LEAST and n * float(bdtrc(count - 1, of, stretches / n)) < CHANCE
-
-
-def _wild(y: Array, level: Array, spread: Array, around: int, block: int, lsb: float) -> Mask:
-    """Samples [n] that are loud each by itself, against the level and the noise of the blocks about them."""
-    usual = np.maximum(_middle(bridged(spread), around) / MEDIAN_SD, lsb)
-    rows = y[: level.size * block].reshape(-1, block)
-    wild = np.abs(rows - _middle(level, around)[:, None]) > LOUD_WITHIN * usual[:, None]
-    return np.append(wild.ravel(), np.zeros(y.size - wild.size, bool))
-
-
-def _louder(sizes: list[Array], leasts: tuple[float, float], inside: Rows, around: int) -> bool:
-    """Whether the blocks `inside` are loud against the time before and the time after them, by one measure."""
-    a, b = int(inside[0]), int(inside[-1]) + 1
-    sides = [slice(max(0, a - around), a), slice(b, b + around)]
-    return any(
-        all(
-            float(np.median(size[inside])) > least * float(np.median(size[side]))
-            for side in sides
-            if size[side].size > around // 24
-        )
-        for size, least in zip(sizes, leasts, strict=False)
-    )
-
-
-def _blocks(values: Array, share: int) -> tuple[Array, Array]:
-    """Median of each block of `share` values, and their noise: the median of their steps over sqrt(2). A jump or a
-    slope within a block is no noise. NaN where half of a block is missing; no noise of single values."""
-    if share == 1:
-        return values, np.full(values.size, np.nan)
-    n = values.size // share * share
-    steps = np.abs(np.diff(values[:n], prepend=values[0]))
-    level, noise = _medians(values[:n], share), math.sqrt(0.5) * _medians(steps, share)
-    return np.where(np.isfinite(noise), level, np.nan), np.where(np.isfinite(level), noise, np.nan)
-
-
-def _medians(values: Array, share: int) -> Array:
-    """Middle of each `share` values, the upper one of two; NaN where half of them are."""
-    rows = values.reshape(-1, share)
-    missing = np.isnan(rows)
-    if not missing.any():
-        return np.ascontiguousarray(np.partition(rows, share // 2, axis=1)[:, share // 2])
-    # Missing ones lie to either side in turn: they move no median.
-    beyond = np.where(np.cumsum(missing, axis=1) % 2 == 0, np.inf, -np.inf)
-    middle = np.partition(np.where(missing, beyond, rows), share // 2, axis=1)[:, share // 2]
-    return np.where(2 * missing.sum(axis=1) >= share, np.nan, middle)
-
-
-def _middle(values: Array, around: int) -> Array:
-    """Running median over `around` values; at the ends that of the first and the last so many."""
-    half = around // 2
-    middle: Array = median_filter(values, 2 * half + 1, mode="nearest")
-    middle[:half], middle[values.size - half :] = middle[half], middle[values.size - half - 1]
-    return middle
-
-
-def _over(values: Array, around: int, lsb: float) -> Array:
-    """Deviations over the usual ones about them, as of a normal's."""
-    usual = _middle(values, around) / MEDIAN_SD
-    own = float(np.median(values[values > 0.0])) / MEDIAN_SD if (values > 0.0).any() else 0.0
-    return values / np.maximum(np.maximum(usual, STILL * own), max(lsb, 1e-300))
 
 
 def joined(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:

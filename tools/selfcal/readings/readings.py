@@ -25,9 +25,9 @@ from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import CODES, PIECE, PIECES, Uneven, fit_of, uneven_of
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
-from selfcal.readings.lost_words import Recurring, recurring_of
+from selfcal.readings.lost_words import Recurring, is_limit, recurring_of
 from selfcal.readings.misread import ABOUT_ZERO, Misread, misread_of, spans_of
-from selfcal.readings.motion import Moved, loud, moves_of
+from selfcal.readings.motion import Moved, moves_of
 
 #: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
 CLOCK_LEAST = 1e-3
@@ -37,8 +37,6 @@ SLOPES, SLOPES_LEAST = 10, 8.0
 KEPT_MOST = 1 << 22
 #: Longest common interval of two rates, s, and how far off it may be.
 COMMON_S, COMMON_OFF = 1.0, 3e-3
-#: Longest gap that motion is looked for across, s.
-GAP_MOST_S = 240.0
 #: ln of the probability, a record, of a run of equal readings that is no chance.
 LN_STUCK = -nats_of("stuck")
 #: Nats of the runs that are counted; times that there are as many as chance makes, at least. Beyond so many steps in
@@ -240,8 +238,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
     folded = misread is not None and misread.undone is None and misread.kind != "range_change"  # ends at zero
     clipped = None if folded else _clipped(sound, lattice)
-    whole = sound if clipped is None else _unclipped(sound, clipped, lattice)[1]
-    moving, moved = _moving(recording, axis, whole, lattice)
+    moving, moved = _moving(recording, axis)
     if moving.any():
         sound = np.where(moving, np.nan, sound)
         clipped = None if folded else _clipped(sound, lattice)
@@ -285,31 +282,13 @@ def _intervals(recording: Recording, mask: Mask) -> list[tuple[float, float]]:
     return [(float(time[a]), float(time[b - 1]) + step) for a, b in runs(mask)]
 
 
-def _moving(recording: Recording, axis: str, values: Array, lattice: Lattice | None) -> tuple[Mask, Moved | None]:
-    """Rows [n] in which the sensor moved, by the energy of all axes and by the level of `values` [n], NaN where they
-    are none; and the motion of the axis. A gap is no longer than those that matter."""
-    rate = recording.rate_hz
-    place: Rows | None = None
-    even = values
-    if recording.missing_before.any():
-        place = np.arange(values.size) + np.cumsum(np.minimum(recording.missing_before, math.ceil(GAP_MOST_S * rate)))
-        place -= place[0]
-        even = np.full(int(place[-1]) + 1, np.nan)
-        even[place] = values
-    away = loud(even, rate, lattice.step if lattice is not None else 0.0)
-    loudest = moves_of(recording).get(axis)
-    found = [one for one in (away, loudest) if one is not None]
-    if not found:
-        return np.zeros(values.size, bool), None
-    mask = np.zeros(even.size, bool)
-    for begin_s, end_s in away.intervals if away is not None else ():
-        mask[round(begin_s * rate) : round(end_s * rate)] = True
-    mask = mask if place is None else mask[place]
-    time = recording.time_s
-    for begin_s, end_s in loudest.intervals if loudest is not None else ():
-        mask |= (time >= begin_s) & (time < end_s)
-    times = tuple(_intervals(recording, mask))
-    return mask, Moved(times, sum(one.nats for one in found), max(one.net for one in found))
+def _moving(recording: Recording, axis: str) -> tuple[Mask, Moved | None]:
+    """Rows [n] in which the sensor moved, by all axes, and the motion of the axis."""
+    moved, time = moves_of(recording).get(axis), recording.time_s
+    found = np.zeros(time.size, bool)
+    for begin_s, end_s in moved.intervals if moved is not None else ():
+        found |= (time >= begin_s) & (time < end_s)
+    return found, moved
 
 
 # ------------------------------------------------------------------------------------------------------ change of rate
@@ -595,6 +574,8 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
             worth = max(worth, (count - 2) * math.log(100.0))
         if worth < nats_of("saturation") or count < 0.5 * expected:
             continue
+        if not is_limit(y[~at_edge], sign * edge, count, 2.0 * half):
+            continue  # the others do not come near it: a word that the logger shows for lost ones
         mask = np.zeros(values.size, bool)
         mask[rows[at_edge]] = True
         limits[sign * edge] = mask
