@@ -190,6 +190,42 @@ def test_a_line_of_one_source_has_one_phase() -> None:
         assert gains[0] < common - free < gains[1]
 
 
+@pytest.mark.parametrize("turns", [2.3, 7.4])
+def test_a_slow_line_is_fitted_with_the_drifts(turns: float) -> None:
+    """Of 5 and 7 N on two axes. Drifts that are fitted without it swallow it: three to ten lines were named, each
+    larger than the readings. Beside the walks a size is known to 3 % and the frequency to 0.012 turns at most."""
+    n = 3000
+    wave = np.sin(2.0 * math.pi * turns * np.arange(n) / n + 0.4)
+    found = seen(drawn(21, n, 2) + np.outer([5.0, -7.0], wave))
+    (line,) = found.events
+    assert line.cause == "periodic"
+    assert line.theta[0] * n == pytest.approx(turns, abs=0.05)
+    sizes = np.abs(line.act.size.T @ line.columns).max(axis=1) * found.scale
+    assert sizes == pytest.approx([5.0, 7.0], rel=0.1)
+
+
+def test_a_temperature_that_swings_is_no_line() -> None:
+    """Two turns and a half in the record, on two axes. Its column alone gains what the line does with a frequency and
+    a phase."""
+    n, random = 3000, np.random.default_rng(31)
+    temperature = 22.0 + 3.0 * np.sin(2.0 * math.pi * 2.6 * np.arange(n) / n) + 0.01 * random.normal(size=n)
+    found = seen(drawn(22, n, 2) + np.outer([2.0, -1.4], temperature - 22.0), temperature=temperature)
+    assert [event.cause for event in found.events] == ["temperature"]
+
+
+def test_a_line_of_three_axes_has_one_frequency() -> None:
+    """Strong enough that each axis finds it alone, a hundredth of a turn from the others."""
+    n = 3000
+    wave = np.sin(2.0 * math.pi * 0.137 * np.arange(n))
+    y = drawn(24, n, 3) + np.outer([1.2, 0.9, 1.0], wave)
+    states = {name: State(name, "deg/s", row, 1.0, 0.0, np.ones(n)) for name, row in zip(NAMES, y, strict=False)}
+    found = diagnose_record(Record(1.0, states, {}, {}, np.ones(n, bool)), list(states))
+    columns = {name: [column.name for column in one.state.regressors] for name, one in found.items()}
+    assert len(columns["gx"]) == 2
+    assert columns["gx"] == columns["gy"] == columns["gz"]
+    assert all([finding.look.cause for finding in one.findings] == ["periodic"] for one in found.values())
+
+
 @pytest.mark.parametrize("turns", [0.13, 0.2])
 def test_a_slow_quantity_is_no_lagged_temperature(turns: float) -> None:
     """A part of a day's turn and a weak walk on six axes, beside a temperature that warms up and does nothing. Late
