@@ -19,6 +19,7 @@ import yaml
 from scipy.optimize import minimize
 from scipy.signal import lfilter
 
+from selfcal.base.ending import Held
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis.causes.periodic import BANDS_MOST
@@ -634,6 +635,18 @@ def test_ctrl_c_leaves_what_was_found(tmp_path: Path) -> None:
     assert [finding["cause"] for finding in found["gx"]["findings"]] == ["step"]
     assert found["gy"]["verdict"] == "adequate" and "interrupted" in found["gz"]["error"]
     assert "Not diagnosed: " in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert Model.load(tmp_path / "extended.yaml").regressors[0].kind == "step"
+
+
+def test_an_end_while_results_are_written_loses_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From when results have to be written no fit goes on. The findings' effect on the bias took passes of its own, and
+    all was lost."""
+    values = 0.1 * np.random.default_rng(7).standard_normal((2, 1500))
+    values[:, 700:] += [[0.5], [0.3]]
+    save(tmp_path / "log.npz", {name: ("deg/s", row) for name, row in zip(("gx", "gy"), values, strict=True)}, 1.0)
+    monkeypatch.setattr(Held, "overdue", property(lambda held: True))
+    document = diagnose(tmp_path / "log.npz", write_model=tmp_path / "extended.yaml")
+    assert [(entry["cause"], list(entry["axes"])) for entry in document["findings"]] == [("step", ["gx", "gy"])]
     assert Model.load(tmp_path / "extended.yaml").regressors[0].kind == "step"
 
 

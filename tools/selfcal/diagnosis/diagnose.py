@@ -169,7 +169,7 @@ def add_posteriors(
     known: dict[str, Identified | None] = {}
     for name, axis in axes.items():
         known[name] = None
-        with suppress(UserError):
+        with suppress(UserError, Stopped):
             known[name] = None if ending.asked else identify_axis(recording, name, model, "library", None)
         axis["posterior"] = _posterior(known[name])
     return known

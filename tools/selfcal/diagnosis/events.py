@@ -26,6 +26,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.causes.variance_change import ENDS
 from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
+from selfcal.likelihood import work
 from selfcal.likelihood.heldout import HARM_SD, in_sd
 from selfcal.likelihood.state import interval, log_normal, mixture
 from selfcal.likelihood.statemodel import Array
@@ -71,7 +72,8 @@ class Member:
     def bias(self) -> float:
         """How far the finding moves the bias, in the recording's unit."""
         before, after = self.finding.before, self.finding.after
-        return 0.0 if before is after else (bias_ahead(after) - bias_ahead(before)) * self.factor
+        with work.within(work.Work(lambda: False)):  # two passes: an end that was asked for keeps the result
+            return 0.0 if before is after else (bias_ahead(after) - bias_ahead(before)) * self.factor
 
     def joins(self, other: Member) -> bool:
         """Whether both are one event or source."""
