@@ -54,12 +54,12 @@ def judge(
     tables: Tables,
     group: Group,
     result: AxisResult,
-    recording: Recording,
-    others: Sequence[str],
+    recording: Recording | None = None,
+    others: Sequence[str] = (),
     used: Sequence[int] = (),
 ) -> Judged:
     """What in the record speaks against the most probable law, with the columns `used`. `others`: the recording's
-    columns that may act on the axis."""
+    columns that may act on the axis. Without a recording nothing is held against the drift."""
     from selfcal.adequacy.drift_checks import drift_checks
 
     law = result.best
@@ -84,7 +84,8 @@ def judge(
     if all(one["passed"] for one in checks.values()):  # else the others would show the same
         checks |= batch_check(tables, group, result) | innovation_checks(blocks, tables, group, result, list(used))
         checks |= allan_checks(curve) if curve else {}
-    return Judged(checks | drift_checks(left, tables, result, recording, others), curve)
+    checks |= {} if recording is None else drift_checks(left, tables, result, recording, others)
+    return Judged(checks, curve)
 
 
 def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:

@@ -195,7 +195,8 @@ NAMED: dict[str, Law] = {
     "moving_average": Law((Term("walk"),), coloured_noise=True),
     "walk_and_markov": Law((Term("walk"), Term("markov", bandwidth=math.nan, stated=True, by_ratio=True))),
 }
-#: Laws of one term, which are the paper's.
+#: Laws of several terms, and of one, which are the paper's.
+SUMS = tuple(name for name, law in NAMED.items() if law.is_sum)
 PLAIN = tuple(name for name, law in NAMED.items() if not law.is_sum)
 
 

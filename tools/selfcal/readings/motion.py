@@ -321,6 +321,11 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
     nats = 0.5 * own_free * (ratio - 1.0 - np.log(ratio))
     near = nats > 1.0
     nats[near] = -np.log(np.maximum(fdtrc(own_free[near], side_free[near], ratio[near]), TINY))
+    # Of readings that are far by themselves some come together: so many are rare by their share of the record.
+    share = np.exp(-0.5 * energy.most) + sums[:, -1, -1] / (energy.most * np.maximum(counts[:, -1, -1], 1.0))
+    far, usual = own[:, -1] * n[:, -1] / energy.most[:, None], n[:, -1] * share[:, None]
+    rare = np.where(far > usual, far * np.log(np.maximum(far, TINY) / np.maximum(usual, TINY)) - far + usual, 0.0)
+    nats[:, -1] = np.minimum(nats[:, -1], np.concatenate([rare, (rare * quiet[:, -1]).sum(axis=0)[None]]))
     return nats, (there[0] & there[1]).any(axis=1) | (own[:, -1] > 0.5 * energy.most[:, None]), wide
 
 
