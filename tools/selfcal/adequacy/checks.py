@@ -68,8 +68,10 @@ def judge(
         return Judged({}, None)
     if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
         return Judged({}, None)
-    z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
-    left = replace(blocks, mean=blocks.mean - z @ coefficients_of(result)) if used else blocks
+    left = blocks
+    if used:
+        z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
+        left = replace(blocks, mean=blocks.mean - z @ coefficients_of(result))
     curve = curve_of(
         left.mean,
         tables.dt_s,
