@@ -438,6 +438,17 @@ def _of_multiples(weights: Array, known: Array, multiples: Sequence[int]) -> Cal
     return gain
 
 
+def _of_columns(y: Array, model: Joint, weights: Array, multiples: Sequence[int]) -> Callable[[Array], Array]:
+    """The same, of slow lines, whose information differs from one frequency to the next."""
+
+    def gain(tried: Array) -> Array:
+        waves = np.vstack([_waves(float(f), y.shape[1], multiples) for f in tried])
+        gains = full(waves @ weights, information(model, y, waves))
+        return np.asarray(gains.reshape(tried.size, -1).sum(axis=1))
+
+    return gain
+
+
 def transients(seen: Seen) -> Iterator[Candidate]:
     """A constant rate, and a bias that settles: theta is its time constant, s, and the sd of the logarithm of that."""
     t = (np.arange(seen.n) + 0.5) * seen.dt
@@ -529,13 +540,7 @@ def locked(seen: Seen, one: Candidate) -> Candidate:
     for k in range(LOCKED):
         model = refitted(seen.model, seen.y - one.effect, seen.dt)
         found, f = course(model, seen.y, smooth=True), one.theta[0] * seen.dt
-
-        def gain(tried: Array, model: Joint = model, weights: Array = found.weights) -> Array:
-            waves = np.vstack([_waves(float(each), n, multiples) for each in tried])
-            gains = full(waves @ weights, information(model, seen.y, waves))
-            return np.asarray(gains.reshape(tried.size, -1).sum(axis=1))
-
-        sharp = _sharpest(gain, f, 0.5 ** min(k, 2) / n)
+        sharp = _sharpest(_of_columns(seen.y, model, found.weights, multiples), f, 0.5 ** min(k, 2) / n)
         waves = _waves(sharp, n, multiples)
         known = information(model, seen.y, waves).reshape(len(multiples), 2, *model.correlation.shape).mean(axis=1)
         phased = _phased(waves, waves @ found.weights, known)

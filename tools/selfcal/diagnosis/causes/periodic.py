@@ -24,7 +24,7 @@ from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array, M
 TURNS_LEAST, BAND_TURNS = 1.5, 3.0
 #: A line of fewer turns is as slow as a drift: its gain must hold beside one of two terms, and its search costs more.
 SLOW_TURNS = 30.0
-#: Lines of two axes are one if their frequencies are so near, turns in the record.
+#: Two axes know the frequency of one line to so many turns in the record: nearer ones share a column.
 SAME = 0.25
 #: Widths of a band in bins of the periodogram.
 BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
@@ -35,7 +35,7 @@ BAND_DEARER = 6.0
 BANDS_MOST = 5
 #: A band wider than this share of a line's frequency lies at one of its multiples by chance.
 HARMONIC_MOST = 0.1
-#: Lines of two axes whose frequencies differ by less are one.
+#: Lines whose frequencies, or multiples of them, differ by less than this share are one event.
 ONE_LINE = 0.01
 #: Share of its frequency within which another line is a side band.
 SIDE_BAND = 0.1
@@ -216,15 +216,18 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     for name, finding in sorted(lines, key=lambda line: -line[1].look.gain):
         one, hz = found[name], _hz(finding.look)
         common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME), hz)
-        multiples = finding.look.estimate.get("harmonics", [])
+        if common == hz:
+            first.append((name, hz))
+            continue
+        theta = (common, *finding.look.estimate.get("harmonics", []))
         free = one.state.without({column.name for column in finding.columns})
-        look = at(free, record, (common, *multiples))
-        after = free if common == hz else free.refit(**look.changes)
-        if common == hz or after.best.ln_likelihood < one.state.best.ln_likelihood - ALIKE:
+        look = at(free, record, theta)
+        after = free.refit(**look.changes)
+        if after.best.ln_likelihood < one.state.best.ln_likelihood - ALIKE:
             first.append((name, hz))
             continue
         look = replace(look, gain=finding.look.gain, net=finding.look.net)
-        own = finding.before.refit(**at(finding.before, record, (common, *multiples)).changes)
+        own = finding.before.refit(**at(finding.before, record, theta).changes)
         one.findings[one.findings.index(finding)] = replace(finding, look=look, after=own)
         one.state = after
         changed.append(name)
@@ -240,7 +243,7 @@ def _hz(look: Look) -> float:
 def _harmonics(one: Diagnosed) -> None:
     """Lines at multiples of a slower one's frequency are one finding with it: their gains are added."""
     found = (f for f in one.findings if f.look.cause == "periodic")
-    lines = sorted(found, key=lambda f: f.look.estimate["frequency_hz"]["median"])
+    lines = sorted(found, key=lambda f: _hz(f.look))
     for base in lines:
         if base not in one.findings:
             continue
@@ -278,7 +281,7 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     found = looks(before.first(split), part)
     if not found:
         return after
-    f, own = (float(one.estimate["frequency_hz"]["median"]) for one in (found[0], look))
+    f, own = _hz(found[0]), _hz(look)
     known = {one.name for one in before.regressors}
 
     def at_f(one: Regressor) -> Regressor:
@@ -290,7 +293,7 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
 
 def _alike(a: Look, b: Look) -> bool:
     """One line, a harmonic, or a side band."""
-    f, g = sorted(float(look.estimate["frequency_hz"]["median"]) for look in (a, b))
+    f, g = sorted(map(_hz, (a, b)))
     times = g / f
     return abs(times - round(times)) < ONE_LINE or times < 1.0 + SIDE_BAND
 
