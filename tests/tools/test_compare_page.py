@@ -12,9 +12,9 @@ import pytest
 from test_page import HOSTILE, Page
 
 from selfcal.base.errors import UserError
-from selfcal.batch.compare import show
+from selfcal.batch.compare import changes, show
 from selfcal.logs.recording import save
-from selfcal.show.comparison_page import page
+from selfcal.show.comparison_page import page, told_of
 from selfcal.verbs.compare import compare
 
 
@@ -40,11 +40,61 @@ def test_it_has_what_the_document_has(made: tuple[dict[str, Any], str]) -> None:
     assert document["axes"]["ax"] == []
     seen = Page(text)
     assert f"{rows['N']['before']:.5g}" in seen.text and f"{rows['N']['distance_sd']:+.1f}" in seen.text
-    assert re.search(r"step.*found", seen.text)
+    assert rows["step"]["after"] == pytest.approx(1.2, abs=0.02)  # 5 sd of the means on both sides
+    assert re.search(r"step.*1\.2", seen.text)
     quantities = document["quantities"][document["recordings"][0]]["ax"]
     assert f"{quantities['N']['median']:.3g}" in seen.text
     assert [one["id"] for one in seen.named("h2")] == ["changes", "verdicts", "axis-ax", "axis-gx", "read"]
     assert len(seen.named("figure")) == 2 and len([one for one in seen.named("svg") if "aria-label" in one]) == 4
+
+
+@pytest.fixture(scope="module")
+def tilted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The document of two records of 40 minutes. In the second the part turns by 0.7 and 0.5 deg about two axes after
+    1500 s, and the walk of gz is five times as large. All else is the same."""
+    folder = tmp_path_factory.mktemp("tilted")
+    logs = [folder / name for name in ("before.npz", "after.npz")]
+    t = np.arange(2400.0)
+    for k, log in enumerate(logs):
+        rng = np.random.default_rng(70 + k)
+
+        def drifting(N: float, K: float, mean: float = 0.0) -> Any:
+            return mean + N * rng.standard_normal(t.size) + np.cumsum(K * rng.standard_normal(t.size))  # noqa: B023
+
+        turned = k * (t >= 1500.0)
+        log_of = {
+            "gz": ("deg/s", drifting(0.04, 0.002 * (1 + 4 * k))),
+            "ax": ("m/s^2", drifting(0.007, 0.0003) + 9.81 * np.deg2rad(0.7) * turned),
+            "ay": ("m/s^2", drifting(0.007, 0.0003) - 9.81 * np.deg2rad(0.5) * turned),
+            "az": ("m/s^2", drifting(0.007, 0.0003, 9.81)),
+        }
+        save(log, log_of, 1.0, {})
+    return dict(compare(logs))
+
+
+def test_a_tilt_is_no_change_of_the_drift(tilted: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
+    """K is compared with the findings in the model: a jump of the readings is not a drift that became faster."""
+    rows = {(name, row["quantity"]): row for name, axis in tilted["axes"].items() for row in axis}
+    assert not {("ax", "K"), ("ay", "K"), ("az", "K")} & rows.keys()
+    assert rows["ax", "tilt"]["after"] == pytest.approx(9.81 * np.deg2rad(0.7), abs=0.01)  # 4 sd of the drift
+    assert rows["ay", "tilt"]["after"] == pytest.approx(-9.81 * np.deg2rad(0.5), abs=0.01)
+    K = rows["gz", "K"]
+    assert 3.0 < K["after"] / max(K["before"], 1e-9) < 8.0  # five times, by two estimates of 15 % each
+    show(tilted)
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert [line[:3] for line in lines if "tilt" in line and "->" in line] == [["ax", "ay", "tilt"]]
+
+
+def test_a_drift_that_one_record_cannot_tell_is_below_its_limit() -> None:
+    """From "less than 0.001" to 0.01 is a change; two numbers that nobody knows are none."""
+    unknown = {"median": 1e-5, "q05": 1e-8, "q95": 1e-3, "unit": "deg/s^2/sqrt(Hz)", "identified": False}
+    known = {**unknown, "median": 1e-2, "q05": 8e-3, "q95": 1.2e-2, "identified": True}
+    (row,) = changes({"K": unknown}, {"K": known})
+    assert (row["what"], row["before_below"]) == ("changed", 1e-3) and "after_below" not in row
+    assert changes({"K": unknown}, {"K": {**unknown, "median": 5e-3, "q05": 4.9e-3, "q95": 5.1e-3}}) == []
+    document = {"axes": {"gx": [{"from": "a", "to": "b", **row}]}}
+    (line,) = told_of(document)
+    assert (line.side("before", "-"), line.side("after", "-")) == ("< 0.001", "0.01")
 
 
 def test_nothing_in_it_runs_or_is_loaded(made: tuple[dict[str, Any], str]) -> None:

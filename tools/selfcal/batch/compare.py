@@ -33,11 +33,6 @@ class Compared:
         return {"error": ", ".join(self.errors), "changes": self.changes} if self.errors else self.changes
 
 
-def changes_of(axis: Sequence[dict[str, Any]] | Mapping[str, Any]) -> Sequence[dict[str, Any]]:
-    """The changes of an axis of the document, whether all recordings could be compared or not."""
-    return axis["changes"] if isinstance(axis, Mapping) else axis
-
-
 def incomparable(verdicts: Mapping[str, Mapping[str, Any] | None]) -> str | None:
     """Why an axis cannot be compared between two recordings; None where it can be, or neither has it."""
     there = {log: verdict for log, verdict in verdicts.items() if verdict is not None}
@@ -61,19 +56,28 @@ def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict
 
 
 def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What can change: parameters of the likeliest law, the bias, the coefficients of the model file's regressors, and
-    the size of each cause found. A cause is `small` where it changes no number by as much as matters."""
+    """What can change: N, K and B with all findings in the model, the other parameters of the likeliest law, the bias,
+    the coefficients of the model file's regressors, and each cause found with its sizes. A cause is `small` where it
+    changes no number by as much as matters. Without a model of the findings the parameters are those of `identify`."""
     sizes: dict[str, Mapping[str, Any]] = {}
-    if "hypotheses" in identified:
-        law = likeliest(identified["hypotheses"])
-        for name, estimate in identified["parameters"][law].items():
-            if estimate["identified"]:
+    known = diagnosed.get("posterior") or identified
+    if "hypotheses" in known:
+        law = likeliest(known["hypotheses"])
+        numbers = {
+            name: {**number["after"], "unit": number["unit"]}
+            for name, number in diagnosed.get("numbers", {}).items()
+            if "q05" in number["after"]
+        }
+        for name, estimate in known["parameters"][law].items():
+            if name not in numbers and estimate["identified"]:
                 sizes[f"{name} ({law})" if name != "N" else "N"] = estimate
-        sizes["bias"] = bias_of(identified)
-        for regressor in identified.get("regressors", {}).values():
+        sizes |= numbers
+        for regressor in known.get("regressors", {}).values():
             for column, estimate in regressor["coefficients"].items():
                 if math.isfinite(estimate["median"]):
                     sizes[f"{column}.coefficient"] = estimate
+    if "bias_now" in identified:
+        sizes["bias"] = bias_of(identified)
     counted: dict[str, int] = {}
     matter = (*diagnosed.get("material", ()), "unexplained")
     own = [finding["cause"] for finding in diagnosed.get("findings", [])]
@@ -84,38 +88,43 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
         cause = str(finding["cause"])
         counted[cause] = counted.get(cause, 0) + 1
         label = cause if counted[cause] == 1 else f"{cause} {counted[cause]}"
-        for key, estimate in finding["estimate"].items():
-            if key in SIZES and isinstance(estimate, Mapping):
-                sizes[f"{label}.{key}"] = estimate
-        sizes.setdefault(label, {"present": True, "small": cause not in matter})
+        known_sizes = {
+            f"{label}.{key}": estimate
+            for key, estimate in finding["estimate"].items()
+            if key in SIZES and isinstance(estimate, Mapping)
+        }
+        first = next(iter(known_sizes.values()), {})
+        size = {part: first[part] for part in ("median", "unit") if part in first}
+        sizes[label] = {"present": True, "small": cause not in matter, **size}
+        sizes |= known_sizes
     return sizes
 
 
 def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What is in one recording alone and matters there, and what changed beyond the limit, a row each."""
+    """What is in one recording alone and matters there, and what changed beyond the limit, a row each. A number that
+    one of the recordings does not identify counts by its interval, and the row has what it lies below."""
     rows: list[dict[str, Any]] = []
     for key in sorted(before.keys() | after.keys()):
         a, b = before.get(key), after.get(key)
         if a is None or b is None:
             only = a or b
             if only is not None and "present" in only and not only["small"]:
-                rows.append({"quantity": key, "what": "appeared" if a is None else "gone"})
+                side = "after" if a is None else "before"
+                size = {side: only["median"], "unit": only["unit"]} if "median" in only else {}
+                rows.append({"quantity": key, "what": "appeared" if a is None else "gone", **size})
             continue
-        if "present" in a:
+        if "present" in a or not (a.get("identified", True) or b.get("identified", True)):
             continue
         sd = math.hypot(sd_of(a), sd_of(b))
         distance = (b["median"] - a["median"]) / sd if sd > 0.0 else 0.0
         if abs(distance) >= LIMIT:
-            rows.append(
-                {
-                    "quantity": key,
-                    "what": "changed",
-                    "before": a["median"],
-                    "after": b["median"],
-                    "unit": a["unit"],
-                    "distance_sd": distance,
-                }
-            )
+            row = {"before": a["median"], "after": b["median"], "unit": a["unit"], "distance_sd": distance}
+            below = {
+                f"{side}_below": one["q95"]
+                for side, one in (("before", a), ("after", b))
+                if not one.get("identified", True)
+            }
+            rows.append({"quantity": key, "what": "changed", **row, **below})
     return rows
 
 
@@ -138,28 +147,25 @@ def compared_of(
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """One line a change, then what each recording shows that matters."""
+    """One line a change, the largest first, then what each recording shows that matters."""
+    from selfcal.show.comparison_page import told_of
+
     console = console_of(to_stderr=to_stderr)
-    headings = ("axis", "quantity", "before", "after", "unit", "sd apart", "recordings")
+    headings = ("axes", "quantity", "before", "after", "unit", "sd apart", "recordings")
     table = table_of(headings, "changes beyond what the recordings leave open")
-    for name, axis in document["axes"].items():
-        for row in changes_of(axis):
-            changed = row["what"] == "changed"
-            table.add_row(
-                name,
-                row["quantity"],
-                f"{row['before']:.5g}" if changed else "-" if row["what"] == "appeared" else "found",
-                f"{row['after']:.5g}" if changed else "found" if row["what"] == "appeared" else "-",
-                row["unit"] if changed else "",
-                f"{row['distance_sd']:+.1f}" if changed else "",
-                printable(f"{Path(row['from']).name} -> {Path(row['to']).name}"),
-            )
+    rows = told_of(document)
+    for row in rows:
+        logs = f"{Path(row.change['from']).name} -> {Path(row.change['to']).name}"
+        distance = f"{row.change['distance_sd']:+.1f}" if "distance_sd" in row.change else ""
+        before, after = (row.side(name, "-") for name in ("before", "after"))
+        quantity = row.change["quantity"].replace("_", " ")
+        table.add_row(row.axes, quantity, before, after, row.unit, distance, printable(logs))
     if not console.is_terminal:
         console.width = max(console.width, 140)
-    if table.row_count:
+    if rows:
         console.print(table)
     errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}
-    if not any(changes_of(axis) for axis in document["axes"].values()):
+    if not rows:
         which = [name for name in document["axes"] if name not in errors] if errors else []
         console.print(f"{', '.join(which)}{': ' if which else ''}nothing changed beyond what the recordings leave open")
     for log, verdicts in document["verdicts"].items():

@@ -30,11 +30,57 @@ def page(document: Mapping[str, Any], curves: Curves) -> str:
     short = [Path(log).name for log in recordings]  # whole paths where two names are equal
     names = dict(zip(recordings, short if len(set(short)) == len(short) else recordings, strict=True))
     axes = [_axis(name, entry, document, curves.get(name, {}), names) for name, entry in document["axes"].items()]
-    changes = [(axis.name, change) for axis in axes for change in axis.changes]
-    changes.sort(key=lambda change: -abs(change[1].get("distance_sd", np.inf)))
     title = f"Comparison of {' and '.join(names.values())}"
-    values = {"document": document, "title": title, "names": names, "axes": axes, "changes": changes}
+    values = {"document": document, "title": title, "names": names, "axes": axes, "changes": told_of(document)}
     return str(render("comparison.html", **values))
+
+
+@dataclass(frozen=True)
+class Told:
+    """A line of the changes: one `change`, or one cause that appeared or is gone on several axes: all of it."""
+
+    changes: list[tuple[str, Mapping[str, Any]]]
+
+    @property
+    def change(self) -> Mapping[str, Any]:
+        return self.changes[0][1]
+
+    @property
+    def axes(self) -> str:
+        return " ".join(name for name, _ in self.changes)
+
+    @property
+    def unit(self) -> str:
+        """The unit of all axes; empty where they differ, or nothing has one."""
+        units = {change.get("unit", "") for _, change in self.changes}
+        return str(units.pop()) if len(units) == 1 else ""
+
+    def side(self, side: str, absent: str) -> str:
+        """The value `before` or `after`, of each axis: what it lies below where it is not identified; and without a
+        number whether it was found."""
+        if (below := self.change.get(f"{side}_below")) is not None:
+            return f"< {below:.5g}"
+        sizes = [change.get(side) for _, change in self.changes]
+        if None in sizes:
+            return "found" if (self.change["what"] == "appeared") == (side == "after") else absent
+        digits = 5 if self.change["what"] == "changed" else 3
+        units = ["" if self.unit else f" {change['unit']}" for _, change in self.changes]
+        return ", ".join(f"{size:.{digits}g}{unit}" for size, unit in zip(sizes, units, strict=True))
+
+
+def told_of(document: Mapping[str, Any]) -> list[Told]:
+    """The lines of all axes: causes that appeared or are gone, on all their axes; then numbers by their distance."""
+    causes: dict[tuple[str, ...], list[tuple[str, Mapping[str, Any]]]] = {}
+    numbers: list[tuple[str, Mapping[str, Any]]] = []
+    for name, entry in document["axes"].items():
+        for change in entry["changes"] if isinstance(entry, Mapping) else entry:
+            if change["what"] == "changed":
+                numbers.append((name, change))
+            else:
+                place = tuple(change[key] for key in ("from", "to", "quantity", "what"))
+                causes.setdefault(place, []).append((name, change))
+    numbers.sort(key=lambda row: -abs(row[1]["distance_sd"]))
+    return [Told(rows) for rows in causes.values()] + [Told([row]) for row in numbers]
 
 
 @dataclass(frozen=True)
