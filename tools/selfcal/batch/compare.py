@@ -16,7 +16,7 @@ from selfcal.base.output import console_of, table_of
 SCHEMA = "selfcal.compare/1"
 #: Least difference that counts, in standard deviations: 1 in 1600 quantities exceeds it by chance.
 LIMIT = 3.4
-#: Estimates that are sizes of a cause; places in time belong to one recording alone.
+#: Estimates that are sizes of a cause, the one that stands for it first; places in time belong to one recording alone.
 SIZES = ("coefficient", "slope", "amplitude", "frequency_hz", "B", "lag1", "ratio", "lsb", "limit")
 
 
@@ -88,15 +88,13 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
         cause = str(finding["cause"])
         counted[cause] = counted.get(cause, 0) + 1
         label = cause if counted[cause] == 1 else f"{cause} {counted[cause]}"
-        known_sizes = {
-            f"{label}.{key}": estimate
-            for key, estimate in finding["estimate"].items()
-            if key in SIZES and isinstance(estimate, Mapping)
+        own_sizes = {
+            key: finding["estimate"][key] for key in SIZES if isinstance(finding["estimate"].get(key), Mapping)
         }
-        first = next(iter(known_sizes.values()), {})
+        first: Mapping[str, Any] = next(iter(own_sizes.values()), {})
         size = {part: first[part] for part in ("median", "unit") if part in first}
         sizes[label] = {"present": True, "small": cause not in matter, **size}
-        sizes |= known_sizes
+        sizes |= {f"{label}.{key}": estimate for key, estimate in own_sizes.items()}
     return sizes
 
 
