@@ -44,7 +44,7 @@ def test_it_has_what_the_document_has(made: tuple[dict[str, Any], str]) -> None:
     assert re.search(r"step.*1\.2", seen.text)
     quantities = document["quantities"][document["recordings"][0]]["ax"]
     assert f"{quantities['N']['median']:.3g}" in seen.text
-    assert [one["id"] for one in seen.named("h2")] == ["changes", "verdicts", "axis-ax", "axis-gx", "read"]
+    assert [one["id"] for one in seen.named("h2")] == ["changes", "verdicts", "axis-gx", "axis-ax", "read"]
     assert len(seen.named("figure")) == 2 and len([one for one in seen.named("svg") if "aria-label" in one]) == 4
 
 

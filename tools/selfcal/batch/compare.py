@@ -72,7 +72,8 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
             if name not in numbers and estimate["identified"]:
                 sizes[f"{name} ({law})" if name != "N" else "N"] = estimate
         sizes |= numbers
-        for regressor in known.get("regressors", {}).values():
+        stated = identified.get("regressors", {})  # a column of a finding has its size with that
+        for regressor in ({**stated, **known.get("regressors", {})}[name] for name in stated):
             for column, estimate in regressor["coefficients"].items():
                 if math.isfinite(estimate["median"]):
                     sizes[f"{column}.coefficient"] = estimate
@@ -131,7 +132,7 @@ def compared_of(
 ) -> dict[str, Compared]:
     """Each recording beside the one before, by axis. `seen`: the recordings with the quantities of each axis;
     `verdicts`: by recording and axis."""
-    compared = {name: Compared() for name in sorted(set().union(*verdicts.values()))}
+    compared = {name: Compared() for axes in verdicts.values() for name in axes}
     for (first, before), (second, after) in pairwise(seen):
         for name, axis in compared.items():
             error = incomparable({log: verdicts[log].get(name) for log in (first, second)})
