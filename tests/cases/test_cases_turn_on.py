@@ -53,6 +53,32 @@ def test_the_amplitude_is_the_one_at_the_start_of_the_recording() -> None:
         assert look.estimate["amplitude"]["sd"] < 0.03
 
 
+def test_two_time_constants_are_never_two_huge_ones_that_cancel() -> None:
+    """A bump t/tau exp(1 - t/tau) of 0.5 deg/s is the limit of two equal time constants with endless amplitudes. With
+    time constants a factor 4 apart the curve of least error has 2.2 times the bump's height on either."""
+    for seed, tau in enumerate((40.0, 70.0, 110.0, 180.0)):
+        t = np.arange(3600.0)
+        y = 0.5 * t / tau * np.exp(1.0 - t / tau) + noise(np.random.default_rng(700 + seed), "walk", t.size, 1.0)
+        look = looked(y, 1.0)
+        assert look is not None and "tau_2_s" in look.estimate
+        assert look.estimate["tau_2_s"]["median"] > 3.9 * look.estimate["tau_s"]["median"]
+        assert all(abs(look.estimate[key]["median"]) < 3.0 * 0.5 for key in ("amplitude", "amplitude_2"))
+
+
+def test_both_time_constants_lie_in_their_intervals() -> None:
+    """Of 6 records 4 and more have each number in its 90 % interval; 1 in 60 would fail by chance."""
+    inside = {"tau_s": 0, "tau_2_s": 0, "amplitude": 0, "amplitude_2": 0}
+    truth = {"tau_s": 25.0, "tau_2_s": 280.0, "amplitude": 0.9, "amplitude_2": 0.6}
+    t = np.arange(3600.0)
+    curve = sum(truth[f"amplitude{end}"] * np.exp(-t / truth[f"tau{end}_s"]) for end in ("", "_2"))
+    for seed in range(6):
+        look = looked(curve + noise(np.random.default_rng(800 + seed), "walk", t.size, 1.0), 1.0)
+        assert look is not None
+        for key, value in truth.items():
+            inside[key] += bool(look.estimate[key]["q05"] <= value <= look.estimate[key]["q95"])
+    assert min(inside.values()) >= 4, inside
+
+
 def coefficient(document: dict[str, Any]) -> dict[str, float]:
     entry = document["axes"]["gx"]["regressors"]["settling"]
     return {key: float(value) for key, value in entry["coefficients"]["settling"].items() if key != "unit"}

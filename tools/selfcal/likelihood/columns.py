@@ -51,13 +51,15 @@ NODE, POSSIBLE, NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
 
 @dataclass(frozen=True)
 class Number:
-    """One number of a shape, above 0: its key in the estimate, its unit, and between what it is looked for."""
+    """One number of a shape, above 0: its key in the estimate, its unit, and between what it is looked for. A number
+    that is a share `of` another one has that in its value and limits, and in the estimate their product."""
 
     key: str
     value: float
     unit: str
     low: float
     high: float
+    of: str = ""
 
 
 @dataclass(frozen=True)
@@ -98,6 +100,11 @@ class Shape:
     def worth(self, gain: float) -> float:
         """A gain net of the search."""
         return net(gain, self.free, self.price(gain) if callable(self.price) else self.price)
+
+    def told(self, thetas: Array) -> dict[str, Array]:
+        """What the estimate says of the numbers [..., m], by key."""
+        values = {one.key: thetas[..., k] for k, one in enumerate(self.numbers)}
+        return {one.key: values[one.key] * values.get(one.of, 1.0) for one in self.numbers}
 
     @property
     def limits(self) -> Array:
@@ -201,7 +208,7 @@ def alike(found: Mapping[str, Tried]) -> list[Tried]:
     limit: any slower change looks like the longest lag, or settling."""
     best = max(one.net for one in found.values())
     near = [one for one in found.values() if one.net > best - ALIKE]
-    return sorted(near, key=lambda one: any(number.value > 0.5 * number.high for number in one.shape.numbers))
+    return sorted(near, key=lambda one: any(n.value > 0.5 * n.high and not n.of for n in one.shape.numbers))
 
 
 def looks(
@@ -239,7 +246,8 @@ def _estimate(chosen: Tried) -> dict[str, Any]:
     k = len(shape.columns)
     c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
     found = {key: interval(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
-    numbers = {one.key: interval(one.value, 0.0, one.unit) for one in shape.numbers}
+    values = shape.told(np.array(shape.theta))
+    numbers = {one.key: interval(float(values[one.key]), 0.0, one.unit) for one in shape.numbers}
     return {**shape.where(fit), **found, **numbers, **shape.stated}
 
 
@@ -266,9 +274,9 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
         key: mixture(weight.ravel(), means[..., j].ravel(), sds[..., j].ravel(), unit)
         for j, (key, unit) in enumerate(shape.keys)
     }
-    for k, number in enumerate(shape.numbers):
+    for k, (number, values) in enumerate(zip(shape.numbers, shape.told(np.exp(points)).values(), strict=True)):
         # The deviation within a cell of the lattice: its width over the root of 12.
-        values, width = np.exp(points[:, k]), float(np.linalg.norm(steps[k])) / math.sqrt(12.0)
+        width = float(np.linalg.norm(steps[k])) / math.sqrt(12.0)
         found[number.key] = mixture(weight.sum(axis=1), values, values * width, number.unit)
     return found
 
@@ -332,4 +340,5 @@ def least(state: State, shape: Shape, key: str) -> dict[str, tuple[float, str]]:
     """The size of a shape of one column that the record would have shown, its search paid for, with its numbers."""
     (_, unit), size = shape.keys[0], state.least(shape.columns[0])
     found = {key: (size * math.sqrt(gain_for(shape.worth)), unit)}
-    return {**found, **{one.key: (one.value, one.unit) for one in shape.numbers}}
+    values = shape.told(np.array(shape.theta))
+    return {**found, **{one.key: (float(values[one.key]), one.unit) for one in shape.numbers}}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import combinations
 from typing import Any
 
@@ -47,9 +46,13 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
 
 
 def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
+    """Of one time constant, or of two, the faster one first: that is a share of the slower one."""
     rows = _decays(_time(record), np.asarray(tau))
     ends = ["", "_2"][: len(tau)]
     low, high = _range(record)
+    numbers = [Number(f"tau{ends[-1]}_s", float(tau[-1]), "s", low, high)]
+    if len(tau) == 2:
+        numbers.append(Number("tau_s", float(tau[0] / tau[1]), "s", low / high, 1.0 / APART, of="tau_2_s"))
     return Shape(
         f"{len(tau)}",
         rows,
@@ -60,8 +63,8 @@ def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
         tuple((f"amplitude{end}", state.unit) for end in ends),
         price=len(tau) * LN_LOOKS + LN_SLOW,
         free=2 * len(tau),
-        numbers=tuple(Number(f"tau{end}_s", float(one), "s", low, high) for one, end in zip(tau, ends, strict=True)),
-        moved=partial(_shape, state, record),
+        numbers=tuple(numbers),
+        moved=lambda theta: _shape(state, record, [theta[1] * theta[0], theta[0]] if len(theta) == 2 else theta),
     )
 
 
