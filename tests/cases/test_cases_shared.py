@@ -146,6 +146,21 @@ def written(folder: Path, axes: dict[str, Array]) -> Path:
     return path
 
 
+@pytest.mark.parametrize(("seed", "source"), [(11, "gx"), (12, "gy"), (13, "az")])
+def test_one_source_of_several_axes_is_one_leak(tmp_path: Path, seed: int, source: str) -> None:
+    """A share of one axis' readings in three others: by one pair alone the direction is a toss, by all it is not. Each
+    shows 0.5 x 4000 x 0.12^2 = 29 nats."""
+    random = np.random.default_rng(seed)
+    names = ("gx", "gy", "gz", "ax", "az")
+    axes = {name: random.standard_normal(2 * SAMPLES) + drift(random, 2 * SAMPLES, 0.02) for name in names}
+    followers = {name for name in names if name != source and name != "gz"}
+    axes |= {name: axes[name] + 0.12 * axes[source] for name in followers}
+    columns = {f"{name}[{'deg/s' if name[0] == 'g' else 'm/s^2'}]": y for name, y in axes.items()}
+    np.savez(tmp_path / "star.npz", allow_pickle=False, **{"t[s]": np.arange(2.0 * SAMPLES), **columns})
+    leaks = [finding for finding in diagnose(tmp_path / "star.npz")["findings"] if finding["cause"] == "cross_axis"]
+    assert [(leak["estimate"]["other"], set(leak["axes"])) for leak in leaks] == [(source, followers)]
+
+
 def test_a_leak_is_no_common_source(tmp_path: Path) -> None:
     """The drift of the other axis leaks as well; of a common source each axis has a drift of its own."""
     random = np.random.default_rng(45)

@@ -51,17 +51,21 @@ def _channel(record: Record, name: str, values: Array) -> Channel:
 def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     """Two axes that each blame the other: the reading that follows is the one that gains more by it.
 
-    White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, the weaker
-    coupling is kept: a mechanical one is below 1. Returns the axes whose model changed."""
+    White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, one source of
+    several axes is likelier than several of one; and of one pair the weaker coupling is kept: a mechanical one is
+    below 1. Returns the axes whose model changed."""
     changed = [*_own_ramps(record, found), *_star(record, found)]
     static = [leak for leak in _leaks(found) if leak[2].look.estimate["form"] == "static"]
     pairs = {(name, other): finding for name, other, finding in static}
+    partners = _partners(found)
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
         if back is None:
             continue
-        ahead = back.look.gain - finding.look.gain
+        ahead: float = back.look.gain - finding.look.gain
         if abs(ahead) < ALIKE:
+            ahead = partners[name] - partners[other]
+        if ahead == 0.0:
             sizes = [abs(float(one.look.estimate["coefficient"]["median"])) for one in (finding, back)]
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
@@ -91,6 +95,12 @@ def _leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
     ]
 
 
+def _partners(found: Mapping[str, Diagnosed]) -> Counter[str]:
+    """Axes that each goes together with, whichever follows."""
+    pairs = {frozenset((name, other)) for name, other, _ in _leaks(found)}
+    return Counter(name for pair in pairs for name in pair)
+
+
 def _drop(one: Diagnosed, finding: Finding, free: State) -> None:
     one.findings.remove(finding)
     one.state = free
@@ -113,13 +123,12 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
 
 
 def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    """Turn a leak about, where the axis that follows is the source of more axes than its own is, and the other way
-    round explains it nearly as well: one source of several axes is likelier than several. Returns the axes whose model
-    changed."""
+    """Turn a leak about, where the axis that follows goes together with more axes than the other one does, and the
+    other way round explains it nearly as well. Returns the axes whose model changed."""
     changed: list[str] = []
-    followed = Counter(other for _, other, _ in _leaks(found))
+    partners = _partners(found)
     for name, other, finding in _leaks(found):
-        if followed[name] <= followed[other] or other not in found:
+        if partners[name] <= partners[other] or other not in found:
             continue
         one, source = found[name], found[other]
         free = without(one.state, other)
@@ -130,7 +139,6 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             after = source.state.refit(**back[0].changes)
             source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
             source.state = after
-            followed += Counter({name: 1, other: -1})
             changed += [name, other]
     return changed
 
