@@ -583,7 +583,7 @@ from selfcal.diagnosis import diagnose as verb
 
 loop, last = verb.diagnose_record, time.monotonic()
 
-def interrupted(record, axes, advance, found):
+def interrupted(record, axes, advance, found, *means):
     seen = 0
     def noted(text):
         nonlocal seen
@@ -596,7 +596,7 @@ def interrupted(record, axes, advance, found):
             time.sleep(0.2)
         last = time.monotonic()
         advance(text)
-    return loop(record, axes, noted, found)
+    return loop(record, axes, noted, found, *means)
 
 verb.diagnose_record = interrupted
 cli.main()

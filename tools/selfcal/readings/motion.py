@@ -69,11 +69,13 @@ MARGIN_S, EDGE_S = 0.5, 5.0
 @dataclass(frozen=True)
 class Moved:
     """Motion of one axis: begin and end of its stretches in order, s, their `nats` over rest, and those `net` of the
-    search."""
+    search. `ratio`: the readings in them about their level over the noise beside them, root mean square; not a number
+    where that is 0."""
 
     intervals: tuple[tuple[float, float], ...]
     nats: float
     net: float
+    ratio: float
 
 
 @dataclass(frozen=True)
@@ -122,7 +124,8 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         for k, name in enumerate(names):
             times = joined([_times(energy, one, recording) for one in found[name]])
             nats = sum(float(one.nats[k]) for one in found[name])
-            seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]))
+            ratio = _loudness(recording, name, energy, found[name], times)
+            seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]), ratio)
     return {name: one for name, one in seen.items() if one.intervals}
 
 
@@ -131,6 +134,26 @@ def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, f
     begin, end, length_s = one.begin * energy.piece_s, one.end * energy.piece_s, recording.duration_s
     margin_s = max(MARGIN_S, 3.0 * energy.piece_s)  # the first loud samples may look like single wild ones
     return begin - margin_s if begin > EDGE_S else 0.0, end + margin_s if end < length_s - EDGE_S else length_s
+
+
+def _loudness(
+    recording: Recording, name: str, energy: Energy, found: Sequence[Stretch], times: Sequence[tuple[float, float]]
+) -> float:
+    """The ratio of Moved, of the stretches that were `found` in an axis and the `times` left out for them."""
+    y, time = recording.columns[name].values, recording.clock_of(name).time_s
+    rest = np.isfinite(y) & ~np.any([(time >= a) & (time < b) for a, b in times], axis=0) if times else y < y
+    steps = np.abs(np.diff(y[rest]))
+    noise = float(np.median(steps)) / (MEDIAN_SD * math.sqrt(2.0)) if steps.size else 0.0
+    squares = [np.zeros(0)]
+    for one in found:
+        a, b = one.begin * energy.piece_s, one.end * energy.piece_s
+        beside = [rest & (time >= first) & (time < first + PUSH_S) for first in (a - PUSH_S - EDGE_S, b + MARGIN_S)]
+        levels = [(float(np.median(time[each])), float(np.median(y[each]))) for each in beside if each.any()]
+        inside = np.isfinite(y) & (time >= a) & (time < b)
+        if levels:
+            squares.append((y[inside] - np.interp(time[inside], *np.array(levels).T)) ** 2)
+    every = np.concatenate(squares)
+    return math.sqrt(float(every.mean())) / noise if every.size and noise > 0.0 else math.nan
 
 
 def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
@@ -264,7 +287,8 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
                     found.append((float(net[at]), int(begin[at]), length, which))
     taken = np.zeros(pieces, bool)
     apart: list[Stretch] = []
-    for net, first, length, which in sorted(found, key=lambda one: (one[3].sum() == 1, -one[0])):
+    sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others, and no other takes its place
+    for net, first, length, which in sorted(found, key=lambda one: (one[0] <= sure, one[3].sum() == 1, -one[0])):
         if not taken[first : first + length].any():
             a, b = _ends(energy, *_ends(energy, first, first + length, which), which)
             nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
@@ -273,7 +297,6 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
-    sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others
     nets = sorted((one.net for one in [*known, *apart] if one.axes.sum() > 1 and one.net <= sure), reverse=True)
     # At rest exp(-net) stretches of several axes are beyond a net: the fewest that are together no chance.
     least = [net for many, net in enumerate(nets, 1) if gammainc(many, math.exp(-net)) < SHARE]
