@@ -212,7 +212,7 @@ def test_bursts_of_some_axes_move_those(rate: float, times: tuple[float, float])
     readings, the loudest axis, and the search leave about 9, with a deviation of 4, where 7 are needed: one of two
     bursts is found in 8 of 10 records (53 of 60)."""
     random = np.random.default_rng([31, round(rate)])
-    count, seen, named, wrong, elsewhere = case_records(12, 120), 0, 0, 0, 0
+    count, seen, named, wrong, elsewhere = case_records(10, 120), 0, 0, 0, 0
     for _ in range(count):
         rows = random.standard_normal((6, round(1300.0 * rate)))
         shaken = random.choice(6, 3, replace=False)

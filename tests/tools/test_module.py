@@ -382,9 +382,9 @@ def _of_one_axis(sizes: dict[str, float], gravity: str = "az") -> set[str]:
     return set(finding["also_possible"])
 
 
-def test_a_step_of_one_accelerometer_may_be_a_tilt() -> None:
-    """0.7 degrees move ay by 0.12 m/s^2 and az by 0.0007, which its noise hides; a step along gravity is no turn."""
-    assert _of_one_axis({"ay": 9.80665 * math.sin(math.radians(0.7))}) == {"tilt"}
-    assert _of_one_axis({"az": 0.12}) == set()
-    # 12 degrees would move az by 0.2.
-    assert _of_one_axis({"ay": 9.80665 * math.sin(math.radians(12.0))}) == set()
+@pytest.mark.parametrize(("axis", "degrees", "turns"), [("ay", 0.7, True), ("az", 0.7, False), ("ay", 12.0, False)])
+def test_a_step_of_one_accelerometer_may_be_a_tilt(axis: str, degrees: float, turns: bool) -> None:
+    """0.7 degrees move ay by 0.12 m/s^2 and az by 0.0007, which its noise hides; a step along gravity is no turn. 12
+    degrees would move az by 0.2."""
+    also_possible = _of_one_axis({axis: 9.80665 * math.sin(math.radians(degrees))})
+    assert also_possible == ({"tilt"} if turns else set())
