@@ -22,11 +22,7 @@ def verdict(axis: Mapping[str, Any]) -> str:
     return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
 
 
-#: Follows its number.
-TIMES = "times the noise"
-#: A cause that is not read out as its name.
-NAMES = {"turn_on": "turn-on transient"}
-#: How an estimate's key is read out.
+#: How an estimate's key is read out, or a cause.
 LABELS = {
     "other": "other axis",
     "share": "share of the noise",
@@ -46,7 +42,8 @@ LABELS = {
     "misread": "share read as a neighbour",
     "value": "a dead band about",
     "lag1": "correlation of neighbours",
-    "ratio": TIMES,
+    "ratio": "times the noise",
+    "turn_on": "turn-on transient",
 }
 #: What a form adds to the sentence; the static one is what the sentence says by itself.
 FORMS = {
@@ -133,7 +130,7 @@ def _size(key: str, value: Any) -> str:
         unit = "" if unit == "1" else f" {unit}"
         spread = f" ± {ratio(half)}" if half > 0.0 and math.isfinite(half) else ""
         size = rounded(value["median"], half) if "q05" in value else f"{value['median']:.3g}"
-        return f"{size}{spread} {label}" if label == TIMES else f"{label} {size}{spread}{unit}"
+        return f"{size}{spread} {label}" if key == "ratio" else f"{label} {size}{spread}{unit}"
     match key:
         case "intervals":
             return intervals(value)
@@ -178,7 +175,7 @@ def event(finding: Mapping[str, Any]) -> str:
 
 def named(cause: str) -> str:
     """A cause by its name."""
-    return NAMES.get(cause, cause.replace("_", " "))
+    return LABELS.get(cause, cause.replace("_", " "))
 
 
 def what(finding: Mapping[str, Any]) -> str:
@@ -196,9 +193,8 @@ def how_much(finding: Mapping[str, Any]) -> str:
         if "share" in one["estimate"] and not isinstance(one["estimate"]["share"], Mapping):
             found.append((axis, one["estimate"]["share"], "of the drift"))
         elif value is not None and value["median"] is not None:
-            label = LABELS.get(key, key.replace("_", " "))
-            of = value["unit"] if value["unit"] != "1" else label if label == TIMES else f"({label})"
-            found.append((axis, value["median"], of))
+            label = named(key) if key == "ratio" else f"({named(key)})"
+            found.append((axis, value["median"], value["unit"] if value["unit"] != "1" else label))
     return _by_unit(found)
 
 

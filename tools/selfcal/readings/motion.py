@@ -37,8 +37,8 @@ WILD = (3.0, 8.0)
 #: Readings whose median is the level of the middle one: ramps, jumps and slow waves have no part in what is apart from
 #: it. Squares of white noise about it in one degree of freedom.
 LEVEL, SQUARES = 9, 1.29
-#: Longest window, s. Its sides are so many times as long each, s at least, and squares at least.
-WINDOW_S, SIDE, SIDE_S, SIDE_SQUARES = 32.0, 8, 10.0, 120
+#: Longest window, s. Its sides are so many times as long each, PUSH_S at least, and squares at least.
+WINDOW_S, SIDE, SIDE_SQUARES = 32.0, 8, 120
 #: Probability, a record, that axes at rest move together, and that one moves alone.
 SHARE = SHARES["motion"]
 #: Share of its windows by which an axis' own loudness counts: of an axis alone at most the rest may be loud.
@@ -48,9 +48,7 @@ QUIETER = (0.1587, 0.5)
 #: Nats by which the search over windows costs all axes together less than as many windows apart: of 124 clean records
 #: of 600 and 1500 s at 1 and 10 Hz the largest of one is 1.5 to 1.9 less in the median, and 2.0 to 2.7 in a tenth.
 FEWER = 2.0
-#: Nats that each of several stretches of all axes has at least: at rest one record in ten has one.
-EACH = 2.3
-#: Nats from which on an axis is in a stretch of others: ln 20.
+#: Nats that each of several stretches of all axes has at least, and from which on an axis is in one of others: ln 20.
 TOGETHER = 3.0
 #: Least probability whose logarithm is taken.
 TINY = 1e-300
@@ -141,19 +139,24 @@ def _loudness(
 ) -> float:
     """The ratio of Moved, of the stretches that were `found` in an axis and the `times` left out for them."""
     y, time = recording.columns[name].values, recording.clock_of(name).time_s
-    rest = np.isfinite(y) & ~np.any([(time >= a) & (time < b) for a, b in times], axis=0) if times else y < y
+    rest = np.isfinite(y)
+
+    def rows(begin_s: float, end_s: float) -> slice:
+        return slice(*np.searchsorted(time, (begin_s, end_s)))
+
+    for a, b in times:
+        rest[rows(a, b)] = False
     steps = np.abs(np.diff(y[rest]))
     noise = float(np.median(steps)) / (MEDIAN_SD * math.sqrt(2.0)) if steps.size else 0.0
-    squares = [np.zeros(0)]
+    total, count = 0.0, 0
     for one in found:
         a, b = one.begin * energy.piece_s, one.end * energy.piece_s
-        beside = [rest & (time >= first) & (time < first + PUSH_S) for first in (a - PUSH_S - EDGE_S, b + MARGIN_S)]
-        levels = [(float(np.median(time[each])), float(np.median(y[each]))) for each in beside if each.any()]
-        inside = np.isfinite(y) & (time >= a) & (time < b)
+        sides = [rows(a - EDGE_S - PUSH_S, a), rows(b, b + EDGE_S + PUSH_S)]
+        levels = [(np.median(time[at][rest[at]]), np.median(y[at][rest[at]])) for at in sides if rest[at].any()]
         if levels:
-            squares.append((y[inside] - np.interp(time[inside], *np.array(levels).T)) ** 2)
-    every = np.concatenate(squares)
-    return math.sqrt(float(every.mean())) / noise if every.size and noise > 0.0 else math.nan
+            apart = y[rows(a, b)] - np.interp(time[rows(a, b)], *np.array(levels).T)
+            total, count = total + float(np.nansum(apart**2)), count + int(np.isfinite(apart).sum())
+    return math.sqrt(total / count) / noise if count and noise > 0.0 else math.nan
 
 
 def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
@@ -281,7 +284,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         looks = math.log(used.size * pieces / length)
         singly = alone.max(axis=0) - looks - math.log(axes * len(lengths))
         for net, several in ((others.max(axis=0) - looks + FEWER, True), (singly, False)):
-            for at in np.flatnonzero(net > (EACH if several else -math.log(SHARE))):
+            for at in np.flatnonzero(net > (TOGETHER if several else -math.log(SHARE))):
                 which = loudest[:, at] > TOGETHER if several else np.arange(axes) == np.argmax(alone[:, at])
                 if several == (which.sum() > 1):
                     found.append((float(net[at]), int(begin[at]), length, which))
@@ -316,7 +319,7 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
         n = counts[..., last] - counts[..., first]
         return (sums[..., last] - sums[..., first]) / np.maximum(n, 1.0), n
 
-    side = max(SIDE * length, round(SIDE_S / energy.piece_s), math.ceil(SIDE_SQUARES / max(1e-9, float(each.max()))))
+    side = max(SIDE * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / max(1e-9, float(each.max()))))
     own, n = means(begin, begin + length)
     left, n_left = means(begin - 1 - side, begin - 1)
     right, n_right = means(begin + length + 1, begin + length + 1 + side)

@@ -26,8 +26,6 @@ TURNS_LEAST, BAND_TURNS = 1.5, 3.0
 SLOW_TURNS = 30.0
 #: Two axes know the frequency of one line to so many turns in the record: nearer ones share a column.
 SAME = 0.25
-#: Share of the rate of the recording from which on a line is near half of it: it may be an alias of a faster one.
-NEAR_HALF, ALIASED = 0.25, "Record at another rate: a line that moves is an alias."
 #: Widths of a band in bins of the periodogram.
 BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
 #: A band must show this much, nats net of the search, before it is fitted; and explain this much more than a line.
@@ -317,12 +315,14 @@ def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
 
 
 def _advice(look: Look, record: Record) -> str:
-    """A line of few turns may be a drift; one near half the rate may be an alias, and that it moves with the rate."""
+    """A line of few turns may be a drift. One of fewer than four readings a turn is near half of the rate:
+    it may be an alias of a faster one, and moves with the rate."""
     turns = _hz(look) * float(record.time_s[-1])
     if turns < SLOW_TURNS:
         beside = "" if "temperature" in record.channels else ", with the temperature at the sensor"
         return f"Record longer{beside}: {turns:.1f} turns hardly tell a line from a drift."
-    return ALIASED if _hz(look) > NEAR_HALF * record.recorded_hz else ""
+    few = record.recorded_hz < 4.0 * _hz(look)
+    return "Record at another rate: a line that moves is an alias." if few else ""
 
 
 CAUSE = Cause(
