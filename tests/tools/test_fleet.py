@@ -353,6 +353,8 @@ def test_causes_and_their_exit_code(logs: Path) -> None:
     assert result["failed"] == {"sn01": ["step: gx"]} and result["code"] == 1
     causes = {(row["device"], row["axis"]): row["causes"] for row in table(logs / "t.csv")}
     assert causes.pop(("sn01", "gx")) == "step"
+    material = {(row["device"], row["axis"]) for row in table(logs / "t.csv") if row["material"] == "step"}
+    assert material == {("sn01", "gx")}
     assert "step" not in " ".join(causes.values())
     (link,) = re.findall(r"<b>sn01</b>.*?<a href='([^']+)'", (logs / "logs/t.html").read_text())
     page_of_unit = logs / "logs" / link

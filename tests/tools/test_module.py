@@ -7,6 +7,7 @@ small record, by dense matrices.
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,11 +17,14 @@ from numpy.typing import NDArray
 
 from selfcal.diagnosis import module
 from selfcal.diagnosis.causes import tilt
+from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.loop import _give, diagnose_record
-from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.record import Record, of_recording
 from selfcal.likelihood.joint import Joint, act, course, information
 from selfcal.likelihood.state import Look, State, interval
+from selfcal.logs.recording import Column, Recording
+from selfcal.model.file import Model
 
 from conftest import case_records
 
@@ -359,3 +363,28 @@ def test_what_is_no_turn_is_a_step() -> None:
     """Along gravity; or against what the gyroscopes say; or with a gyroscope among the axes."""
     for sizes, turned in (({"ax": 0.01, "az": 0.08}, 0.0), ({"ax": 0.05, "ay": -0.08}, -1.0)):
         assert {look.cause for look in _looks(sizes, turned).values()} == {"step"}
+
+
+def _of_one_axis(sizes: dict[str, float], gravity: str = "az") -> set[str]:
+    """What a step of 900 s at 1 Hz may also be. Sizes, m/s^2, at 520 s; `gravity` has 1 g."""
+    random = np.random.default_rng(9)
+    n = 900
+    columns = {}
+    for name in ("ax", "ay", "az"):
+        jump = sizes.get(name, 0.0) * (np.arange(n) >= 520)
+        columns[name] = 0.02 * random.standard_normal(n) + jump + 9.80665 * (name == gravity)
+    recording = Recording(
+        Path("a"), 1.0, {k: Column(k, "m/s^2", v) for k, v in columns.items()}, np.zeros(n, np.int64), {}
+    )
+    document = to_document(recording, diagnose_record(of_recording(recording, Model.load(None)), list(sizes)), {}, {})
+    (finding,) = document["axes"][next(iter(sizes))]["findings"]
+    assert finding["cause"] == "step"
+    return set(finding["also_possible"])
+
+
+@pytest.mark.parametrize(("axis", "degrees", "turns"), [("ay", 0.7, True), ("az", 0.7, False), ("ay", 12.0, False)])
+def test_a_step_of_one_accelerometer_may_be_a_tilt(axis: str, degrees: float, turns: bool) -> None:
+    """0.7 degrees move ay by 0.12 m/s^2 and az by 0.0007, which its noise hides; a step along gravity is no turn. 12
+    degrees would move az by 0.2."""
+    also_possible = _of_one_axis({axis: 9.80665 * math.sin(math.radians(degrees))})
+    assert also_possible == ({"tilt"} if turns else set())

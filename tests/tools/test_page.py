@@ -289,6 +289,7 @@ def test_the_findings_stand_at_the_top(case: Case) -> None:
     step = next(place for place, one in enumerate(case.document["findings"], 1) if one["cause"] == "step")
     strip = next(label for label in pictures_of if label.startswith("Readings and events: gx, gy; marks at"))
     assert re.search(rf"125\d s \({step}\)", strip)  # the step is at sample 2500 of 2 Hz
+    assert f"Without a mark, as no time is known or they act all along: {3 - step}." in parsed.text
 
 
 def cells_of(text: str, name: str) -> list[list[str]]:

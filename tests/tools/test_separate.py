@@ -46,11 +46,11 @@ def test_the_planned_record_decides(tmp_path: Path) -> None:
 def test_the_sentence_of_a_plan() -> None:
     """Without a channel to cycle, without a record that suffices, and without a rival."""
     plan = {"drive": None, "between": ["ramp", "turn_on"], "duration_s": 5000.0}
-    told = "Leave it on, with all else still, and record 84 minutes. Then ramp and turn on differ by 10 nats."
+    told = "Leave it on, with all else still, and record 84 minutes. Then ramp and turn-on transient differ by 10 nats."
     assert planned(plan, "Advice.") == told
     cycle = {"drive": "temperature", "amplitude": 3.0, "unit": "degC", "period_s": 900.0, "duration_s": 900.0}
     assert "for 15 minutes. Hold the supply still. Then" in planned({**cycle, "between": ["temperature", "supply"]}, "")
     assert "Hold" not in planned({**cycle, "between": ["temperature", "turn_on"]}, "")
-    none = "Advice. No record that was tried tells ramp and turn on apart."
+    none = "Advice. No record that was tried tells ramp and turn-on transient apart."
     assert planned({**plan, "duration_s": None}, "Advice.") == none
     assert planned(None, "Advice.") == "Advice."

@@ -16,7 +16,7 @@ from selfcal.batch.files import Source, moment, stem
 
 COLUMNS = (
     *("device", "recording", "recorded_at", "station", "lot", "sha256", "version", "axis", "parameter"),
-    *("median", "q05", "q95", "parameter_unit", "law", "probability", "adequate", "causes", "error"),
+    *("median", "q05", "q95", "parameter_unit", "law", "probability", "adequate", "causes", "material", "error"),
 )
 _NUMBERS = ("median", "q05", "q95", "probability")
 SUFFIXES = (".csv", ".parquet")
@@ -49,17 +49,14 @@ class Unit:
             return {"": self.error}
         return {name: axis["error"] for name, axis in self.axes.items() if "error" in axis}
 
-    def causes(self, axis: str) -> list[str]:
-        """The causes that `diagnose` finds on an axis."""
-        causes: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get("causes", [])
+    def causes(self, axis: str, key: str = "causes") -> list[str]:
+        """The causes that `diagnose` finds on an axis; of the key `material` those that change a number."""
+        causes: list[str] = self.record.get("diagnosis", {}).get(axis, {}).get(key, [])
         return causes
 
     def small(self, axis: str) -> set[str]:
         """Causes that change no number by as much as matters."""
-        return set(self.causes(axis)) - {
-            "unexplained",
-            *self.record.get("diagnosis", {}).get(axis, {}).get("material", []),
-        }
+        return set(self.causes(axis)) - {"unexplained", *self.causes(axis, "material")}
 
 
 def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
@@ -75,7 +72,7 @@ def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
             continue
         law = likeliest(axis["hypotheses"])
         known = {"law": law, "probability": axis["hypotheses"][law], "adequate": axis["adequate"]}
-        known["causes"] = ";".join(unit.causes(name))
+        known |= {key: ";".join(unit.causes(name, key)) for key in ("causes", "material")}
         unjudged = unit.record.get("diagnosis", {}).get(name, {}).get("error")
         known |= {} if unjudged is None else {"error": f"not diagnosed: {unjudged}"}
         coefficients = {

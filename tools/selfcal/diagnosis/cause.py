@@ -184,6 +184,7 @@ class Cause:
     """Everything about one cause.
 
     id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
+    advice    the advice to a look instead, where its size asks for another; "": record_next.
     unsure    words instead where the estimate has `source`: which axis is the source is not shown.
     source    where it comes from: surroundings, handling, sensor, read-out or model.
     looks     candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
@@ -197,6 +198,7 @@ class Cause:
     id: str
     words: str
     record_next: str
+    advice: Callable[[Look, Record], str] = field(default=lambda look, record: "")
     unsure: str = ""
     source: str = "model"
     looks: Looks | None = None

@@ -95,7 +95,7 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
 
 
 def _finding(finding: Finding, record: Record, factor: float, unit: str, final: State) -> dict[str, Any]:
-    look = finding.look
+    look, cause = finding.look, CAUSES[finding.look.cause]
     beside = finding.before if finding.record is not None else final.without({one.name for one in finding.columns})
     record = finding.record or record
     inner = finding.before.unit
@@ -127,8 +127,8 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str, final: 
         "estimate": estimate,
         "when": later(list(look.when), record.start_s) if look.when else None,
         "found_in_round": finding.round,
-        "also_possible": list(finding.also_possible),
-        "record_next": words.planned(planned, CAUSES[look.cause].record_next),
+        "also_possible": list(dict.fromkeys((*finding.also_possible, *look.others))),
+        "record_next": words.planned(planned, cause.advice(look, record) or cause.record_next),
         "next_record": planned,
         "gain": held_out,
         **({} if reason is None else {"gain_reason": reason}),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -21,7 +22,7 @@ def verdict(axis: Mapping[str, Any]) -> str:
     return f"{'nothing found so far' if axis['verdict'] == 'adequate' else axis['verdict']}, not finished"
 
 
-#: How an estimate's key is read out.
+#: How an estimate's key is read out, or a cause.
 LABELS = {
     "other": "other axis",
     "share": "share of the noise",
@@ -42,6 +43,7 @@ LABELS = {
     "value": "a dead band about",
     "lag1": "correlation of neighbours",
     "ratio": "times the noise",
+    "turn_on": "turn-on transient",
 }
 #: What a form adds to the sentence; the static one is what the sentence says by itself.
 FORMS = {
@@ -109,8 +111,9 @@ def rounded(value: float, half: float) -> str:
 
 
 def intervals(stretches: Sequence[Sequence[float]]) -> str:
-    """The first few stretches of time, and how many more there are."""
-    return f"from {few([f'{start:.6g} s to {end:.6g} s' for start, end in stretches], 3)}"
+    """The first few stretches of time, how many more there are, and how long all are."""
+    told = f"from {few([f'{start:.6g} s to {end:.6g} s' for start, end in stretches], 3)}"
+    return f"{told}, {sum(end - start for start, end in stretches):.3g} s in all" if len(stretches) > 1 else told
 
 
 def sizes(estimate: Mapping[str, Any]) -> str:
@@ -127,7 +130,7 @@ def _size(key: str, value: Any) -> str:
         unit = "" if unit == "1" else f" {unit}"
         spread = f" ± {ratio(half)}" if half > 0.0 and math.isfinite(half) else ""
         size = rounded(value["median"], half) if "q05" in value else f"{value['median']:.3g}"
-        return f"{label} {size}{spread}{unit}"
+        return f"{size}{spread} {label}" if key == "ratio" else f"{label} {size}{spread}{unit}"
     match key:
         case "intervals":
             return intervals(value)
@@ -170,10 +173,15 @@ def event(finding: Mapping[str, Any]) -> str:
     return f"{CAUSES[finding['cause']].words} {told or 'On ' + ', '.join(finding['axes'])}."
 
 
+def named(cause: str) -> str:
+    """A cause by its name."""
+    return LABELS.get(cause, cause.replace("_", " "))
+
+
 def what(finding: Mapping[str, Any]) -> str:
     """The first words of the list: what acts, on which axes, and when or at which frequency."""
     shape = {key: value for key, value in finding["estimate"].items() if key not in LATER}
-    told = f"{finding['cause'].replace('_', ' ')} on {' '.join(finding['axes'])}"
+    told = f"{named(finding['cause'])} on {' '.join(finding['axes'])}"
     return f"{told}: {told_of}" if (told_of := sizes(shape)) else told
 
 
@@ -185,8 +193,8 @@ def how_much(finding: Mapping[str, Any]) -> str:
         if "share" in one["estimate"] and not isinstance(one["estimate"]["share"], Mapping):
             found.append((axis, one["estimate"]["share"], "of the drift"))
         elif value is not None and value["median"] is not None:
-            of = value["unit"] if value["unit"] != "1" else f"({LABELS.get(key, key.replace('_', ' '))})"
-            found.append((axis, value["median"], of))
+            label = named(key) if key == "ratio" else f"({named(key)})"
+            found.append((axis, value["median"], value["unit"] if value["unit"] != "1" else label))
     return _by_unit(found)
 
 
@@ -240,10 +248,29 @@ def effects(finding: Mapping[str, Any]) -> str:
     if more:
         most, horizon = max(more)
         told.append(f"bias error {horizon} s ahead {100.0 * most:.0f} % larger")
-    seen = ["not confirmed on held-out time"] if finding["confirmed"] is False else []
+    seen = []
+    if finding["confirmed"] is False:
+        once = finding["cause"] in CAUSES and CAUSES[finding["cause"]].score.once
+        seen = ["happened once: no other time can confirm it" if once else "not confirmed on held-out time"]
     if finding.get("confirmed_on") is not None:
         seen.append("holds on the second recording" if finding["confirmed_on"] else "not seen on the second recording")
     return "; ".join([*([", ".join(told)] if told else []), *seen])
+
+
+def contrary(findings: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[str, Any]]) -> str:
+    """Why a number moves one way without a finding of the list and the other way in the table; "" where none does."""
+    told: dict[str, list[str]] = {}
+    for name, (axis, one) in itertools.product(("N", "K", "B"), axes.items()):
+        number = one["numbers"][name]
+        rise = number["after"]["median"] - number["before"] if number["after"]["identified"] else 0.0
+        own = [finding["changes"].get(axis) for finding in findings]
+        large = [change[name] > 1.0 for change in own if change and name in change["material"] and change[name]]
+        if (rise > 0.0 and True in large) or (rise < 0.0 and False in large):
+            told.setdefault(name, []).append(axis)
+    each = ", ".join(f"{name} of {' '.join(names)}" for name, names in told.items())
+    return (
+        f"{each}: the list leaves out one finding, the table all of them: these move it the other way" if each else ""
+    )
 
 
 def action(finding: Mapping[str, Any]) -> str:
@@ -267,7 +294,7 @@ def planned(record: Mapping[str, Any] | None, else_: str) -> str:
     """The next record in words; without one the advice of the cause."""
     if record is None:
         return else_
-    rivals = " and ".join(record["between"]).replace("_", " ")
+    rivals = " and ".join(map(named, record["between"]))
     if record["duration_s"] is None:
         return f"{else_} No record that was tried tells {rivals} apart."
     length = duration_words(record["duration_s"])
@@ -293,7 +320,7 @@ def small(findings: Sequence[Mapping[str, Any]]) -> str:
     count = f"{len(findings)} small findings" if several else "1 small finding"
     causes: dict[str, list[str]] = {}
     for one in findings:
-        causes.setdefault(str(one["cause"]).replace("_", " "), []).extend(one["axes"])
+        causes.setdefault(named(one["cause"]), []).extend(one["axes"])
     each = "; ".join(f"{cause} on {' '.join(dict.fromkeys(axes))}" for cause, axes in causes.items())
     none = "none moves" if several else "it moves none of"
     return f"{count} ({each}): {none} N, K, B or the bias by more than half of its interval"

@@ -3,7 +3,7 @@
 Energy is that of second differences of the readings and of short means, about a running median: ramps and jumps have
 none. A window is compared with its louder side, at its own length. So noise that grows, breathes or stays loud is no
 motion. At rest the mean of n squares exceeds r times its expectation with a probability below
-exp(-n (r - 1 - ln r) / 2) (Chernoff). Axes are independent at rest: the sensor moves where those but the loudest are
+exp(-n (r - 1 - ln r) / 2) (Chernoff). Axes are independent at rest: the sensor moves where some but the loudest are
 louder together, or where one is so loud that no other window of its record is. A hand that pushes shows in the level:
 how far it is from a long running median, beyond any noise. At an end of the record one side is missing and noise may
 have grown: an axis alone moves there where most of its readings are pushed.
@@ -19,7 +19,7 @@ from typing import TypeVar
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.special import fdtrc, gammaincinv
+from scipy.special import binom, fdtrc, gammainc, gammaincinv
 
 from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means
 from selfcal.logs.recording import SIDE_CHANNELS, Recording
@@ -37,20 +37,18 @@ WILD = (3.0, 8.0)
 #: Readings whose median is the level of the middle one: ramps, jumps and slow waves have no part in what is apart from
 #: it. Squares of white noise about it in one degree of freedom.
 LEVEL, SQUARES = 9, 1.29
-#: Longest window, s. Its sides are so many times as long each, s at least, and squares at least.
-WINDOW_S, SIDE, SIDE_S, SIDE_SQUARES = 32.0, 8, 10.0, 30
+#: Longest window, s. Its sides are so many times as long each, PUSH_S at least, and squares at least.
+WINDOW_S, SIDE, SIDE_SQUARES = 32.0, 8, 120
 #: Probability, a record, that axes at rest move together, and that one moves alone.
 SHARE = SHARES["motion"]
 #: Share of its windows by which an axis' own loudness counts: of an axis alone at most the rest may be loud.
 OWN = 0.9
 #: Quantiles of the means of windows that show their spread without the loud ones: the median, and one sd below it.
 QUIETER = (0.1587, 0.5)
-#: Nats by which the search over windows costs all axes together less than as many windows apart: of 250 clean records
-#: of 300 to 3600 s at 1 to 100 Hz the largest of one is 2.1 to 2.9 less in the median, and 2.4 to 3.7 in a tenth.
-FEWER = 3.0
-#: Part of the evidence that each of several stretches of all axes shows at least.
-PART = 0.5
-#: Nats from which on an axis is in a stretch of others: ln 20.
+#: Nats by which the search over windows costs all axes together less than as many windows apart: of 124 clean records
+#: of 600 and 1500 s at 1 and 10 Hz the largest of one is 1.5 to 1.9 less in the median, and 2.0 to 2.7 in a tenth.
+FEWER = 2.0
+#: Nats that each of several stretches of all axes has at least, and from which on an axis is in one of others: ln 20.
 TOGETHER = 3.0
 #: Least probability whose logarithm is taken.
 TINY = 1e-300
@@ -69,11 +67,13 @@ MARGIN_S, EDGE_S = 0.5, 5.0
 @dataclass(frozen=True)
 class Moved:
     """Motion of one axis: begin and end of its stretches in order, s, their `nats` over rest, and those `net` of the
-    search."""
+    search. `ratio`: the readings in them about their level over the noise beside them, root mean square; not a number
+    where that is 0."""
 
     intervals: tuple[tuple[float, float], ...]
     nats: float
     net: float
+    ratio: float
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,8 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         for k, name in enumerate(names):
             times = joined([_times(energy, one, recording) for one in found[name]])
             nats = sum(float(one.nats[k]) for one in found[name])
-            seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]))
+            ratio = _loudness(recording, name, energy, found[name], times)
+            seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]), ratio)
     return {name: one for name, one in seen.items() if one.intervals}
 
 
@@ -131,6 +132,31 @@ def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, f
     begin, end, length_s = one.begin * energy.piece_s, one.end * energy.piece_s, recording.duration_s
     margin_s = max(MARGIN_S, 3.0 * energy.piece_s)  # the first loud samples may look like single wild ones
     return begin - margin_s if begin > EDGE_S else 0.0, end + margin_s if end < length_s - EDGE_S else length_s
+
+
+def _loudness(
+    recording: Recording, name: str, energy: Energy, found: Sequence[Stretch], times: Sequence[tuple[float, float]]
+) -> float:
+    """The ratio of Moved, of the stretches that were `found` in an axis and the `times` left out for them."""
+    y, time = recording.columns[name].values, recording.clock_of(name).time_s
+    rest = np.isfinite(y)
+
+    def rows(begin_s: float, end_s: float) -> slice:
+        return slice(*np.searchsorted(time, (begin_s, end_s)))
+
+    for a, b in times:
+        rest[rows(a, b)] = False
+    steps = np.abs(np.diff(y[rest]))
+    noise = float(np.median(steps)) / (MEDIAN_SD * math.sqrt(2.0)) if steps.size else 0.0
+    total, count = 0.0, 0
+    for one in found:
+        a, b = one.begin * energy.piece_s, one.end * energy.piece_s
+        sides = [rows(a - EDGE_S - PUSH_S, a), rows(b, b + EDGE_S + PUSH_S)]
+        levels = [(np.median(time[at][rest[at]]), np.median(y[at][rest[at]])) for at in sides if rest[at].any()]
+        if levels:
+            apart = y[rows(a, b)] - np.interp(time[rows(a, b)], *np.array(levels).T)
+            total, count = total + float(np.nansum(apart**2)), count + int(np.isfinite(apart).sum())
+    return math.sqrt(total / count) / noise if count and noise > 0.0 else math.nan
 
 
 def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
@@ -210,14 +236,15 @@ def _level(y: Array, size: int = LEVEL) -> Array:
 
 
 def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
-    """Readings [n] with those at their level that are wild by themselves; and the square that is as rare as a wild one,
-    in variances."""
+    """Readings [n]; those that are wild by themselves no farther from their level than where readings are as rare. The
+    square there, in variances."""
     level = _level(y, size)
     apart = y - level
-    noise = float(np.median(np.abs(apart))) / MEDIAN_SD
-    apart = np.abs(apart)
-    wild = (apart > WILD[1] * noise) & (median_filter(apart, BAND_LEAST, mode="nearest") < WILD[0] * noise)
-    return np.where(wild, level, y), 2.0 * math.log(y.size / (1.0 + float(wild.sum())))
+    far = np.abs(apart)
+    noise = float(np.median(far)) / MEDIAN_SD
+    wild = (far > WILD[1] * noise) & (median_filter(far, BAND_LEAST, mode="nearest") < WILD[0] * noise)
+    most = 2.0 * math.log(y.size / (1.0 + float(wild.sum())))
+    return level + np.where(wild, np.sign(apart) * math.sqrt(most) * noise, apart), most
 
 
 def stretches(energy: Energy) -> list[Stretch]:
@@ -257,13 +284,14 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         looks = math.log(used.size * pieces / length)
         singly = alone.max(axis=0) - looks - math.log(axes * len(lengths))
         for net, several in ((others.max(axis=0) - looks + FEWER, True), (singly, False)):
-            for at in np.flatnonzero(net > (-PART if several else -1.0) * math.log(SHARE)):
+            for at in np.flatnonzero(net > (TOGETHER if several else -math.log(SHARE))):
                 which = loudest[:, at] > TOGETHER if several else np.arange(axes) == np.argmax(alone[:, at])
                 if several == (which.sum() > 1):
                     found.append((float(net[at]), int(begin[at]), length, which))
     taken = np.zeros(pieces, bool)
     apart: list[Stretch] = []
-    for net, first, length, which in sorted(found, key=lambda one: (one[3].sum() == 1, -one[0])):
+    sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others, and no other takes its place
+    for net, first, length, which in sorted(found, key=lambda one: (one[0] <= sure, one[3].sum() == 1, -one[0])):
         if not taken[first : first + length].any():
             a, b = _ends(energy, *_ends(energy, first, first + length, which), which)
             nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
@@ -272,13 +300,14 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
-    sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others
-    together = sum(one.net for one in [*known, *apart] if one.axes.sum() > 1 and one.net <= sure)
-    return [one for one in apart if max(one.net, together * (one.axes.sum() > 1)) > sure]
+    nets = sorted((one.net for one in [*known, *apart] if one.axes.sum() > 1 and one.net <= sure), reverse=True)
+    # At rest exp(-net) stretches of several axes are beyond a net: the fewest that are together no chance.
+    least = [net for many, net in enumerate(nets, 1) if gammainc(many, math.exp(-net)) < SHARE]
+    return [one for one in apart if one.net > sure or (one.axes.sum() > 1 and one.net >= max(least, default=sure))]
 
 
 def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
-    """Nats of windows of a length over their louder side [axes, and all but the loudest as one, bands, windows].
+    """Nats of windows of a length over their louder side [axes, and the others but the loudest as one, bands, windows].
     Whether an axis has both sides, or is pushed most of the time [axes, windows]. How much wider than of white noise
     the means lie, `wide` at least [axes, bands]."""
     sums, counts, squares = energy.before
@@ -290,7 +319,7 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
         n = counts[..., last] - counts[..., first]
         return (sums[..., last] - sums[..., first]) / np.maximum(n, 1.0), n
 
-    side = max(SIDE * length, round(SIDE_S / energy.piece_s), math.ceil(SIDE_SQUARES / max(1e-9, float(each.max()))))
+    side = max(SIDE * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / max(1e-9, float(each.max()))))
     own, n = means(begin, begin + length)
     left, n_left = means(begin - 1 - side, begin - 1)
     right, n_right = means(begin + length + 1, begin + length + 1 + side)
@@ -312,11 +341,11 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
     )
     own_free, side_free = (np.maximum(one * known / (SQUARES * wide[..., None] * heavy), 0.5) for one in (n, beside))
     ratio_least = np.maximum(ratio, 1.0)
-    loudest = np.argmax(own_free * (ratio_least - 1.0 - np.log(ratio_least)), axis=0)
-    quiet = np.arange(len(ratio))[:, None, None] != loudest
-    of_others = [(one * quiet).sum(axis=0) for one in (ratio * own_free, own_free, side_free)]
-    ratio = np.concatenate([ratio, [of_others[0] / np.maximum(of_others[1], 0.5)]])
-    own_free, side_free = (np.concatenate([a, [b]]) for a, b in ((own_free, of_others[1]), (side_free, of_others[2])))
+    order = np.argsort(-own_free * (ratio_least - 1.0 - np.log(ratio_least)), axis=0)[1:]
+    # But the loudest: the next one, the next two, and so on, as many as show most. A choice costs its number of ways.
+    of_others = [np.take_along_axis(one, order, 0).cumsum(axis=0) for one in (ratio * own_free, own_free, side_free)]
+    ratio = np.concatenate([ratio, of_others[0] / np.maximum(of_others[1], 0.5)])
+    own_free, side_free = (np.concatenate(pair) for pair in ((own_free, of_others[1]), (side_free, of_others[2])))
     ratio = np.maximum(ratio, 1.0)
     nats = 0.5 * own_free * (ratio - 1.0 - np.log(ratio))
     near = nats > 1.0
@@ -325,7 +354,11 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
     share = np.exp(-0.5 * energy.most) + sums[:, -1, -1] / (energy.most * np.maximum(counts[:, -1, -1], 1.0))
     far, usual = own[:, -1] * n[:, -1] / energy.most[:, None], n[:, -1] * share[:, None]
     rare = np.where(far > usual, far * np.log(np.maximum(far, TINY) / np.maximum(usual, TINY)) - far + usual, 0.0)
-    nats[:, -1] = np.minimum(nats[:, -1], np.concatenate([rare, (rare * quiet[:, -1]).sum(axis=0)[None]]))
+    rares = np.take_along_axis(rare, order[:, -1], 0).cumsum(axis=0)
+    nats[:, -1] = np.minimum(nats[:, -1], np.concatenate([rare, rares]))
+    ways = binom(len(order), 1.0 + np.arange(len(order)))
+    others = np.max(nats[len(rare) :] - np.log(ways)[:, None, None], axis=0, initial=0.0)
+    nats = np.concatenate([nats[: len(rare)], [others]])
     return nats, (there[0] & there[1]).any(axis=1) | (own[:, -1] > 0.5 * energy.most[:, None]), wide
 
 
@@ -347,11 +380,12 @@ def _ratio(energy: Energy, begin: int, end: int) -> tuple[Array, Array]:
 
 
 def _sharing(energy: Energy, begin: int, end: int, axes: Mask) -> Mask:
-    """Which axes [axes] are rather as loud as `axes` are in a stretch than at rest."""
+    """Which axes [axes] are as loud as `axes` are in a stretch, and not at rest."""
     ratio, _ = _ratio(energy, begin, end)
     n = energy.counts[..., begin:end].sum(axis=2)
     r = np.maximum((ratio[axes] * n[axes]).sum(axis=0) / np.maximum(n[axes].sum(axis=0), 1.0), 1.0)
-    return np.asarray((n * (ratio * (1.0 - 1.0 / r) - np.log(r))).max(axis=1) > 0.0)
+    nats = 0.5 / SQUARES * n * (ratio * (1.0 - 1.0 / r) - np.log(r))
+    return np.asarray(nats.max(axis=1) > TOGETHER)
 
 
 def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:

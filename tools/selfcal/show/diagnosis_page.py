@@ -26,7 +26,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outside_of, strips
-from selfcal.show.findings import before_after, noisier_of
+from selfcal.show.findings import before_after, notes
 from selfcal.show.template import number, render, spaced
 
 #: Bytes of the line in place of a picture.
@@ -79,7 +79,7 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "boxes_of": lambda finding: [
             (axis.name, k) for axis in axes if (k := axis.first_of(finding["id"], "of")) is not None
         ],
-        "noisier": noisier_of(results),
+        "notes": notes(shown, results),
         "readings": _readings(shown, axes) if axes else "",
         "causes": list({str(finding["cause"]): None for _, finding in gains}),
         "gains": gains,
@@ -240,6 +240,9 @@ def _readings(findings: Sequence[Entry], axes: Sequence[_Axis]) -> Markup:
         )
     caption = "Readings of each axis about its level, each on its own scale that rest fills: a shake is cut off at its "
     caption += "edges. Numbers: the rows of the list."
+    unmarked = [str(row) for row, finding in enumerate(findings, 1) if not times_of(finding)]
+    if unmarked:
+        caption += f" Without a mark, as no time is known or they act all along: {', '.join(unmarked)}."
     return strips(Figure("Readings and events", caption, panels), marks)
 
 

@@ -46,7 +46,7 @@ def show(
     if axes:
         console.print(_numbers(axes))
         say("without -> with the findings: medians ± half of the 90 % interval; –: looked for, not identified")
-    for line in noisier_of(axes):
+    for line in notes(shown, axes):
         say(line)
     if less:
         say(words.small(less) + ("" if details else " (--details)"))
@@ -72,11 +72,14 @@ def verdict(axis: Mapping[str, Any]) -> str:
     return text + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
 
 
-def noisier_of(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """The axes of a document that are noisier than their siblings, a line each."""
-    known = {name: axis["numbers"]["N"] for name, axis in axes.items() if "numbers" in axis}
+def notes(shown: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Lines on the table of numbers: what moves the other way in the list of findings, and the axes that are noisier
+    than their siblings."""
+    axes = {name: axis for name, axis in axes.items() if "numbers" in axis}
+    known = {name: axis["numbers"]["N"] for name, axis in axes.items()}
     known = {name: N for name, N in known.items() if "q05" in N["after"]}
-    return noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()})
+    lines = noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()})
+    return [*filter(None, [words.contrary(shown, axes)]), *lines]
 
 
 def _events(findings: Sequence[Mapping[str, Any]]) -> Table:

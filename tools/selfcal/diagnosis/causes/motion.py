@@ -12,7 +12,9 @@ from selfcal.readings.motion import Moved
 def look_of(moved: Moved) -> Look:
     """The finding of one axis."""
     intervals = [list(each) for each in moved.intervals]
-    return Look("motion", moved.nats, moved.net, {"intervals": intervals}, {}, when=(intervals[0][0], intervals[-1][1]))
+    size = {"ratio": {"median": moved.ratio, "unit": "1"}} if moved.ratio > 0.0 else {}
+    when = (intervals[0][0], intervals[-1][1])
+    return Look("motion", moved.nats, moved.net, {"intervals": intervals, **size}, {}, when=when)
 
 
 def _seconds(value: float) -> str:

@@ -314,10 +314,22 @@ def _of_column(column: Regressor, c: Sequence[float]) -> dict[str, Any]:
     return {"frequency_hz": float(column.entry["frequency_hz"]), "amplitude": math.hypot(*c)}
 
 
+def _advice(look: Look, record: Record) -> str:
+    """A line of few turns may be a drift. One of fewer than four readings a turn is near half of the rate:
+    it may be an alias of a faster one, and moves with the rate."""
+    turns = _hz(look) * float(record.time_s[-1])
+    if turns < SLOW_TURNS:
+        beside = "" if "temperature" in record.channels else ", with the temperature at the sensor"
+        return f"Record longer{beside}: {turns:.1f} turns hardly tell a line from a drift."
+    few = record.recorded_hz < 4.0 * _hz(look)
+    return "Record at another rate: a line that moves is an alias." if few else ""
+
+
 CAUSE = Cause(
     "periodic",
     "A periodic disturbance of one frequency is in the readings.",
-    "Record at another rate: a line that moves is an alias.",
+    "Look for what turns or switches at this frequency.",
+    advice=_advice,
     source="surroundings",
     looks=looks,
     at=at,

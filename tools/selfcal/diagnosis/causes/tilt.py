@@ -6,6 +6,7 @@ A small turn theta of the sensor changes the specific force f by f x theta. Two 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -16,7 +17,9 @@ from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, shown
 from selfcal.diagnosis.causes import step
-from selfcal.likelihood.state import Look, State, interval
+from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.record import Record
+from selfcal.likelihood.state import NET_LEAST, Look, State, interval
 from selfcal.likelihood.statemodel import Array
 
 #: Standard gravity, m/s^2, and how far off the specific force at rest may be, as a share of it.
@@ -31,38 +34,62 @@ ABOUT_S, SURE = 3.0, 3.0
 def of_steps(looks: Mapping[str, Look], states: Mapping[str, State]) -> dict[str, Look]:
     """The looks at one event of several axes: where that is a step that a turn of the sensor explains, looks at the
     turn."""
+    seen = _turn_of(looks, states) if len(looks) > 1 else None
+    if seen is None:
+        return dict(looks)
+    angles, sure = seen
+    others = () if sure else (step.CAUSE.id,)
+    return {
+        name: replace(look, cause="tilt", estimate={**look.estimate, **angles}, others=(*look.others, *others))
+        for name, look in looks.items()
+    }
+
+
+def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[dict[str, Any], bool] | None:
+    """The angles of the turn that explains the steps of one event, and whether the gyroscopes show it; None: none."""
     force = _specific_force(states)
     steps = all(look.cause == step.CAUSE.id for look in looks.values())
-    if force is None or not steps or len(looks) < 2 or not looks.keys() <= force.keys():
-        return dict(looks)
+    if force is None or not steps or not looks.keys() <= force.keys():
+        return None
     axes = list(force)
     f = np.array([force[name][0] for name in axes])
     size, information = np.zeros(3), np.zeros(3)
     for k, name in enumerate(axes):
-        amplitude = looks[name].estimate["amplitude"] if name in looks else None
-        if amplitude is not None:
-            size[k], information[k] = amplitude["median"] * force[name][1], (amplitude["sd"] * force[name][1]) ** -2.0
-    size[information == 0.0] = 0.0
-    across = size - f * float(f @ size) / float(f @ f)
-    if float(information @ across**2) < EXPLAINED * float(information @ size**2):
-        return dict(looks)
+        if name in looks:
+            amplitude, scale = looks[name].estimate["amplitude"], force[name][1]
+            size[k], information[k] = amplitude["median"] * scale, (amplitude["sd"] * scale) ** -2.0
+    # A turn keeps the length of f. What lies along f beyond that is none.
+    across = size - f * float(f @ size + 0.5 * size @ size) / float(f @ f)
+    along = (size - across) ** 2
+    if float(information @ along) > (1.0 - EXPLAINED) * float(information @ size**2):
+        return None
+    if float(information.max() * along[information == 0.0].sum()) > 2.0 * NET_LEAST:  # another axis would show it
+        return None
     turn = -np.cross(f, size) / float(f @ f)
     time_s = next(iter(looks.values())).estimate["time_s"]["median"]
     turned = _turned(states, [f"g{name[-1]}" for name in axes], time_s)
     sure = turned is not None and bool(np.abs(turned[0] / turned[1]).max() > SURE)
     if turned is not None and sure and float(turned[0] @ turn) < 0.0:
-        return dict(looks)
+        return None
     weight = np.where(information > 0.0, 1.0 / np.maximum(information, 1e-300), 0.0)
     angles = {}
     for k in np.argsort(np.abs(f))[:2]:
         row = -np.cross(f, np.eye(3))[:, k] / float(f @ f)
         sd = math.sqrt(float(row**2 @ weight))
         angles[f"angle_{axes[k][-1]}_deg"] = interval(math.degrees(turn[k]), math.degrees(sd), "deg")
-    others = () if sure else (step.CAUSE.id,)
-    return {
-        name: replace(look, cause="tilt", estimate={**look.estimate, **angles}, others=(*look.others, *others))
-        for name, look in looks.items()
-    }
+    return angles, sure
+
+
+def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    """A step of one accelerometer may be a turn about one axis: gravity moves on the others by its square alone."""
+    states = {**record.axes, **{name: one.state for name, one in found.items()}}
+    events = Counter(finding.event for one in found.values() for finding in one.findings)
+    for name, one in found.items():
+        for k, finding in enumerate(one.findings):
+            alone = not finding.event or events[finding.event] == 1
+            if finding.look.cause == step.CAUSE.id and alone and _turn_of({name: finding.look}, states) is not None:
+                one.findings[k] = replace(finding, look=replace(finding.look, others=(CAUSE.id,)))
+    return []
 
 
 def _specific_force(states: Mapping[str, State]) -> dict[str, tuple[float, float]] | None:
@@ -110,7 +137,7 @@ CAUSE = Cause(
     at=step.at,
     of_means=True,
     pictures=shown("means", "evidence"),
-    grouping=Grouping(alike=step.alike),
+    grouping=Grouping(alike=step.alike, settle=_settle),
     score=Scored(once="a turn is an event of its recording"),
     written=Written(entry=step.entry, of_column=step.of_column),
     simulated=Simulated(

@@ -39,6 +39,9 @@ EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
 MOST = 12.0
 #: Steps of the search for a slope, and the largest one in standard deviations of the channel.
 STEPS, FARTHEST = 30, 1.0
+#: Samples that the level of another axis leaves out: the one that is judged, and two on either side. Where one axis is
+#: in the other, at once or a sample late, or both share noise, a square of one is in the variance of the other.
+OWN = 5
 #: Shares of the record that the channel lies below at the quiet and at the loud end of `ratio`.
 ENDS = (0.05, 0.95)
 
@@ -140,7 +143,10 @@ def levels(state: State, record: Record) -> Iterator[Level]:
     for name, values in others.items():
         for width in vibration.WIDTHS_S:
             if width * record.recorded_hz >= vibration.LEAST and width <= 0.1 * n * dt:
-                power = smoothed(values, round(width / dt))
+                cells = round(width / dt)
+                power = smoothed(values, cells)
+                if cells > OWN:
+                    power = (cells * power - OWN * smoothed(values, OWN)) / (cells - OWN)
                 yield Level(name, "1", np.log(np.maximum(power / power.max(), 1e-12)), "variance", width, price)
 
 
