@@ -89,14 +89,15 @@ def test_compiled_code_runs_on_every_processor() -> None:
 @pytest.mark.skipif("_library32_fma" not in selfcal._library32.__name__, reason="no fused multiply-add here")
 @pytest.mark.skipif("_likelihood_avx2" not in selfcal._likelihood.__name__, reason="no vectors of four doubles here")
 def test_both_builds_give_the_same_numbers() -> None:
-    """Bit by bit: a record, its report, and the whole state; sums, shifts and slopes of models of 1 to 24 states."""
+    """Bit by bit: a record, its report, and the whole state; sums, shifts and slopes of models of 1 to 24 states,
+    and of six axes together."""
     script = """
 import hashlib, sys
 import numpy as np
 import selfcal
 if sys.argv[1] == "plain":
     selfcal._newer = lambda name: ""
-from selfcal import _library32, _likelihood
+from selfcal import _joint, _library32, _likelihood
 from selfcal.bank.library import Bank
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import make_tables
@@ -120,13 +121,21 @@ for terms in some:
     found = shifts(series, terms, theta)
     numbers += [found.A, found.B, found.impulse, *slopes(series, finish(series, terms, theta))]
     print(_likelihood.__name__, hashlib.sha256(b"".join(one.tobytes() for one in numbers)).hexdigest())
+from selfcal.likelihood.joint import Joint, course, information
+own = np.tile([0.1, -4.0, -1.5, -4.0], (6, 1)) + 0.1 * np.arange(6.0)[:, None]
+model = Joint(own, 0.6 * np.eye(6) + 0.4, np.linspace(0.2, 0.9, 6), 0.02)
+y = np.random.default_rng(5).normal(size=(6, 1500))
+y[2:4, 500:503] = np.nan
+found = course(model, y, smooth=True)
+numbers = [found.innovations, found.f, found.weights, found.of_f, found.known, information(model, y, y[:2])]
+print(_joint.__name__, found.ln_likelihood, hashlib.sha256(b"".join(map(bytes, numbers))).hexdigest())
 """
     said = {
         build: subprocess.run([sys.executable, "-c", script, build], capture_output=True, text=True, check=True).stdout
         for build in ("newer", "plain")
     }
     assert said["newer"].replace("_fma", "").replace("_avx2", "") == said["plain"]
-    assert (said["newer"].count("_library32_fma"), said["newer"].count("_likelihood_avx2")) == (2, 4)
+    assert [said["newer"].count(one) for one in ("_library32_fma", "_likelihood_avx2", "_joint_avx2")] == [2, 4, 1]
 
 
 class Installed:

@@ -37,7 +37,7 @@ _OTHERS = {
     "UserError": "base.errors",
 }
 #: Instructions of newer processors that a compiled module has a build for.
-_BUILDS = {"_library32": "fma", "_likelihood": "avx2"}
+_BUILDS = {"_library32": "fma", "_likelihood": "avx2", "_joint": "avx2"}
 #: Lines of /proc/cpuinfo that tell of the first core.
 MOST_LINES = 100
 

@@ -336,8 +336,8 @@ def _together(bins: Bins, own: Array) -> Array:
 @dataclass(frozen=True)
 class Course:
     """What filter and smoother make of a record. `ln_likelihood`; `innovations` [n, m] of each axis (NaN: missing) and
-    their variances `spread` [n, m]; `predicted` [n, s]: the states before each sample. Of the smoother: the states
-    [n, s]; `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its product
+    their variances `spread` [n, m]; `predicted` [n, s]: the states before each sample. Of the smoother: `f` [n];
+    `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its product
     with them; `of_f` [n, 2]: score of a jump of f just before each sample, and its information; `shock` [n, m] and
     `known` [n, m, m]: the same of the levels."""
 
@@ -345,7 +345,7 @@ class Course:
     innovations: Array
     spread: Array
     predicted: Array
-    states: Array
+    f: Array
     weights: Array
     of_f: Array
     known: Array
@@ -370,19 +370,18 @@ def ahead(model: Joint, found: Course, steps: int) -> Array:
 
 
 def _matrices(model: Joint) -> tuple[Array, Array, Array, Array, Array]:
-    """Decay of the states a sample, their noise, how the axes read them, the covariance of the white noise, and that of
-    the first state. States: f, then walk and Gauss-Markov drift of each axis. The levels are unknown: the walks begin
-    with a wide prior."""
+    """Decay of the states a sample, their noise, how the axes read f, the covariance of the white noise, and that of the
+    first states. States: f, then walk and Gauss-Markov drift of each axis. The levels are unknown: the walks begin with
+    a wide prior."""
     m = model.loading.size
     own, scale = model.own, np.exp(2.0 * model.own[:, 0])
     markov = scale * np.exp(2.0 * own[:, 2])
     decay = np.concatenate([[math.exp(-model.rate)], np.ones(m), np.exp(-np.exp(own[:, 3]))])
     noise = np.concatenate([[1.0], scale * np.exp(2.0 * own[:, 1]), markov])
     noise *= np.concatenate([[-math.expm1(-2.0 * model.rate)], np.ones(m), -np.expm1(-2.0 * np.exp(own[:, 3]))])
-    H = np.hstack([model.loading[:, None], np.eye(m), np.eye(m)])
     wide = np.full(m, 1e6 * max(1.0, float(scale.max())))
     R = model.correlation * np.outer(model.white, model.white)
-    return decay, noise, H, R, np.diag(np.concatenate([[1.0], wide, markov]))
+    return decay, noise, model.loading, R, np.concatenate([[1.0], wide, markov])
 
 
 def course(model: Joint, y: Array, smooth: bool = False) -> Course:
