@@ -1,6 +1,6 @@
 """The compiled filter of several axes of tools/bindings/joint.cpp: x(t + 1) = decay x(t) + noise, of those variances,
-and y_i = loading_i x_0 + x_(1 + i) + x_(1 + m + i) + white noise of covariance R. `first`: variances of x(0). For 16 axes
-at most."""
+and y_i = loading_i x_0 + x_(1 + i) + x_(1 + m + i) + white noise of covariance R. `first`: variances of x(0). Most: 16
+axes."""
 
 import numpy as np
 from numpy.typing import NDArray
