@@ -73,7 +73,7 @@ def test_a_source_archive_is_whole(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(os.uname().machine != "x86_64" or shutil.which("objdump") is None, reason="reads x86-64 code")
 def test_compiled_code_runs_on_every_processor() -> None:
-    """But for the build with fused multiply-adds, which is loaded where the processor has them."""
+    """But for the builds for newer ones, which are loaded where the processor is one."""
     from selfcal import _fixed
 
     modules = sorted(Path(_fixed.__file__).parent.glob("_*.so"))
@@ -83,18 +83,21 @@ def test_compiled_code_runs_on_every_processor() -> None:
             ["objdump", "-d", "--no-show-raw-insn", module], capture_output=True, text=True, check=True
         ).stdout
         newer = len(NEWER.findall(code))
-        assert (newer > 0) == ("_fma" in module.name), (module.name, newer)
+        assert (newer > 0) == module.stem.split(".")[0].endswith(("_fma", "_avx2")), (module.name, newer)
 
 
 @pytest.mark.skipif("_library32_fma" not in selfcal._library32.__name__, reason="no fused multiply-add here")
+@pytest.mark.skipif("_likelihood_avx2" not in selfcal._likelihood.__name__, reason="no vectors of four doubles here")
 def test_both_builds_give_the_same_numbers() -> None:
-    """Bit by bit: a record, its report, and the whole state."""
+    """Bit by bit: a record, its report, and the whole state; sums, shifts and slopes of models of 1 to 24 states,
+    and of six axes together."""
     script = """
 import hashlib, sys
 import numpy as np
 import selfcal
-selfcal._fma = lambda: sys.argv[1] == "fma"
-from selfcal import _library32
+if sys.argv[1] == "plain":
+    selfcal._newer = lambda name: ""
+from selfcal import _joint, _library32, _likelihood
 from selfcal.bank.library import Bank
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import make_tables
@@ -103,15 +106,36 @@ for name in ("default", "sums"):
     noise = np.random.default_rng(3).normal(size=(2, 4000, 2))
     bank.push(0.02 * noise[0] + 1e-3 * np.cumsum(noise[1], axis=0))
     print(_library32.__name__, hashlib.sha256(bank.save()).hexdigest(), bank.report(0), bank.report(1))
+from selfcal.likelihood.fit import Series, finish, passed, shifts, slopes
+from selfcal.likelihood.statemodel import Terms
+noise = np.random.default_rng(4).normal(size=(3, 1500))
+y = noise[0] + 0.1 * np.cumsum(noise[1])
+y[200:207] = np.nan
+r = np.where(np.arange(1500) < 900, 1.0, 2.0)
+series = Series(y, 0.5, r, np.array([np.ones(1500), noise[2], np.arange(1500.0)]))
+some = [Terms(walk=True), Terms(walk=True, color="ma"), Terms(markov=True, flicker=True, oscillation=True)]
+some += [Terms(flicker=True, oscillation=True, color="ar", bands=((0.2, 0.01, 0.1), (0.3, 0.02, -1.0)) * 3)]
+for terms in some:
+    theta = np.array(terms.limits(0.5)).mean(axis=1) + 0.1
+    numbers = [*passed(series, terms, theta, [700, 1500], True)]
+    found = shifts(series, terms, theta)
+    numbers += [found.A, found.B, found.impulse, *slopes(series, finish(series, terms, theta))]
+    print(_likelihood.__name__, hashlib.sha256(b"".join(one.tobytes() for one in numbers)).hexdigest())
+from selfcal.likelihood.joint import Joint, course, information
+own = np.tile([0.1, -4.0, -1.5, -4.0], (6, 1)) + 0.1 * np.arange(6.0)[:, None]
+model = Joint(own, 0.6 * np.eye(6) + 0.4, np.linspace(0.2, 0.9, 6), 0.02)
+y = np.random.default_rng(5).normal(size=(6, 1500))
+y[2:4, 500:503] = np.nan
+found = course(model, y, smooth=True)
+numbers = [found.innovations, found.f, found.weights, found.of_f, found.known, information(model, y, y[:2])]
+print(_joint.__name__, found.ln_likelihood, hashlib.sha256(b"".join(map(bytes, numbers))).hexdigest())
 """
     said = {
-        build: subprocess.run(
-            [sys.executable, "-c", script, build], capture_output=True, text=True, check=True
-        ).stdout.replace("_library32_fma", "_library32")
-        for build in ("fma", "plain")
+        build: subprocess.run([sys.executable, "-c", script, build], capture_output=True, text=True, check=True).stdout
+        for build in ("newer", "plain")
     }
-    assert said["fma"] == said["plain"]
-    assert said["fma"].count("_library32") == 2
+    assert said["newer"].replace("_fma", "").replace("_avx2", "") == said["plain"]
+    assert [said["newer"].count(one) for one in ("_library32_fma", "_likelihood_avx2", "_joint_avx2")] == [2, 4, 1]
 
 
 class Installed:

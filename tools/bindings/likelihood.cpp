@@ -117,8 +117,8 @@ nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix
     const std::size_t n = y.shape(0), d = h.shape(0), count = h_by.shape(0);
     const Matrix none(nullptr, {0, n});
     const bool diagonal = check(y, none, r, F, Q, h, P0, driver);
-    if (count < 1 || count > parameters_max)
-        throw std::invalid_argument("1 to 8 parameters");
+    if (count < 1 || count > width)
+        throw std::invalid_argument("1 to 4 parameters");
     for (const Cube &by : {F_by, Q_by, P0_by})
         if (by.shape(0) != count || by.shape(1) != d || by.shape(2) != d)
             throw std::invalid_argument("shapes of the derivatives do not fit");
@@ -135,17 +135,14 @@ nb::tuple slopes(const Vector &y, const Vector &r, const Matrix &F, const Matrix
     const Input in{y.data(), nullptr, r.data(), n, 1, model, model_by, d, count, driver, &n, 1};
     {
         nb::gil_scoped_release released;
-        if (count <= width)
-            differentiated<1, 1, states_max>(diagonal, in, out, by);
-        else
-            differentiated<2, 8, states_max>(diagonal, in, out, by);
+        differentiated<1, states_max>(diagonal, in, out, by);
     }
     return nb::make_tuple(G, D, counted, G_by, D_by, innovations, spread);
 }
 
 } // namespace
 
-NB_MODULE(_likelihood, m) {
+NB_MODULE(MODULE_NAME, m) {
     using namespace nb::literals;
     m.def("run", &run, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "lost"_a, "driver"_a, "marks"_a,
           "innovations"_a);

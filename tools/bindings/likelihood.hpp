@@ -16,9 +16,8 @@ namespace likelihood {
 
 constexpr int states_max = 24;
 constexpr int columns_max = 40;
-// Parameters that derivatives are by: so many a vector, one vector or two.
+// Parameters that derivatives are by, at most: one vector.
 constexpr int width = 4;
-constexpr std::size_t parameters_max = 2 * width;
 
 // The matrices of a model, and their derivatives by each of `count` parameters, one after the other.
 struct Matrices {
@@ -61,12 +60,11 @@ struct Shifts {
     double *impulse; // [n] the information of a single shifted sample
 };
 
-// Of models of D to MOST states: the sums; those and what a shift adds; those and their derivatives by up to V * width
+// Of models of D to MOST states: the sums; those and what a shift adds; those and their derivatives by up to `width`
 // parameters. likelihood_filter.cpp is compiled for each D and MOST that likelihood.cpp names.
 template <int D, int MOST> void filtered(bool diagonal, const Input &in, const Sums &out);
 template <int D, int MOST> void shifted(const Input &in, const Sums &out, const Shifts &shifts);
-template <int V, int D, int MOST>
-void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes);
+template <int D, int MOST> void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes);
 
 } // namespace likelihood
 

@@ -1,5 +1,5 @@
 // The filter of likelihood.hpp. Compiled in parts, side by side (CMakeLists.txt): each for FIRST to LAST states. With
-// VECTORS a part has the derivatives in place of the sums.
+// SLOPES a part has the derivatives in place of the sums.
 #include "likelihood.hpp"
 
 #include <algorithm>
@@ -38,29 +38,25 @@ constexpr std::size_t piece_most = 128, piece_least = 8;
 // States up to which the groups' chains are interleaved.
 constexpr int beside = 4;
 
-// A number and its derivatives by up to V * width parameters.
-template <int V> struct Dual {
-    static constexpr int vectors = V;
+// A number and its derivatives by up to `width` parameters.
+struct Dual {
     double value;
-    Lanes slopes[V];
+    Lanes slopes;
 
     Dual(double v = 0.0) : value(v), slopes{} {}
 
     Dual &operator+=(const Dual &b) {
         value += b.value;
-        for (int k = 0; k < V; k++)
-            slopes[k] += b.slopes[k];
+        slopes += b.slopes;
         return *this;
     }
     Dual &operator-=(const Dual &b) {
         value -= b.value;
-        for (int k = 0; k < V; k++)
-            slopes[k] -= b.slopes[k];
+        slopes -= b.slopes;
         return *this;
     }
     Dual &operator*=(const Dual &b) {
-        for (int k = 0; k < V; k++)
-            slopes[k] = value * b.slopes[k] + b.value * slopes[k];
+        slopes = value * b.slopes + b.value * slopes;
         value *= b.value;
         return *this;
     }
@@ -75,14 +71,12 @@ template <int V> struct Dual {
     // A function of the number, by its value and its derivative there.
     Dual through(double v, double slope) const {
         Dual d(v);
-        for (int k = 0; k < V; k++)
-            d.slopes[k] = slope * slopes[k];
+        d.slopes = slope * slopes;
         return d;
     }
-    double slope(std::size_t j) const { return slopes[j / width][j % width]; }
     bool bent() const {
-        for (std::size_t j = 0; j < V * width; j++)
-            if (slope(j) != 0.0)
+        for (int j = 0; j < width; j++)
+            if (slopes[j] != 0.0)
                 return true;
         return false;
     }
@@ -91,19 +85,19 @@ template <int V> struct Dual {
 double value_of(double a) {
     return a;
 }
-template <int V> double value_of(const Dual<V> &a) {
+double value_of(const Dual &a) {
     return a.value;
 }
 double root(double a) {
     return std::sqrt(a);
 }
-template <int V> Dual<V> root(const Dual<V> &a) {
+Dual root(const Dual &a) {
     return a.through(std::sqrt(a.value), 0.5 / std::sqrt(a.value));
 }
 double ln(double a) {
     return std::log(a);
 }
-template <int V> Dual<V> ln(const Dual<V> &a) {
+Dual ln(const Dual &a) {
     return a.through(std::log(a.value), 1.0 / a.value);
 }
 
@@ -111,11 +105,10 @@ void take(double &to, const double *values, const double *, std::size_t i, std::
     to = values[i];
 }
 
-template <int V>
-void take(Dual<V> &to, const double *values, const double *by, std::size_t i, std::size_t size, std::size_t count) {
+void take(Dual &to, const double *values, const double *by, std::size_t i, std::size_t size, std::size_t count) {
     to = values[i];
     for (std::size_t j = 0; j < count; j++)
-        to.slopes[j / width][j % width] = by[j * size + i];
+        to.slopes[j] = by[j * size + i];
 }
 
 template <class T, int D> using Square = T[D][D];
@@ -268,19 +261,17 @@ template <class T> struct Outer {
     void add(const T &, double) {}
 };
 
-template <int V> struct Outer<Dual<V>> {
-    Lanes sum[V * width][V] = {};
+template <> struct Outer<Dual> {
+    Lanes sum[width] = {};
 
-    void add(const Dual<V> &a, double weight) {
-        for (int j = 0; j < V * width; j++)
-            for (int k = 0; k < V; k++)
-                sum[j][k] += weight * a.slope(static_cast<std::size_t>(j)) * a.slopes[k];
+    void add(const Dual &a, double weight) {
+        for (int j = 0; j < width; j++)
+            sum[j] += weight * a.slopes[j] * a.slopes;
     }
 
     void add(const Outer &more, double weight) {
-        for (int j = 0; j < V * width; j++)
-            for (int k = 0; k < V; k++)
-                sum[j][k] += weight * more.sum[j][k];
+        for (int j = 0; j < width; j++)
+            sum[j] += weight * more.sum[j];
     }
 };
 
@@ -471,59 +462,48 @@ template <class T, int D> struct Filter {
 
     // The readings from `from` to `to`, of one column, all with one gain: as `one`, with values and slopes apart.
     template <bool PLAIN> void alone(std::size_t from, std::size_t to) {
-        constexpr int V = T::vectors;
         double v[D];
-        Lanes X[D][V];
+        Lanes X[D];
         bool bent[D]; // whether a parameter moves what F and h do with the state
         for (int a = 0; a < D; a++) {
             const int after = a < D - 1 ? a + 1 : a;
             bent[a] = on[a].bent() || above[a].bent() || below[after].bent() || m.h[a].bent();
             v[a] = x[0][a].value;
-            for (int k = 0; k < V; k++)
-                X[a][k] = x[0][a].slopes[k];
+            X[a] = x[0][a].slopes;
         }
         T sum = 0.0;
         Outer<T> products;
         for (std::size_t i = from; i < to; i++) {
             double value[4] = {in.y[i]};
-            Lanes slope[4][V] = {}, moved[D][V];
+            Lanes slope[4] = {}, moved[D];
 #pragma GCC unroll 4
             for (int a = 0; a < D; a++) {
                 value[a % 4] -= m.h[a].value * v[a];
-                for (int k = 0; k < V; k++)
-                    slope[a % 4][k] -= m.h[a].value * X[a][k];
+                slope[a % 4] -= m.h[a].value * X[a];
             }
 #pragma GCC unroll 4
             for (int a = 0; a < D; a++)
-                for (int k = 0; k < V; k++)
-                    moved[a][k] = on[a].value * X[a][k];
+                moved[a] = on[a].value * X[a];
             if constexpr (!PLAIN) {
 #pragma GCC unroll 4
                 for (int a = D % 2; a + 1 < D; a += 2)
-                    for (int k = 0; k < V; k++) {
-                        moved[a][k] += above[a].value * X[a + 1][k];
-                        moved[a + 1][k] += below[a + 1].value * X[a][k];
-                    }
+                    moved[a] += above[a].value * X[a + 1], moved[a + 1] += below[a + 1].value * X[a];
             }
 #pragma GCC unroll 4
             for (int a = 0; a < D; a++)
-                if (bent[a])
-                    for (int k = 0; k < V; k++) {
-                        slope[a % 4][k] -= v[a] * m.h[a].slopes[k];
-                        moved[a][k] += v[a] * on[a].slopes[k];
-                        if (!PLAIN && a > 0)
-                            moved[a - 1][k] += v[a] * above[a - 1].slopes[k];
-                        if (!PLAIN && a < D - 1)
-                            moved[a + 1][k] += v[a] * below[a + 1].slopes[k];
-                    }
+                if (bent[a]) {
+                    slope[a % 4] -= v[a] * m.h[a].slopes;
+                    moved[a] += v[a] * on[a].slopes;
+                    if (!PLAIN && a > 0)
+                        moved[a - 1] += v[a] * above[a - 1].slopes;
+                    if (!PLAIN && a < D - 1)
+                        moved[a + 1] += v[a] * below[a + 1].slopes;
+                }
             const double e = (value[0] + value[1]) + (value[2] + value[3]);
-            Lanes E[V];
-            for (int k = 0; k < V; k++)
-                E[k] = (slope[0][k] + slope[1][k]) + (slope[2][k] + slope[3][k]);
+            const Lanes E = (slope[0] + slope[1]) + (slope[2] + slope[3]);
 #pragma GCC unroll 4
             for (int a = 0; a < D; a++)
-                for (int k = 0; k < V; k++)
-                    X[a][k] = moved[a][k] + FK[a].value * E[k] + e * FK[a].slopes[k];
+                X[a] = moved[a] + FK[a].value * E + e * FK[a].slopes;
             if constexpr (PLAIN) {
 #pragma GCC unroll 4
                 for (int a = 0; a < D; a++)
@@ -539,16 +519,13 @@ template <class T, int D> struct Filter {
                 }
             }
             sum.value += e * e;
-            for (int k = 0; k < V; k++)
-                sum.slopes[k] += 2.0 * e * E[k];
-            for (int j = 0; j < V * width; j++)
-                for (int k = 0; k < V; k++)
-                    products.sum[j][k] += E[j / width][j % width] * E[k];
+            sum.slopes += 2.0 * e * E;
+            for (int j = 0; j < width; j++)
+                products.sum[j] += E[j] * E;
         }
         for (int a = 0; a < D; a++) {
             x[0][a].value = v[a];
-            for (int k = 0; k < V; k++)
-                x[0][a].slopes[k] = X[a][k];
+            x[0][a].slopes = X[a];
         }
         G[0][0] += sum * (scale * scale);
         innovations.add(products, scale.value * scale.value);
@@ -824,26 +801,25 @@ template <int D, int MOST> void shifted(const Input &in, const Sums &out, const 
         shifted<D + 1, MOST>(in, out, shifts);
 }
 
-// Compiled for few numbers of states: every one up to 4 and every second beyond, of many parameters every eighth.
-template <int V, int D, int MOST>
-void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes) {
+// Compiled for few numbers of states: every one up to 4 and every second beyond.
+template <int D, int MOST> void differentiated(bool diagonal, const Input &in, const Sums &out, const Slopes &slopes) {
     if constexpr (D < MOST)
         if (in.states > D)
-            return differentiated<V, D + (V == 2 ? 8 : D < 4 ? 1 : 2), MOST>(diagonal, in, out, slopes);
-    const auto filter = std::make_unique<Filter<Dual<V>, D>>(in, out, diagonal);
+            return differentiated<D + (D < 4 ? 1 : 2), MOST>(diagonal, in, out, slopes);
+    const auto filter = std::make_unique<Filter<Dual, D>>(in, out, diagonal);
     filter->run();
     for (std::size_t j = 0; j < in.count; j++) {
-        slopes.G[j] = filter->G[0][0].slope(j);
-        slopes.D[j] = filter->ln_s.slope(j);
+        slopes.G[j] = filter->G[0][0].slopes[j];
+        slopes.D[j] = filter->ln_s.slopes[j];
         for (std::size_t k = 0; k < in.count; k++) {
-            slopes.innovations[j * in.count + k] = filter->innovations.sum[j][k / width][k % width];
-            slopes.spread[j * in.count + k] = filter->spread.sum[j][k / width][k % width];
+            slopes.innovations[j * in.count + k] = filter->innovations.sum[j][k];
+            slopes.spread[j * in.count + k] = filter->spread.sum[j][k];
         }
     }
 }
 
-#ifdef VECTORS
-template void differentiated<VECTORS, FIRST, LAST>(bool, const Input &, const Sums &, const Slopes &);
+#ifdef SLOPES
+template void differentiated<FIRST, LAST>(bool, const Input &, const Sums &, const Slopes &);
 #else
 template void filtered<FIRST, LAST>(bool, const Input &, const Sums &);
 template void shifted<FIRST, LAST>(const Input &, const Sums &, const Shifts &);

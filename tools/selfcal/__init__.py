@@ -36,6 +36,8 @@ _OTHERS = {
     "Recording": "logs.recording",
     "UserError": "base.errors",
 }
+#: Instructions of newer processors that a compiled module has a build for.
+_BUILDS = {"_library32": "fma", "_likelihood": "avx2", "_joint": "avx2"}
 #: Lines of /proc/cpuinfo that tell of the first core.
 MOST_LINES = 100
 
@@ -48,8 +50,8 @@ def __getattr__(name: str) -> Any:
     if name in _OTHERS:
         found = getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
         return found if isinstance(found, type) else _in_python(found)
-    if name == "_library32":
-        globals()[name] = import_module(f"selfcal._library32{'_fma' if _fma() else ''}")
+    if name in _BUILDS:
+        globals()[name] = import_module(f"selfcal.{name}{_newer(name)}")
         return globals()[name]
     if name == "__version__":
         from importlib.metadata import version
@@ -108,15 +110,17 @@ def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
     return call
 
 
-def _fma() -> bool:
-    """Whether this processor has the instruction, and the package the build with it. Either build rounds alike."""
-    if find_spec("selfcal._library32_fma") is None:
-        return False
+def _newer(name: str) -> str:
+    """The end of the name of the build for newer processors, if this one and the package have it. Each rounds alike."""
+    flag = _BUILDS[name]
+    if find_spec(f"selfcal.{name}_{flag}") is None:
+        return ""
     try:
         with Path("/proc/cpuinfo").open(encoding="ascii", errors="replace") as file:
-            return any(line.startswith("flags") and "fma" in line.split() for line in islice(file, MOST_LINES))
+            has = any(line.startswith("flags") and flag in line.split() for line in islice(file, MOST_LINES))
     except OSError:
-        return False
+        return ""
+    return f"_{flag}" if has else ""
 
 
 def __dir__() -> list[str]:

@@ -1,5 +1,6 @@
 """The compiled filter of several axes of tools/bindings/joint.cpp: x(t + 1) = decay x(t) + noise, of those variances,
-and y = H x + white noise of covariance R. P0: covariance of x(0)."""
+and y_i = loading_i x_0 + x_(1 + i) + x_(1 + m + i) + white noise of covariance R. `first`: variances of x(0). Most: 16
+axes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,9 +9,9 @@ def course(
     y: NDArray[np.float64],
     decay: NDArray[np.float64],
     noise: NDArray[np.float64],
-    H: NDArray[np.float64],
+    loading: NDArray[np.float64],
     R: NDArray[np.float64],
-    P0: NDArray[np.float64],
+    first: NDArray[np.float64],
     smoothed: bool,
 ) -> tuple[
     float,
@@ -30,8 +31,8 @@ def information(
     columns: NDArray[np.float64],
     decay: NDArray[np.float64],
     noise: NDArray[np.float64],
-    H: NDArray[np.float64],
+    loading: NDArray[np.float64],
     R: NDArray[np.float64],
-    P0: NDArray[np.float64],
+    first: NDArray[np.float64],
 ) -> NDArray[np.float64]:
     """[k, m, m]: of each column [k, n] on every axis, beside the levels, where y has readings."""

@@ -155,7 +155,7 @@ class Hidden:
         found = {}
         for name in self.names:
             others = [k for k, other in enumerate(self.names) if other != name]
-            found[name] = course(self.model.of(others), self.y[others], smooth=True).states[:, 0]
+            found[name] = course(self.model.of(others), self.y[others], smooth=True).f
         return found
 
     @cached_property

@@ -82,6 +82,8 @@ def diagnose_record(
     record = _of_means(record, found, means) if means else _together(record, found, advance)
     record = _fast(record, found)
 
+    walked: dict[str, str] = {}  # and whether the work was spent
+
     def walk(name: str, causes: Sequence[Looks] = ()) -> None:
         one, spent = found[name], ""
         one.record = record
@@ -91,11 +93,16 @@ def diagnose_record(
                     _rounds(record, one, advance, causes or (QUICK if name in means else LOOKS))
             except work.Spent:
                 spent = SPENT
-            _end(one, advance)
-            one.unfinished = spent
+            _measure(one)
+            walked[name] = spent
+
+    def end(name: str) -> None:
+        with suppress(Stopped):
+            _end(found[name], advance)
+            found[name].unfinished = walked[name]
 
     work.each(walk, found)
-    if any(one.unfinished == INTERRUPTED for one in found.values()):
+    if len(walked) < len(found):
         raise Stopped
     named = {name: [finding.look for finding in one.findings] for name, one in found.items()}
     settled = [
@@ -109,9 +116,13 @@ def diagnose_record(
         gone = [look for look in named[name] if not any(look.repeats(kept.look) for kept in one.findings)]
         one.dropped += gone
         causes = tuple(looks for looks in (QUICK if name in means else LOOKS) if looks in OWN)
-        walk(name, causes) if gone else _end(one, advance)
+        if gone:
+            walk(name, causes)
+        else:
+            _measure(one)
 
     work.each(again, dict.fromkeys(name for names in settled for name in names))
+    work.each(end, found)
     return found
 
 
@@ -121,9 +132,8 @@ def _stated(state: State) -> bool:
 
 
 def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
-    """Sizes in the final model, what is left over, and the statistics of the model that the loop began with."""
+    """What is left over, and the statistics of the model that the loop began with."""
     advance(f"{one.state.axis}: statistics")
-    one.findings = [_measured(finding, one.state) for finding in one.findings if finding.round <= ROUNDS]
     _unexplained(one)
     one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
 
@@ -151,12 +161,12 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
     return changed
 
 
-def _measured(finding: Finding, final: State) -> Finding:
-    """The finding with its sizes beside all others: a later column may have taken a part of an earlier one."""
-    if finding.record is not None:
-        return finding
-    beside = final.without({column.name for column in finding.columns})
-    return replace(finding, look=finding.look.measured(beside))
+def _measure(one: Diagnosed) -> None:
+    """Give each finding its sizes beside all others: a later column may have taken a part of an earlier one."""
+    for k, finding in enumerate(one.findings):
+        if finding.record is None:
+            beside = one.state.without({column.name for column in finding.columns})
+            one.findings[k] = replace(finding, look=finding.look.measured(beside))
 
 
 def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[str, Moved]) -> Record:

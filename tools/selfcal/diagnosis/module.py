@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from scipy.special import logsumexp, softmax
@@ -212,12 +213,12 @@ def sizes(score: Array, known: Array) -> Array:
     return np.asarray(np.linalg.solve(firm, score[..., None])[..., 0])
 
 
-def _best(score: Array, known: Array, apart: int) -> list[int]:
-    """The best places of scores [n, m]: of all axes together, and of each alone."""
+def _best(gain: Array, score: Array, known: Array, apart: int) -> list[int]:
+    """The best places of scores [n, m]: of all axes together, by their `gain` [n], and of each alone."""
     found = []
     alone = 0.5 * score**2 / np.maximum(np.diagonal(known, axis1=-2, axis2=-1), 1e-300)
-    for gain, count in [(full(score, known), PLACES), *((one, 1) for one in alone.T)]:
-        left = np.array(gain)
+    for each, count in [(gain, PLACES), *((one, 1) for one in alone.T)]:
+        left = np.array(each)
         for _ in range(count):
             at = int(np.argmax(left))
             found.append(at)
@@ -236,14 +237,14 @@ def steps(seen: Seen) -> Iterator[Candidate]:
     score = np.where(seen.passed[:, None], 0.0, seen.course.shock)
     score[: seen.edge] = score[-seen.edge :] = 0.0
     gain = full(score, seen.course.known)
-    for at in _best(score, seen.course.known, EDGE):
+    for at in _best(gain, score, seen.course.known, EDGE):
         column = (np.arange(seen.n) >= at).astype(float)
         found = act(score[at][None], seen.course.known[at])
         yield Candidate("step", (at * seen.dt,), found, math.log(seen.n) - _shared(gain, at), column[None])
 
 
 def pulses(seen: Seen) -> Iterator[Candidate]:
-    """Two jumps of one size, there and back."""
+    """Two jumps of one size, there and back. A first search takes their information as it is far from the ends."""
     count = max(1, int(math.log(seen.n / 3.0 / SHORTEST) / math.log(LONGER)))
     lengths = np.unique((SHORTEST * LONGER ** np.arange(count)).astype(int))
     shock = seen.course.shock
@@ -253,12 +254,12 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
     best: list[tuple[float, int, int]] = []
     for length in map(int, lengths):
         score = shock[:-length] - shock[length:]
-        cross = seen.cross[length]
-        known = seen.course.known[:-length] + seen.course.known[length:] - cross - cross.T
+        cross = seen.cross[0] - seen.cross[length]
         score[: seen.edge] = score[-seen.edge :] = 0.0
         score[near_end[:-length] | near_end[length:] | (seen.passed[:-length] & seen.passed[length:])] = 0.0
         apart = max(1, length // PLACES_IN)  # its ends are moved to their best places
-        gain = full(score[::apart], known[::apart])
+        some = score[::apart]
+        gain = 0.5 * (some @ np.linalg.inv(cross + cross.T) * some).sum(axis=1)
         at = int(np.argmax(gain)) * apart
         best.append((float(gain.max()), at, at + length))
     places = [_moved(seen, first, last) for _, first, last in sorted(best, reverse=True)[:PLACES]]
@@ -426,16 +427,25 @@ def _sharpest(gain: Callable[[Array], Array], f: float, reach: float) -> float:
 
 def _of_multiples(weights: Array, known: Array, multiples: Sequence[int]) -> Callable[[Array], Array]:
     """Gain of lines by their multiples, whose information [k, m, m] is much the same at all frequencies tried."""
-    t = np.arange(weights.shape[0])
 
     def gain(tried: Array) -> Array:
         total = np.zeros(tried.size)
         for k, there in zip(multiples, known, strict=False):
-            z = np.exp(2j * math.pi * k * tried[:, None] * t) @ weights
+            z = _turned(k * tried, weights)
             total += full(z.real, there) + full(z.imag, there)
         return total
 
     return gain
+
+
+def _turned(turns: Array, rows: Array) -> NDArray[np.complex128]:
+    """Sums [tried, m] of rows [n, m], each turned by so many turns a sample: of blocks first, which all turn alike."""
+    n, m = rows.shape
+    block = math.isqrt(n) + 1
+    blocks = np.concatenate([rows, np.zeros((-n % block, m))]).reshape(-1, block, m)
+    turn = 2j * math.pi * turns[:, None]
+    within = np.tensordot(np.exp(turn * np.arange(block)), blocks, (1, 1))
+    return np.asarray((np.exp(turn * block * np.arange(len(blocks)))[:, :, None] * within).sum(axis=1))
 
 
 def _of_columns(y: Array, model: Joint, weights: Array, multiples: Sequence[int]) -> Callable[[Array], Array]:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
+from itertools import combinations, product
 from types import MappingProxyType
 from typing import Any
 
@@ -37,6 +37,8 @@ HARDLY, NODE_STEP, POSSIBLE, PLATEAU, NODES_FARTHEST = 0.7, 0.6, 4.0, 0.02, 18.0
 NODES_MOST = 100_000
 #: The slopes of a model's matrices are taken over this much of each parameter: exact to 1e-8.
 NEAR = 1e-4
+#: Parameters that one pass takes the slopes by (bindings/likelihood.cpp).
+TOGETHER = 4
 #: Steps of a fit at most, how far one goes at most in any parameter, and how much shorter one is that went too far.
 STEPS, FARTHEST, SHORTER = 40, 3.0, 0.25
 #: A step that promises less than this share of `ftol` is not taken. Its curvature is taken as other than expected by
@@ -312,7 +314,8 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
     """Slope [k] of ln likelihood by the parameters of a fit, and their information [k, k].
 
     One pass over the record less its columns: their coefficients are the best ones, and a small change of theta moves
-    the likelihood by none of theirs. sigma is free in the information."""
+    the likelihood by none of theirs. sigma is free in the information. More parameters than a pass takes have one for
+    every two pairs of them."""
     work.count(series.y.size, at.theta.size)
     terms, theta = at.terms, at.theta
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
@@ -320,14 +323,18 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
         [matrices(terms, theta + sign * move, series.dt, series.duration_s, series.block) for sign in (1.0, -1.0)]
         for move in NEAR * np.eye(theta.size)
     ]
-    F_by, Q_by, h_by, P0_by, R_by, lost_by = (
-        np.ascontiguousarray([(getattr(ahead, name) - getattr(back, name)) / (2.0 * NEAR) for ahead, back in near])
+    by = [
+        np.array([(getattr(ahead, name) - getattr(back, name)) / (2.0 * NEAR) for ahead, back in near])
         for name in ("F", "Q", "h", "P0", "R", "lost")
-    )
-    whole = series.y - at.c @ series.columns
-    rss, _, n, rss_by, D_by, innovations, spread = _likelihood.slopes(
-        whole, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, F_by, Q_by, h_by, P0_by, R_by, lost_by, m.driver
-    )
+    ]
+    whole, k = series.y - at.c @ series.columns, theta.size
+    pairs = [[j, j + 1][: k - j] for j in range(0, k, 2)]
+    rss, n, rss_by, D_by, innovations, spread = 0.0, 0.0, *np.empty((2, k)), *np.empty((2, k, k))
+    for part in [[*range(k)]] if k <= TOGETHER else [a + b for a, b in combinations(pairs, 2)]:
+        F, Q, h, P0, R, lost = (one[part] for one in by)
+        rss, _, n, rss_by[part], D_by[part], innovations[np.ix_(part, part)], spread[np.ix_(part, part)] = (
+            _likelihood.slopes(whole, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, F, Q, h, P0, R, lost, m.driver)
+        )
     rss = max(rss, 1e-300)
     information = n / rss * innovations + 0.5 * (spread - np.outer(D_by, D_by) / n)
     return -0.5 * (n * rss_by / rss + D_by), information

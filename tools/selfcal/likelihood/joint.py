@@ -52,15 +52,13 @@ LN_ODDS = math.log(0.25)
 #: Numbers of an axis' own drift: ln of white noise, walk a step, Gauss-Markov deviation, rate a sample.
 OWN = 4
 
-Spectra = NDArray[np.complex128]
-
 
 @dataclass(frozen=True)
 class Bins:
-    """Periodogram matrices [k, m, m] of tapered first differences, at angles `turn` [k], each the mean of `count` [k]
-    frequencies."""
+    """Real parts [k, m, m] of the periodogram matrices of tapered first differences, at angles `turn` [k], each the
+    mean of `count` [k] frequencies."""
 
-    power: Spectra | Array
+    power: Array
     turn: Array
     count: Array
 
@@ -69,13 +67,12 @@ class Bins:
         """Spectrum [k] of the difference of white noise of variance 1."""
         return 2.0 - 2.0 * np.cos(self.turn)
 
-    def markov(self, rate: float) -> tuple[Array, Array]:
-        """The same of a Gauss-Markov process of this rate a sample, and its slope over ln of the rate."""
-        a = math.exp(-rate)
-        below = 1.0 - 2.0 * a * np.cos(self.turn) + a * a
-        value = -math.expm1(-2.0 * rate) / below * self.white
-        slope = value * rate * (2.0 * a * a / -math.expm1(-2.0 * rate) - 2.0 * a * (np.cos(self.turn) - a) / below)
-        return value, slope
+    def markov(self, rate: Array) -> tuple[Array, Array]:
+        """The same [k, rates] of Gauss-Markov processes of rates a sample, and its slopes over ln of the rates."""
+        a, cosine = np.exp(-rate), 1.0 - 0.5 * self.white[:, None]
+        power, below = -np.expm1(-2.0 * rate), 1.0 - 2.0 * a * cosine + a * a
+        value = power / below * self.white[:, None]
+        return value, value * rate * (2.0 * a * a / power - 2.0 * a * (cosine - a) / below)
 
 
 def _lines(power: Array, least: float = LINE) -> Mask:
@@ -129,7 +126,7 @@ def bins_of(y: Array) -> Bins:
     group = np.where(place < SINGLE, place, SINGLE + (octave * AN_OCTAVE).astype(int))
     start = np.flatnonzero(np.diff(group, prepend=-1))
     count = np.diff(np.append(start, turn.size)).astype(np.float64)
-    outer = np.einsum("tif,tjf->fij", z, z.conj()) / TAPERS
+    outer = np.einsum("tif,tjf->fij", z, z.conj()).real / TAPERS
     return Bins(np.add.reduceat(outer, start) / count[:, None, None], np.add.reduceat(turn, start) / count, count)
 
 
@@ -160,9 +157,9 @@ class Joint:
         S = bins.white[:, None, None] * (self.correlation * np.outer(self.white, self.white))
         place = np.arange(self.white.size)
         scale = np.exp(2.0 * self.own[:, 0])
-        drift = [np.exp(2.0 * one[2]) * bins.markov(math.exp(one[3]))[0] + np.exp(2.0 * one[1]) for one in self.own]
-        S[:, place, place] += np.stack(drift, axis=1) * scale
-        S += bins.markov(self.rate)[0][:, None, None] * np.outer(self.loading, self.loading)
+        drift, f = np.split(bins.markov(np.append(np.exp(self.own[:, 3]), self.rate))[0], [self.white.size], axis=1)
+        S[:, place, place] += (np.exp(2.0 * self.own[:, 2]) * drift + np.exp(2.0 * self.own[:, 1])) * scale
+        S += f[:, :, None] * np.outer(self.loading, self.loading)
         return np.asarray(np.linalg.inv(S))
 
     def of(self, axes: Sequence[int]) -> Joint:
@@ -204,64 +201,94 @@ class _Cost:
         lower = _lower(m)
         root[lower] = x[at : at + lower[0].size]
         at += lower[0].size
-        root /= np.linalg.norm(root, axis=1)[:, None]
+        lengths = np.linalg.norm(root, axis=1)
+        root /= lengths[:, None]
         loading, ln_rate = (x[at : at + m], float(x[at + m])) if self.f else (np.zeros(m), 0.0)
-        return own, root, root @ root.T, loading, ln_rate
+        return own, root, lengths, loading, ln_rate
+
+    def spectra(self, own: Array, root: Array, loading: Array, ln_rate: float) -> tuple[Array, Array, Array]:
+        """[k, m, m], and those of each drift and of f with their slopes over ln of the rate, [k, m + 1]."""
+        m, white = self.m, np.exp(own[:, 0])
+        values, bends = self.bins.markov(np.exp(np.append(own[:, 3], ln_rate)))
+        noises = np.array([root @ root.T, np.outer(loading, loading)]) * np.outer(white, white)
+        S = (np.column_stack([self.bins.white, values[:, m]]) @ noises.reshape(2, -1)).reshape(-1, m, m)
+        own_drift = np.exp(2.0 * own[:, 1]) + values[:, :m] * np.exp(2.0 * own[:, 2])
+        S[:, np.arange(m), np.arange(m)] += own_drift * white**2
+        return S, values, bends
+
+    def deviations(self, x: Array) -> Array:
+        """Standard deviation of each parameter if it alone were unknown, by Fisher's information.
+
+        A change of row and column i by z has the information 2 ((S^-1 z)_i^2 + z' S^-1 z (S^-1)_ii) in each bin."""
+        count, m = self.bins.count, self.m
+        own, root, lengths, loading, ln_rate = self.parts(x)
+        S, values, bends = self.spectra(own, root, loading, ln_rate)
+        Q, white, every = np.linalg.inv(S), np.exp(own[:, 0]), np.arange(m)
+        q = Q[:, every, every] * white**2
+        of_own = np.stack(
+            [
+                2.0 + 2.0 * S[:, every, every] * q / white**2,
+                (2.0 * np.exp(2.0 * own[:, 1]) * q) ** 2,
+                (2.0 * np.exp(2.0 * own[:, 2]) * values[:, :m] * q) ** 2,
+                (np.exp(2.0 * own[:, 2]) * bends[:, :m] * q) ** 2,
+            ],
+            axis=2,
+        )
+        row, column = _lower(m)
+        z = (root[:, column] - root[row, column] * (root @ root[row].T)) * white[:, None] / lengths[row]
+        z = np.column_stack([z, np.repeat((loading * white)[:, None], m, axis=1)])
+        at = np.append(row, every)
+        Qz = Q @ z
+        of_rows = 2.0 * ((Qz[:, at, np.arange(at.size)] * white[at]) ** 2 + (z * Qz).sum(axis=1) * q[:, at])
+        of_rows *= np.repeat([self.bins.white**2, values[:, m] ** 2], [row.size, m], axis=0).T
+        of_rate = (bends[:, m] * (z[:, -1] * Qz[:, :, -1]).sum(axis=1)) ** 2
+        known = [(count @ of_own.reshape(-1, m * OWN) + np.tile(self.weight, m)), count @ of_rows[:, : row.size]]
+        known += [count @ of_rows[:, row.size :], [count @ of_rate + 1.0 / PRIOR_SD**2]] if self.f else []
+        return np.asarray(1.0 / np.sqrt(np.maximum(np.concatenate(known), 1.0 / PRIOR_SD**2)))
 
     def __call__(self, x: Array) -> tuple[float, Array]:
         bins, m = self.bins, self.m
         work.count(bins.turn.size, m)
-        own, root, correlation, loading, ln_rate = self.parts(x)
-        white = np.exp(own[:, 0])
-        S = bins.white[:, None, None] * (correlation * np.outer(white, white))
+        own, root, lengths, loading, ln_rate = self.parts(x)
+        S, values, bends = self.spectra(own, root, loading, ln_rate)
+        white, correlation, diagonal = np.exp(own[:, 0]), root @ root.T, np.arange(m)
         walk, size = np.exp(2.0 * (own[:, 0] + own[:, 1])), np.exp(2.0 * (own[:, 0] + own[:, 2]))
-        drifts = [bins.markov(math.exp(rate)) for rate in own[:, 3]]
-        diagonal = np.arange(m)
-        S[:, diagonal, diagonal] += walk + np.stack([v for v, _ in drifts], axis=1) * size
         u = loading * white
-        common, bend = bins.markov(math.exp(ln_rate)) if self.f else (np.zeros_like(bins.turn),) * 2
-        S += common[:, None, None] * np.outer(u, u)
         inverse = np.linalg.inv(S)
         sign, ln_det = np.linalg.slogdet(S)
         if not (sign > 0.0).all():
             return 1e30, np.zeros_like(x)
         M = inverse @ bins.power
-        value = float(bins.count @ (ln_det + np.trace(M, axis1=1, axis2=2).real))
-        A = bins.count[:, None, None] * (inverse - (M @ inverse).real)
+        value = float(bins.count @ (ln_det + np.trace(M, axis1=1, axis2=2)))
+        A = bins.count[:, None, None] * (inverse - M @ inverse)
         slope = np.zeros_like(x)
         of_own = np.zeros((m, OWN))
-        G = np.einsum("k,kij->ij", bins.white, A)
+        weights = np.stack([bins.white, values[:, m], bends[:, m]])
+        G, of_f, of_rate = (weights @ A.reshape(-1, m * m)).reshape(3, m, m)
         of_own[:, 0] = 2.0 * (G * correlation * np.outer(white, white)).sum(axis=1)
         D = A[:, diagonal, diagonal]
         of_walk = 2.0 * walk * D.sum(axis=0)
-        of_size = 2.0 * size * np.array([D[:, i] @ v for i, (v, _) in enumerate(drifts)])
+        of_size = 2.0 * size * (D * values[:, :m]).sum(axis=0)
         of_own[:, 0] += of_walk + of_size
         of_own[:, 1], of_own[:, 2] = of_walk, of_size
-        of_own[:, 3] = size * np.array([D[:, i] @ s for i, (_, s) in enumerate(drifts)])
+        of_own[:, 3] = size * (D * bends[:, :m]).sum(axis=0)
         at = OWN * m
         of_root = 2.0 * (G * np.outer(white, white)) @ root
         of_root -= (of_root * root).sum(axis=1)[:, None] * root
         lower = _lower(m)
-        lengths = np.linalg.norm(np.eye(m) + _strictly(x[at : at + lower[0].size], m), axis=1)
         slope[at : at + lower[0].size] = (of_root / lengths[:, None])[lower]
         at += lower[0].size
         if self.f:
-            of_u = 2.0 * np.einsum("k,kij->ij", common, A) @ u
+            of_u = 2.0 * of_f @ u
             slope[at : at + m] = of_u * white
             of_own[:, 0] += of_u * u
             far = (ln_rate - self.centre[3]) / PRIOR_SD**2
-            slope[at + m] = float(u @ np.einsum("k,kij->ij", bend, A) @ u) + far
+            slope[at + m] = float(u @ of_rate @ u) + far
             value += 0.5 * far * (ln_rate - self.centre[3])
         away = own - self.centre
         value += 0.5 * float((self.weight * away**2).sum())
         slope[: OWN * m] = (of_own + self.weight * away).ravel()
         return value, slope
-
-
-def _strictly(values: Array, m: int) -> Array:
-    found = np.zeros((m, m))
-    found[_lower(m)] = values
-    return found
 
 
 def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
@@ -285,12 +312,20 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     elif f:
         vector = _together(bins, own)
         tries = [np.concatenate([head, vector, [np.clip(math.log(dt / tau), *bounds[-1])]]) for tau in STARTS_S]
-    best = min(
-        (minimize(cost, one, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 400}) for one in tries),
-        key=lambda one: float(one.fun),
-    )
-    own, _, correlation, loading, ln_rate = cost.parts(best.x)
-    return Joint(own, correlation, loading * np.exp(own[:, 0]), math.exp(ln_rate), -float(best.fun))
+    found = []
+    for one in tries:  # in units of how well each parameter is known: else a fit takes five times as many steps
+        unit = cost.deviations(one)
+        within = np.array(bounds) / unit[:, None]
+
+        def scaled(z: Array, unit: Array = unit) -> tuple[float, Array]:
+            value, slope = cost(z * unit)
+            return value, slope * unit
+
+        end = minimize(scaled, one / unit, jac=True, method="L-BFGS-B", bounds=within, options={"maxiter": 400})
+        found.append((float(end.fun), end.x * unit))
+    value, x = min(found, key=lambda one: one[0])
+    own, root, _, loading, ln_rate = cost.parts(x)
+    return Joint(own, root @ root.T, loading * np.exp(own[:, 0]), math.exp(ln_rate), -value)
 
 
 def refitted(model: Joint, y: Array, dt: float) -> Joint:
@@ -325,7 +360,7 @@ def _value(bins: Bins, model: Joint) -> float:
 def _together(bins: Bins, own: Array) -> Array:
     """Loadings [m] to begin with: what the slow parts of the axes share, relative to the white noise of each."""
     slow = max(8, int(np.searchsorted(np.cumsum(bins.count), 0.1 * bins.count.sum())))
-    power = np.einsum("k,kij->ij", bins.count[:slow], bins.power[:slow].real)
+    power = np.einsum("k,kij->ij", bins.count[:slow], bins.power[:slow])
     deviation = np.sqrt(np.diag(power))
     values, vectors = np.linalg.eigh(power / np.outer(deviation, deviation))
     relative = deviation / math.sqrt(float(bins.count[:slow] @ bins.white[:slow])) / np.exp(own[:, 0])
@@ -336,8 +371,8 @@ def _together(bins: Bins, own: Array) -> Array:
 @dataclass(frozen=True)
 class Course:
     """What filter and smoother make of a record. `ln_likelihood`; `innovations` [n, m] of each axis (NaN: missing) and
-    their variances `spread` [n, m]; `predicted` [n, s]: the states before each sample. Of the smoother: the states
-    [n, s]; `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its product
+    their variances `spread` [n, m]; `predicted` [n, s]: the states before each sample. Of the smoother: `f` [n];
+    `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its product
     with them; `of_f` [n, 2]: score of a jump of f just before each sample, and its information; `shock` [n, m] and
     `known` [n, m, m]: the same of the levels."""
 
@@ -345,7 +380,7 @@ class Course:
     innovations: Array
     spread: Array
     predicted: Array
-    states: Array
+    f: Array
     weights: Array
     of_f: Array
     known: Array
@@ -370,19 +405,18 @@ def ahead(model: Joint, found: Course, steps: int) -> Array:
 
 
 def _matrices(model: Joint) -> tuple[Array, Array, Array, Array, Array]:
-    """Decay of the states a sample, their noise, how the axes read them, the covariance of the white noise, and that of
-    the first state. States: f, then walk and Gauss-Markov drift of each axis. The levels are unknown: the walks begin
-    with a wide prior."""
+    """Decay of the states a sample, their noise, how the axes read f, the covariance of the white noise, and variances
+    of the first states. States: f, then walk and Gauss-Markov drift of each axis. The levels are unknown: the walks
+    begin with a wide prior."""
     m = model.loading.size
     own, scale = model.own, np.exp(2.0 * model.own[:, 0])
     markov = scale * np.exp(2.0 * own[:, 2])
     decay = np.concatenate([[math.exp(-model.rate)], np.ones(m), np.exp(-np.exp(own[:, 3]))])
     noise = np.concatenate([[1.0], scale * np.exp(2.0 * own[:, 1]), markov])
     noise *= np.concatenate([[-math.expm1(-2.0 * model.rate)], np.ones(m), -np.expm1(-2.0 * np.exp(own[:, 3]))])
-    H = np.hstack([model.loading[:, None], np.eye(m), np.eye(m)])
     wide = np.full(m, 1e6 * max(1.0, float(scale.max())))
     R = model.correlation * np.outer(model.white, model.white)
-    return decay, noise, H, R, np.diag(np.concatenate([[1.0], wide, markov]))
+    return decay, noise, model.loading, R, np.concatenate([[1.0], wide, markov])
 
 
 def course(model: Joint, y: Array, smooth: bool = False) -> Course:
