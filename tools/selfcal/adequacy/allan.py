@@ -62,13 +62,13 @@ class Terms:
     def sums(self, j: _Floats) -> _Floats:
         """G at the distances `j`, whole or not."""
         j = np.abs(j)
-        found = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
+        total = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
         if self.lag1:
-            found = found - self.variance * self.lag1 * np.maximum(j, 1.0)
+            total = total - self.variance * self.lag1 * np.maximum(j, 1.0)
         for variance, alpha in self.markov:
             phi, left = np.exp(-alpha), -np.expm1(-alpha)
-            found = found - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
-        return np.asarray(found)
+            total = total - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
+        return np.asarray(total)
 
     def allan_variance(self, m: _Floats) -> _Floats:
         """At `m` readings."""
@@ -78,21 +78,21 @@ class Terms:
         """Cov(u_k, u_(k+j)) for j = 0 to `lags` - 1."""
         near = np.arange(min(lags, 2 * m + 2), dtype=float)
         weights = {0: 6.0, m: -4.0, -m: -4.0, 2 * m: 1.0, -2 * m: 1.0}
-        found = sum(weight * self.sums(near + shift) for shift, weight in weights.items()) / m**2
+        nearby = sum(weight * self.sums(near + shift) for shift, weight in weights.items()) / m**2
         far = np.zeros(lags - near.size)
         for variance, alpha in self.markov:  # farther than 2 m the others have none
             j = np.arange(near.size, lags, dtype=float)
             scale = variance * np.exp(-alpha) / np.expm1(-alpha) ** 2 * np.expm1(-alpha * m) ** 4 / m**2
             far -= (scale * np.exp(-alpha * (j - 2 * m))).real
-        return np.concatenate([found, far])
+        return np.concatenate([nearby, far])
 
     def spectrum(self, omega: _Floats) -> _Floats:
         """Power of the readings at `omega` rad a reading; white noise of variance 1 has 1."""
         step = 4.0 * np.sin(0.5 * omega) ** 2  # |1 - e^(i omega)|^2
-        found = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
+        power = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
         for variance, alpha in self.markov:
-            found = found - (variance * np.expm1(-2.0 * alpha) / (np.expm1(-alpha) ** 2 + np.exp(-alpha) * step)).real
-        return np.asarray(found)
+            power = power - (variance * np.expm1(-2.0 * alpha) / (np.expm1(-alpha) ** 2 + np.exp(-alpha) * step)).real
+        return np.asarray(power)
 
 
 def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
@@ -172,12 +172,13 @@ def _around(
 ) -> tuple[Callable[[_Floats], Terms], list[tuple[Terms, Terms]]]:
     """The terms at given ln parameters, and those a step to either side of `ln_estimate` in each."""
 
-    def at(ln_theta: _Floats) -> Terms:
+    def terms_at(ln_theta: _Floats) -> Terms:
         theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
         terms = terms_of(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
-    return at, [(at(ln_estimate + step), at(ln_estimate - step)) for step in np.eye(ln_estimate.size) * _STEP]
+    steps = np.eye(ln_estimate.size) * _STEP
+    return terms_at, [(terms_at(ln_estimate + step), terms_at(ln_estimate - step)) for step in steps]
 
 
 def information_of(
@@ -210,10 +211,10 @@ def fit_of(
     ln_estimate = np.log([parameters[name] for name in of.parameters])
     information = information_of(of, parameters, dt_s, n, white, block)
     prior = [group.priors[name].ln_sd ** -2 for name in of.parameters]
-    at, sides = _around(of, ln_estimate, dt_s, white, block)
+    terms_at, sides = _around(of, ln_estimate, dt_s, white, block)
     jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * _STEP)
     covariance = np.linalg.inv(information + np.diag(prior))
-    terms = at(ln_estimate)
+    terms = terms_at(ln_estimate)
     return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.asarray(covariance, np.float64))
 
 
@@ -286,21 +287,21 @@ def curve_of(
     """
     # With forgetting the posterior rests on the last readings. Its sums, weighted by e^(-age / w), have the variance of
     # 2 w readings and 1 - e^-2 of their weight on the last 2 w: Var = S + V - 2 (1 - e^-2) V.
-    memory, known = math.ceil(2.0 * half_life_s / math.log(2.0) / dt_s), 1.0
+    memory, shared = math.ceil(2.0 * half_life_s / math.log(2.0) / dt_s), 1.0
     if 0 < memory < y.size:
-        y, known = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
+        y, shared = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
     n = int(np.isfinite(y).sum())
     if n < 2 * LONGEST:
         return None
     y = y - float(np.nanmean(y))
-    found = [(int(m), *overlapping(y, int(m))) for m in lengths(n, _PER_OCTAVE)]
-    found = [entry for entry in found if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
-    m = np.array([entry[0] for entry in found], float)
-    recorded = np.array([entry[1] for entry in found])
+    rows = [(int(m), *overlapping(y, int(m))) for m in lengths(n, _PER_OCTAVE)]
+    rows = [entry for entry in rows if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
+    m = np.array([entry[0] for entry in rows], float)
+    recorded = np.array([entry[1] for entry in rows])
     medians = {name: estimate.median for name, estimate in estimates.items()}
     fit = fit_of(law, medians, group, dt_s, n, m, white, block)
-    own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in found])
-    left = np.maximum(own - known * fit.variance, _LEAST_LEFT * own)
+    own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in rows])
+    left = np.maximum(own - shared * fit.variance, _LEAST_LEFT * own)
     ratio = recorded / fit.allan_variance
     low, high = _band(law, estimates, fit, group, dt_s, m, white, block)
     return Curve(
@@ -389,12 +390,12 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     total, terms = np.zeros(m.size), np.zeros(m.size)
     for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):
         stretch = values[start:stop] - values[start:stop].mean()
-        for at in np.flatnonzero(2 * m < stretch.size).tolist():
-            variance, windows = overlapping(stretch, int(m[at]))
-            total[at] += windows.size * variance
-            terms[at] += windows.size
-    known = np.flatnonzero((terms >= m) & (total > 0.0))
-    m, deviation = m[known], np.sqrt(total[known] / terms[known])
+        for k in np.flatnonzero(2 * m < stretch.size).tolist():
+            variance, windows = overlapping(stretch, int(m[k]))
+            total[k] += windows.size * variance
+            terms[k] += windows.size
+    kept = np.flatnonzero((terms >= m) & (total > 0.0))
+    m, deviation = m[kept], np.sqrt(total[kept] / terms[kept])
     slope = np.gradient(np.log(deviation), np.log(m)) if m.size > 1 else np.full(m.size, -0.5)
     powers = np.clip(np.rint(2.0 * slope), -1.0, 1.0)
     half = np.array([0.5 * freedom_of(power, length, n) for power, length in zip(powers, m.tolist(), strict=True)])

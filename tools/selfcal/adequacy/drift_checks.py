@@ -48,7 +48,7 @@ def drift_checks(
     recording. Nothing where the record is too short, and where the likeliest law is no simple one: then the simple ones
     leave a drift that any column may take."""
     likeliest = max(result.probability, key=lambda law: result.probability[law])
-    simple = any(not one.law.is_sum and one.name == likeliest for one in tables.hypotheses)
+    simple = any(not hypothesis.law.is_sum and hypothesis.name == likeliest for hypothesis in tables.hypotheses)
     state, cells = _state(blocks, tables)
     if np.isfinite(state.y).sum() < FEWEST or not simple:
         return {}
@@ -73,22 +73,22 @@ def drift_checks(
 
 
 def _check(
-    state: State, shapes: Sequence[Shape], told: Callable[[Shape], dict[str, Any]], *, drift: bool = True
+    state: State, shapes: Sequence[Shape], stated: Callable[[Shape], dict[str, Any]], *, drift: bool = True
 ) -> dict[str, Any]:
     """The best of some shapes: what it is worth net of the search, and what is `told` of it. It is worth nothing if it
     explains no `drift`: one must be clearly likelier than none, and beside it a smaller one."""
-    found = columns.tried(state, shapes, slow=True).values()
-    best = max(found, key=lambda one: one.net, default=None)
+    trials = columns.tried(state, shapes, slow=True).values()
+    best = max(trials, key=lambda trial: trial.net, default=None)
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)
     if worth > LEAST and drift:
         full, *smaller = (
-            max(float(state.scores([shape.columns], one.shrunk(by))[0]) for one in state.fits) for by in SIZES
+            max(float(state.scores([shape.columns], fit.shrunk(by))[0]) for fit in state.fits) for by in SIZES
         )
         none = finish(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
         drifts = state.best.ln_likelihood > none.ln_likelihood + CLEARLY
         worth = worth if drifts and max(smaller) > full + CLEARLY else 0.0
     passed = {"value": worth, "limit": LEAST, "passed": worth <= LEAST, "deviations": math.sqrt(2.0 * worth)}
-    return {**passed, **told(shape)}
+    return {**passed, **stated(shape)}
 
 
 def _shape(label: str, values: Array, looks: int, **stated: Any) -> Shape:
@@ -107,15 +107,15 @@ def _state(blocks: Blocks, tables: Tables) -> tuple[State, int]:
 def _channels(state: State, begin: int, block: int, recording: Recording, others: Sequence[str]) -> Iterator[Shape]:
     """Each recorded channel in its forms."""
     sides = {column for column, _ in SIDE_CHANNELS.values()}
-    found = [
+    tried = [
         (column, form, values)
         for column in others
         for form, values in _forms(
             _means(recording.columns[column].values, recording, begin, block, state.y.size), state, column in sides
         )
     ]
-    for k, (column, form, values) in enumerate(found):
-        yield _shape(f"{k}", values, len(found), column=column, form=form)
+    for k, (column, form, values) in enumerate(tried):
+        yield _shape(f"{k}", values, len(tried), column=column, form=form)
 
 
 def _forms(means: Array, state: State, side: bool) -> Iterator[tuple[str, Array]]:

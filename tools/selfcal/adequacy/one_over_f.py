@@ -57,8 +57,8 @@ def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
     whole = float((passed / image).sum())  # 1 / (2 pi f), f per interval
     law = NAMED[FLICKER]
     own = [
-        float(terms_of(law, {"N": 0.0, "B": 1.0, "alpha": one}, dt_s, block).spectrum(np.array(_OMEGA)))
-        for one in alpha.tolist()
+        float(terms_of(law, {"N": 0.0, "B": 1.0, "alpha": bandwidth}, dt_s, block).spectrum(np.array(_OMEGA)))
+        for bandwidth in alpha.tolist()
     ]
     return np.asarray(dt_s * (whole - np.array(own)))
 
@@ -87,8 +87,8 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
     draws = posterior_draws(estimates, fit.covariance, _DRAWS)
     white = white_of(draws, dt_s, block)
     low, middle, high = np.quantile(white, (0.05, 0.5, 0.95)).tolist()
-    known = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
-    own = Estimate(float(white.mean()), middle, float(white.std()), low, high, known, estimates["N"].off_grid)
+    identified = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
+    own = Estimate(float(white.mean()), middle, float(white.std()), low, high, identified, estimates["N"].off_grid)
     return replace(result, parameters={**result.parameters, FLICKER: {**estimates, "N": own}})
 
 
@@ -152,20 +152,20 @@ def weigh_law(
     from selfcal.bank.library import Bank
 
     count = len(tables.hypotheses)
-    if count >= MOST_HYPOTHESES or any(one.name == name for one in tables.hypotheses):
+    if count >= MOST_HYPOTHESES or any(hypothesis.name == name for hypothesis in tables.hypotheses):
         return None
     law = NAMED[name]
     own = replace(group, priors={**group.priors, **priors}, laws={**group.laws, name: law})
     rho, alpha = map(make_grid, _NODES)
     one_more = HypothesisTable(name, law, math.log(odds / (count + odds)), rho, alpha, (priors_of(own, name),))
     share = math.log(count / (count + odds))
-    others = (replace(one, ln_probability=one.ln_probability + share) for one in tables.hypotheses)
+    others = (replace(hypothesis, ln_probability=hypothesis.ln_probability + share) for hypothesis in tables.hypotheses)
     bank = Bank(replace(tables, hypotheses=(*others, one_more)), offset=offset)
     bank.push(samples[:, None], missing_before, columns)
     try:
-        found = bank.report(0, mask)
+        result = bank.report(0, mask)
     except UserError:
         return None
-    if not math.isfinite(found.probability[name]):
+    if not math.isfinite(result.probability[name]):
         return None
-    return Beside(found.probability[name], found.parameters[name], own, tables.dt_s, found.n, tables.block, name)
+    return Beside(result.probability[name], result.parameters[name], own, tables.dt_s, result.n, tables.block, name)
