@@ -63,6 +63,6 @@ def place(latitude_deg: float | None, height_m: float | None, gravity: float | N
         return Place(STANDARD_GRAVITY, 0.015, *of_earth, "standard: neither --latitude nor --gravity is given")
     height_sd = 0.0 if height_m is not None else HEIGHT_SD
     value = gravity_at(latitude_deg, height_m or 0.0)
-    at = f"{height_m:g} m" if height_m is not None else f"the sea's level, {HEIGHT_SD:g} m more or less: no --height"
+    near = f"{height_m:g} m" if height_m is not None else f"the sea's level, {HEIGHT_SD:g} m more or less: no --height"
     # Anomalies of some 30 mGal, and the free-air gradient, 1/s^2.
-    return Place(value, math.hypot(3e-4, 3.086e-6 * height_sd), *of_earth, f"WGS-84 at {latitude_deg:g} deg, {at}")
+    return Place(value, math.hypot(3e-4, 3.086e-6 * height_sd), *of_earth, f"WGS-84 at {latitude_deg:g} deg, {near}")

@@ -56,10 +56,10 @@ class Fit:
     def _informed(self, least: float) -> tuple[Array, Array]:
         """The prior's factor [n, n], and the information in its units, with `least` of the prior's own of the part."""
         factor = np.asarray(np.linalg.cholesky(self.prior), float)
-        seen = self.columns @ factor
+        scaled = self.columns @ factor
         share = np.full(len(factor), least)
         share[list(self.outside)] = 1.0
-        return factor, seen.T @ seen + np.diag(share)
+        return factor, scaled.T @ scaled + np.diag(share)
 
     @property
     def evidence(self) -> float:
@@ -99,15 +99,15 @@ class Fit:
             return []
         more = solve_triangular(self.root, np.hstack([columns for _, columns in tried]), lower=True)
         apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
-        found, first = [], 0
+        ranked, first = [], 0
         for said, columns in tried:
             own = slice(first, first + columns.shape[1])
             first = own.stop
             normal, pull = more[:, own].T @ apart[:, own], apart[:, own].T @ self.white
             explained = float(pull @ np.linalg.pinv(normal, 1e-9, hermitian=True) @ pull)
             count = max(int(np.linalg.matrix_rank(normal, hermitian=True)), 1)
-            found.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
-        return [(said, min(1.0, p)) for p, _, said in sorted(found) if p < FALSE_ALARM]
+            ranked.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
+        return [(said, min(1.0, p)) for p, _, said in sorted(ranked) if p < FALSE_ALARM]
 
 
 def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
@@ -139,17 +139,17 @@ def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | 
     """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
     stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
     Raises UserError where none settles."""
-    found = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
+    current = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
     for _ in range(ITERATIONS):
-        step, sd = found.step, np.sqrt(np.diag(found.covariance))
+        step, sd = current.step, np.sqrt(np.diag(current.covariance))
         far = float(np.max(np.abs(step[sd > 0.0]) / sd[sd > 0.0]))
-        following = linearized(problem, found.theta + step, mean, prior, held)
+        following = linearized(problem, current.theta + step, mean, prior, held)
         for _ in range(HALVINGS if far > 0.3 else 0):
-            if following.squares < found.squares:
+            if following.squares < current.squares:
                 break
             step = 0.5 * step
-            following = linearized(problem, found.theta + step, mean, prior, held)
-        found = following
+            following = linearized(problem, current.theta + step, mean, prior, held)
+        current = following
         if far < 1e-4:
-            return found
+            return current
     raise UserError(UNSETTLED)
