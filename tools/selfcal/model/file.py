@@ -338,10 +338,10 @@ def file_of(model: Path | str | None) -> Path:
         return path
     known = parts()
     named = {re.sub(r"[^a-z0-9]", "", name): path for name, path in known.items()}
-    found = named.get(re.sub(r"[^a-z0-9]", "", path.name.lower()))
-    if found is None:
+    file = named.get(re.sub(r"[^a-z0-9]", "", path.name.lower()))
+    if file is None:
         raise UserError(f"there is no part '{short(path.name)}' (there are {', '.join(known)}), and no such model file")
-    return found
+    return file
 
 
 class _Loader(yaml.SafeLoader):
@@ -488,8 +488,8 @@ class _Reader:
     def text(self, tree: Mapping[str, Any], key: str, where: str) -> str:
         value = self.entry(tree, key, where)
         text = str(value)  # `unit: 1` is a number to YAML
-        known = isinstance(value, str | int | float) and not isinstance(value, bool)
-        if not known or not text.isprintable() or len(text) > LONGEST_TEXT or "*/" in text:
+        plain = isinstance(value, str | int | float) and not isinstance(value, bool)
+        if not plain or not text.isprintable() or len(text) > LONGEST_TEXT or "*/" in text:
             what = f"one line of text, {LONGEST_TEXT} characters at most, without '*/': the tables have it as a comment"
             raise self.fail(f"{where}.{key}" if where else key, f"must be {what}, not {shown(value)}")
         return text
@@ -633,30 +633,30 @@ class _Reader:
         """The curve of a form: free."""
         if not isinstance(tree, list) or not 2 <= len(tree) <= MOST_KNOTS:
             raise self.fail(where, f"must be a list of 2 to {MOST_KNOTS} pairs [channel, height]")
-        found: list[tuple[float, float]] = []
-        for at, pair in enumerate(tree):
+        knots: list[tuple[float, float]] = []
+        for i, pair in enumerate(tree):
             if not isinstance(pair, list) or len(pair) != 2:
-                raise self.fail(f"{where}[{at}]", f"must be a pair [channel, height], not {shown(pair)}")
-            place, height = (self.number(x, f"{where}[{at}]", low=-math.inf, strict=False) for x in pair)
-            if found and not place > found[-1][0]:
-                raise self.fail(f"{where}[{at}]", "the channel's values must rise")
-            found.append((place, height))
-        return tuple(found)
+                raise self.fail(f"{where}[{i}]", f"must be a pair [channel, height], not {shown(pair)}")
+            channel, height = (self.number(x, f"{where}[{i}]", low=-math.inf, strict=False) for x in pair)
+            if knots and not channel > knots[-1][0]:
+                raise self.fail(f"{where}[{i}]", "the channel's values must rise")
+            knots.append((channel, height))
+        return tuple(knots)
 
     def regressors(self, tree: Any, groups: tuple[Group, ...]) -> tuple[Regressor, ...]:
         if not isinstance(tree, list):
             raise self.fail("regressors", "must be a list")
         if len(tree) > MOST_STATED:
             raise self.fail("regressors", f"{len(tree)} are more than {MOST_STATED}")
-        found = tuple(self.regressor(entry, f"regressors[{i}]", groups) for i, entry in enumerate(tree))
-        names = [regressor.name for regressor in found]
+        regressors = tuple(self.regressor(entry, f"regressors[{i}]", groups) for i, entry in enumerate(tree))
+        names = [regressor.name for regressor in regressors]
         for name in names:
             if names.count(name) > 1:
                 raise self.fail("regressors", f"'{name}' appears twice")
-        columns = sum(len(regressor.columns) for regressor in found)
+        columns = sum(len(regressor.columns) for regressor in regressors)
         if columns > MOST_STATED:
             raise self.fail("regressors", f"{columns} columns are more than {MOST_STATED} (periodic: two each)")
-        return found
+        return regressors
 
     def gate(self, tree: Any, groups: tuple[Group, ...]) -> Gate:
         names = ("window_s", "false_alarm", "hold", "settle", "memory", "N")
@@ -691,7 +691,7 @@ class _Reader:
 
     def nodes(self, tree: Any, where: str, laws: Mapping[str, Law]) -> GridNodes:
         fields = self.only(tree, tuple(dict.fromkeys((*NAMED, *laws))), where)
-        found: dict[str, tuple[int, ...]] = {}
+        of_laws: dict[str, tuple[int, ...]] = {}
         for name, law in laws.items():
             what = [f"{key} nodes" for key in ("rho", *law.parameters[2:])] if law.terms else []
             if not what:
@@ -701,8 +701,8 @@ class _Reader:
             if len(counts) != len(what) or isinstance(given, list) != (len(what) > 1):
                 shape = f"[{', '.join(what)}]" if len(what) > 1 else f"a number of {what[0]}"
                 raise self.fail(f"{where}.{name}", f"must be {shape}")
-            found[name] = tuple(self.count(count, f"{where}.{name}", *NODES) for count in counts)
-        return GridNodes(found)
+            of_laws[name] = tuple(self.count(count, f"{where}.{name}", *NODES) for count in counts)
+        return GridNodes(of_laws)
 
     def term(self, tree: Any, where: str) -> Term:
         fields = {"kind": tree} if isinstance(tree, str) else tree
@@ -796,7 +796,7 @@ class _Reader:
                 raise self.fail("simulate.axes", f"the model has no axis {shown(name)} (it has {', '.join(axes)})")
         known = ("hypothesis", "bias", *PLACES)
         known_laws = dict.fromkeys((*NAMED, *laws))
-        truths = {name: dict(self.only(one or {}, known, f"simulate.axes.{name}")) for name, one in stated.items()}
+        truths = {name: dict(self.only(truth or {}, known, f"simulate.axes.{name}")) for name, truth in stated.items()}
         for name, truth in truths.items():
             where = f"simulate.axes.{name}"
             law = truth.get("hypothesis", "constant")
@@ -824,10 +824,10 @@ class _Reader:
             if not isinstance(entries, dict):
                 raise self.fail(f"hidden_input.{key}", "must be a mapping")
             for name in entries:
-                if not all(one in axes for one in str(name).split("-")):
+                if not all(axis in axes for axis in str(name).split("-")):
                     raise self.fail(f"hidden_input.{key}", f"the model has no axis {shown(name)}")
             numbers.append(
-                {name: self.number(one, f"hidden_input.{key}.{name}", low=low) for name, one in entries.items()}
+                {name: self.number(value, f"hidden_input.{key}.{name}", low=low) for name, value in entries.items()}
             )
         return HiddenInput(deviation, alpha, *numbers)
 
@@ -872,7 +872,7 @@ class _Reader:
             nodes={name: self.nodes(fields, f"nodes.{name}", laws) for name, fields in targets.items()},
             simulate=self.simulate(tree.get("simulate") or {}, axes, laws),
             regressors=kept,
-            beyond=tuple(one for one in regressors if one not in kept),
+            beyond=tuple(regressor for regressor in regressors if regressor not in kept),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
             hidden_input=self.hidden_input(tree["hidden_input"], axes) if tree.get("hidden_input") else None,

@@ -98,17 +98,17 @@ def slope(values: Array, window_s: float, interval_s: float) -> Array:
     if window_s <= interval_s:
         return np.asarray(np.gradient(values, interval_s))
     last, whole = values.size - 1, round(window_s / interval_s)
-    at = np.clip(np.arange(values.size) + whole // 2, min(whole, last), last)
-    return formed(values, "rate", window_s, 0.0, interval_s)[at]
+    rows = np.clip(np.arange(values.size) + whole // 2, min(whole, last), last)
+    return formed(values, "rate", window_s, 0.0, interval_s)[rows]
 
 
 def played(values: Array, width: float) -> Array:
     """What follows at half of `width` at most, and moves only if it must."""
     out = np.empty(values.size)
-    at, half = float(values[0]), 0.5 * width
+    position, half = float(values[0]), 0.5 * width
     for i, value in enumerate(values.tolist()):
-        at = min(max(at, value - half), value + half)
-        out[i] = at
+        position = min(max(position, value - half), value + half)
+        out[i] = position
     return out
 
 

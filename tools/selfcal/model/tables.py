@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -266,18 +267,7 @@ def make_tables(
             )
             for name, probability in model.hypotheses.items()
         ),
-        regressors=tuple(
-            RegressorTable(
-                column,
-                one.unit,
-                one.offset,
-                tuple((0.0 if one.column == name else one.sd.get(model.group_of(name).name, 0.0)) for name in names),
-                _source(one, place),
-                len(names) * ((math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0),),
-            )
-            for one in model.regressors
-            for place, column in enumerate(one.columns)
-        ),
+        regressors=tuple(_regressor_tables(model, names)),
         half_life_s=model.half_life_s,
         handling=model.handling,
     )
@@ -295,6 +285,17 @@ def _axis_table(name: str, group: Group) -> AxisTable:
         range=group.range,
         stuck_limit=group.stuck_limit,
     )
+
+
+def _regressor_tables(model: Model, names: Sequence[str]) -> Iterator[RegressorTable]:
+    for regressor in model.regressors:
+        sd = tuple(
+            0.0 if regressor.column == name else regressor.sd.get(model.group_of(name).name, 0.0) for name in names
+        )
+        ln_odds = math.log(regressor.probability / (1.0 - regressor.probability))
+        for place, column in enumerate(regressor.columns):
+            odds = len(names) * (ln_odds if place == 0 else 0.0,)
+            yield RegressorTable(column, regressor.unit, regressor.offset, sd, _source(regressor, place), odds)
 
 
 def _check_times(model: Model, dt: float) -> None:
