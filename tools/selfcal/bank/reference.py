@@ -314,16 +314,16 @@ class _Lattice:
         older ones all is there."""
         directions = np.eye(len(self.low), dtype=np.int64)
         known = set(self._key(self.index).tolist())
-        seen = 0
+        first = 0
         while True:
-            inside = self.index[seen:][self.value[seen:] > self.top - _DEPTH]
+            inside = self.index[first:][self.value[first:] > self.top - _DEPTH]
             near = np.concatenate([inside + sign * direction for direction in directions for sign in (-1, 1)])
             near = near[((near >= 0) & (near <= self.count)).all(axis=1)]
             keys = np.array(sorted(set(self._key(near).tolist()) - known), np.int64)
             if keys.size == 0:
                 return
             known.update(keys.tolist())
-            seen = len(self.index)
+            first = len(self.index)
             self._add(self._index(keys))
 
     def refine(self) -> None:

@@ -496,8 +496,8 @@ def seen_from_words(population: Population) -> str:
 def _drift_words(drift: Drift) -> str:
     of = drift.of
     rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if of.logarithm else f"{drift.per_day:+.3g} {of.unit}"
-    seen = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
-    return f"{of.quantity} {rate} a day, {seen}"
+    basis = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
+    return f"{of.quantity} {rate} a day, {basis}"
 
 
 def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:

@@ -119,9 +119,9 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
         if abs(distance) >= LIMIT:
             row = {"before": a["median"], "after": b["median"], "unit": a["unit"], "distance_sd": distance}
             below = {
-                f"{side}_below": one["q95"]
-                for side, one in (("before", a), ("after", b))
-                if not one.get("identified", True)
+                f"{side}_below": estimate["q95"]
+                for side, estimate in (("before", a), ("after", b))
+                if not estimate.get("identified", True)
             }
             rows.append({"quantity": key, "what": "changed", **row, **below})
     return rows
@@ -173,8 +173,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             for cause in judged.get("causes", ()):
                 if cause in (*judged["material"], "unexplained"):
                     on.setdefault(cause.replace("_", " "), []).append(name)
-        told = "; ".join(f"{cause} on {' '.join(names)}" for cause, names in on.items())
-        line = f"{printable(Path(log).name)}: {told or 'no finding that matters'}"
+        findings = "; ".join(f"{cause} on {' '.join(names)}" for cause, names in on.items())
+        line = f"{printable(Path(log).name)}: {findings or 'no finding that matters'}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for name, error in errors.items():
         console.print(f"{name}: not compared: {printable(error)}", highlight=False, markup=False, soft_wrap=True)

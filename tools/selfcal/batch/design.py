@@ -60,8 +60,8 @@ class Experiment:
 
     def input(self, bit_s: float, samples: int, dt: float) -> Array:
         """[samples]: the input about its middle."""
-        at, levels = self.set_points(bit_s, samples * dt)
-        wanted = levels[np.searchsorted(at, np.arange(samples) * dt, side="right") - 1] - 0.5 * sum(self.levels)
+        starts, levels = self.set_points(bit_s, samples * dt)
+        wanted = levels[np.searchsorted(starts, np.arange(samples) * dt, side="right") - 1] - 0.5 * sum(self.levels)
         return np.asarray(late(np.append(0.0, wanted), max(self.input_lag_s, 1e-3 * dt), dt)[1:])
 
 
@@ -79,13 +79,14 @@ def terms_of(truth: Mapping[str, float], dt: float) -> tuple[Terms, Array, float
 def halves(experiment: Experiment, truth: Mapping[str, float], u: Array, dt: float) -> dict[str, float]:
     """Half the 90 % intervals of gain and lag that a part's record of the input [n] would have, each over its size."""
     terms, theta, sigma = terms_of(truth, dt)
-    drive, at, near = Drive(u, dt), experiment.lag_s, 1e-3 * experiment.lag_s
-    here = drive.columns(LAG, (at,))
-    by_lag = experiment.gain * (drive.columns(LAG, (at + near,))[0] - drive.columns(LAG, (at - near,))[0]) / (2 * near)
+    drive, lag, near = Drive(u, dt), experiment.lag_s, 1e-3 * experiment.lag_s
+    here = drive.columns(LAG, (lag,))
+    change = drive.columns(LAG, (lag + near,))[0] - drive.columns(LAG, (lag - near,))[0]
+    by_lag = experiment.gain * change / (2 * near)
     columns = np.vstack([np.ones(u.size), here[1:], here[:1], by_lag])
     sums = run(Series(np.zeros(u.size), dt, np.ones(u.size), columns), terms, theta)[0][0]
     sd = sigma * np.sqrt(np.diag(sums.coefficients()[1])[-2:])
-    return {"gain": HALF_90 * float(sd[0]) / abs(experiment.gain), "lag": HALF_90 * float(sd[1]) / at}
+    return {"gain": HALF_90 * float(sd[0]) / abs(experiment.gain), "lag": HALF_90 * float(sd[1]) / lag}
 
 
 def designed(
@@ -143,10 +144,10 @@ def drawn_rows(model: Model, axis: str, experiment: Experiment, bit_s: float, sa
     u = experiment.input(bit_s, samples, dt)
     acts = experiment.gain * late(np.append(0.0, u), experiment.lag_s, dt)[1:]
     state = State(axis, model.group_of(axis).unit, y + acts, dt, 0.0, np.ones(samples)).refit()
-    found = answer_of(state, [Input(u, u, "degC")])[0].get("estimate", {})
+    estimate = answer_of(state, [Input(u, u, "degC")])[0].get("estimate", {})
     return [
         {
-            name: 0.5 * (found[key]["q95"] - found[key]["q05"]) / abs(size) if key in found else math.inf
+            name: 0.5 * (estimate[key]["q95"] - estimate[key]["q05"]) / abs(size) if key in estimate else math.inf
             for name, key, size in (("gain", "gain", experiment.gain), ("lag", "lag_s", experiment.lag_s))
         }
     ]

@@ -149,8 +149,8 @@ def sources_of(
     first: dict[str, Source] = {}
     copies: dict[str, str] = {}
     for path, device in named.items():
-        known: dict[str, Any] = {"device": device, **units.get(path, {})}
-        source = replace(hashed(path), **known)
+        fields: dict[str, Any] = {"device": device, **units.get(path, {})}
+        source = replace(hashed(path), **fields)
         other = first.setdefault(source.content, source)
         if other is source:
             sources.append(source)

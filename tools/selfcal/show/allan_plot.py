@@ -94,8 +94,8 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
     )
     panel.set_xscale("log")
     panel.set_yscale("log")
-    seen = np.concatenate([curve, scaled(allan, "model")])
-    panel.set_ylim(0.4 * seen.min(), 1.5 * seen.max())
+    heights = np.concatenate([curve, scaled(allan, "model")])
+    panel.set_ylim(0.4 * heights.min(), 1.5 * heights.max())
     if samples["tau_s"][0] < 0.99 * tau[0]:
         left = samples["tau_s"][0] / 1.5
         panel.axvspan(left, tau[0] / 2**0.5, color="0.92", zorder=0)

@@ -74,9 +74,9 @@ def verdict(axis: Mapping[str, Any]) -> str:
 
 def noisier_of(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """The axes of a document that are noisier than their siblings, a line each."""
-    known = {name: axis["numbers"]["N"] for name, axis in axes.items() if "numbers" in axis}
-    known = {name: N for name, N in known.items() if "q05" in N["after"]}
-    return noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()})
+    noise = {name: axis["numbers"]["N"] for name, axis in axes.items() if "numbers" in axis}
+    noise = {name: N for name, N in noise.items() if "q05" in N["after"]}
+    return noisier({name: {**N["after"], "unit": N["unit"]} for name, N in noise.items()})
 
 
 def _events(findings: Sequence[Mapping[str, Any]]) -> Table:
@@ -105,8 +105,8 @@ def before_after(number: Mapping[str, Any]) -> str:
     text = "–" if not after["identified"] else f"{after['median']:.3g}"
     if "q05" in after:
         half = 0.5 * (after["q95"] - after["q05"])
-        known = f"{words.rounded(after['median'], 10.0 * half)} ± {half:.1g}"
-        text = known if after["identified"] else f"< {after['q95']:.2g}"
+        value = f"{words.rounded(after['median'], 10.0 * half)} ± {half:.1g}"
+        text = value if after["identified"] else f"< {after['q95']:.2g}"
     before = f"{number['before']:.3g}" if number["before"] > 0.0 and math.isfinite(number["before"]) else "–"
     return f"{before} -> {text}"
 

@@ -419,10 +419,10 @@ def _missing(finding: Finding, record: Record) -> Figure:
 
 def _effect(finding: Finding) -> Array:
     """Sum of the finding's columns in a reading [n], in the inner unit."""
-    known = {column.name for column in finding.before.regressors}
+    before = {column.name for column in finding.before.regressors}
     effect = np.zeros(finding.after.y.size)
     for k, column in enumerate(finding.after.regressors):
-        if column.name not in known:
+        if column.name not in before:
             effect = effect + float(finding.after.best.c[1 + k]) * column.values
     return effect
 
@@ -488,11 +488,11 @@ def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
     effect = _effect(finding)
     if not np.ptp(effect) > 0.0:
         return
-    known = 1 + len(finding.before.regressors)
+    count = 1 + len(finding.before.regressors)
     marks = np.unique(np.linspace(0, effect.size - 1, min(effect.size, POINTS // 2)).astype(int))
 
     def path(state: State) -> Summary:
-        series = replace(state.series, columns=state.series.columns[:known]).beside(effect)
+        series = replace(state.series, columns=state.series.columns[:count]).beside(effect)
         white = np.nan_to_num(run(series, state.best.terms, state.best.theta, innovations=True)[1])
         z, others = white[:, -1], white[:, 1:-1]
         z = z - others @ np.linalg.lstsq(others, z, rcond=None)[0]

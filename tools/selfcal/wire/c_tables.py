@@ -73,7 +73,7 @@ def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
     if model.hidden_input is not None:
         yield f"{model.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"
     measured = {name for name, axis in model.simulate.get("axes", {}).items() if "hypothesis" in axis}
-    if measured and (others := [one.name for one in tables.axes if one.name not in measured]):
+    if measured and (others := [axis.name for axis in tables.axes if axis.name not in measured]):
         yield f"{model.path}: wide priors, without a result in the file: {', '.join(others)}"
     if model.gate is not None and gate_table(model, tables) is None:
         yield f"{model.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"

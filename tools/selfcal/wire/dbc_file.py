@@ -242,9 +242,9 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
 
     def first_with(signal: Signal) -> bool:
         """Whether this is the first signal of its name with its comment."""
-        known = len(said)
+        before = len(said)
         said.update([(signal.name, signal.comment)] if signal.comment else [])
-        return len(said) > known
+        return len(said) > before
 
     values = {"head": head, "messages": messages, "whole": whole, "sender": sender, "first_with": first_with}
     return of_code(Path(__file__).parent / "templates").get_template("module.dbc.jinja").render(values)

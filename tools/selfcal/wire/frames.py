@@ -121,7 +121,7 @@ def tumble_text(values: Mapping[str, float]) -> str:
     phase, result, side = (choices(TUMBLE, name).get(int(values.get(name, 0)), "?").replace("_", " ") for name in names)
     if phase == "off":
         return "" if result == "none" else f"no calibration, {result}: send tumble start"
-    sides = re.sub("(minus )?([xyz]) ", lambda found: f"{'-' if found[1] else '+'}{found[2]} ", side)
+    sides = re.sub("(minus )?([xyz]) ", lambda match: f"{'-' if match[1] else '+'}{match[2]} ", side)
     todo = "hold still" if phase == "hold" else "send tumble stop" if sides == "none" else f"now {sides}"
     return f"{values.get('rests', 0):.0f} of {values.get('wanted', 0):.0f}: {todo}"
 
@@ -879,13 +879,13 @@ def serial_ports() -> str:
 
 def _can_devices() -> str:
     """The machine's CAN devices, in words. ARPHRD_CAN of linux/if_arp.h is 280."""
-    found = []
+    names = []
     for device in sorted(Path("/sys/class/net").glob("*")):
         try:
-            found += [device.name] if (device / "type").read_text().strip() == "280" else []
+            names += [device.name] if (device / "type").read_text().strip() == "280" else []
         except OSError:
             continue
-    return f"there are {', '.join(found)}" if found else "this machine has none"
+    return f"there are {', '.join(names)}" if names else "this machine has none"
 
 
 def _reason(interface: str, channel: str, error: BaseException) -> str:
