@@ -19,9 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import LONGEST, fit_of, posterior_draws, terms_of
+from selfcal.bank.priors import MOST_INTERVALS
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError
-from selfcal.model.file import MOST_HYPOTHESES, Group, Prior
+from selfcal.model.file import ABOUT_N, MOST_HYPOTHESES, Group, Prior
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import HypothesisTable, Tables, make_grid, priors_of
 
@@ -37,10 +38,8 @@ _OMEGA = 2.0 * math.pi / 3.0
 _IMAGES = 100
 #: Of the law's own white noise, the least part that is left.
 _LEAST = 1e-3
-#: Nodes of rho and alpha, and bank intervals at most: longer records are averaged further.
-_NODES, _MOST = (24, 20), 20_000
-#: Limits of alpha times the bank's interval, as models/sums.yaml has them.
-_ALPHA = (2e-4, 0.2)
+#: Nodes of rho and of alpha.
+_NODES = (24, 20)
 #: A prior of sigma_m about a known batch is this much wider of B, either way.
 _WIDER = 10.0
 #: Draws of a posterior.
@@ -125,13 +124,13 @@ def weigh(
 
     `mask`: the columns in use. `offset`: see Bank. None where the tables have the law, no room for it, or no result.
     """
-    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * _MOST)))
+    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * MOST_INTERVALS)))
     tables = replace(tables, dt_s=times * tables.dt_s, block=times * tables.block)
     drift = group.priors["sigma_m"]
     wider = _WIDER if drift.law == "log_normal" else 1.0
     own = {
         "B": Prior("log_uniform", drift.min / wider, drift.max * wider),
-        "alpha": Prior("log_uniform", *(limit / tables.dt_s for limit in _ALPHA)),
+        "alpha": Prior("log_uniform", *(limit / tables.dt_s for limit in ABOUT_N["alpha"][:2])),
     }
     return weigh_law(FLICKER, own, 1.0, tables, group, samples, missing_before, columns, mask, offset)
 

@@ -18,6 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
+from selfcal.adequacy.summary import NOISIER
 from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
 from selfcal.bank.result import in_unit
 from selfcal.base import units as unit_module
@@ -38,12 +39,6 @@ KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "deg
 DECADES_STATED = 3.0
 #: Axes of one group whose N differ by more have priors of their own.
 ALIKE = 10.0
-#: A recording's N so many times off the data sheet's is told of.
-DIFFERENT = 2.0
-#: Equal readings in a row that are stuck, as the default model has it; none on a lattice coarser than the noise.
-STUCK = 1000
-#: The default model simulates at this rate, Hz, which a data sheet's part takes.
-SIMULATED_HZ = 10.0
 #: A recording is no faster than its sensor: its rate is above it by no more.
 FASTER = 1.01
 #: A bias prior of an axis of another kind is no narrower than so many times N.
@@ -103,7 +98,7 @@ def groups(default: Mapping[str, Any], recording: Recording, axes: Sequence[str]
             f"{next(iter(recording.columns))}"
         )
     for group in trees.values():
-        group |= {"range": 0.0, "lsb": 0.0, "stuck_limit": STUCK}
+        group |= {"range": 0.0, "lsb": 0.0}
     return trees
 
 
@@ -258,7 +253,7 @@ def _put(group: dict[str, Any], number: Stated, axis: str, measured: bool) -> No
     before = {key: Prior(**prior) for key, prior in {**group["priors"], **held}.items()}
     if number.key == "N":
         N = _noise(group)
-        if measured and not 1.0 / DIFFERENT < value / N < DIFFERENT:
+        if measured and not 1.0 / NOISIER < value / N < NOISIER:
             note(f"{number.text}: the recording has {N:.3g} {parameter_unit('N', group['unit'])}")
         of_group = group["priors"] if axis else {}
         about_it = {key: prior_tree(prior) for key, prior in laid(before, value).items()}
@@ -288,7 +283,7 @@ def finish(tree: dict[str, Any], name: str, recording: Recording | None) -> list
     # Without a recording the drift is drawn from its priors; the noise is known.
     noise = {axis: {"N": rounded(middle[key])} for key, group in tree["groups"].items() for axis in group["axes"]}
     rate_hz = tree["sensor"]["rate_hz"]
-    tree["simulate"] |= {"rate_hz": min(SIMULATED_HZ, rate_hz), "axes": noise}
+    tree["simulate"] |= {"rate_hz": min(tree["simulate"]["rate_hz"], rate_hz), "axes": noise}
     said = []
     if recording is not None:
         tree["simulate"] |= {"rate_hz": rate_hz, "duration_s": recording.duration_s}

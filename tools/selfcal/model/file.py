@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from selfcal import _library32
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
@@ -42,8 +43,9 @@ DEFAULT_PART = "adis16405"
 #: Prior limits of what no law of the file has, so that it need not state them: as in the default model, by whether they
 #: are times the limits of N.
 ABOUT_N = {"K": (0.02, 0.04, True), "sigma_m": (0.5, 1.0, True), "alpha": (2e-4, 0.2, False)}
-#: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
-NODES = (6, 24)
+#: Least nodes of a grid dimension, as a quintic spline needs them; and the limits of a dimension.
+LEAST_NODES = 6
+NODES = (LEAST_NODES, _library32.GRID_MAX)
 #: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
 WIDEST_BIAS = 1e8
 #: Characters of a name or another text.
@@ -76,8 +78,8 @@ MOST_KNOTS = 200
 MOST_HYPOTHESES = 8
 #: What a term of a law may state beside its kind and deviation.
 KEYS_OF_TERM = {"walk": (), "markov": ("bandwidth", "correlation_time_s"), "oscillation": ("period_s", "damping")}
-#: Columns of a bank's regressors together: SELFCAL_REGRESSORS_MAX; and those that a model file may state.
-MOST_COLUMNS, MOST_STATED = 6, 36
+#: Most columns of a bank's regressors together, and most that a model file may state.
+MOST_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
 
 
 @dataclass(frozen=True)

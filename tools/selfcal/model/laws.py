@@ -31,9 +31,9 @@ FORGOTTEN = 20.0
 
 #: Kinds of `selfcal_term_kind_t`. An oscillation is followed by its damping.
 KINDS = ("walk", "markov", "oscillation", "damping")
-#: Bank intervals in a period at least, damping ratios, and intervals that a period lasts at most over 2 pi (SWING_MAX,
-#: DAMPING_MIN, DAMPING_MAX, TIME_MAX in lib/bank_states.c).
-SWING_LEAST, DAMPING_LIMITS, SWING_MOST = 8.0, (1e-3, 0.7), 1e6
+#: Least bank intervals in a period of an oscillation, and limits of its damping ratio (SWING_MAX, DAMPING_MIN and
+#: DAMPING_MAX in lib/bank_states.c).
+SWING_LEAST, DAMPING_LIMITS = 8.0, (1e-3, 0.7)
 #: (kind, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
 LawTuple = tuple[list[tuple[int, float, float, bool, bool]], bool]
 

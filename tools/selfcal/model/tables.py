@@ -17,12 +17,13 @@ from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
 from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior, Regressor
-from selfcal.model.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, SWING_MOST, Law
+from selfcal.model.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, Law
 from selfcal.model.regressors import channels_of, sources_of
 
-#: Samples a bank interval: the float sums of one block lose digits with more.
+#: Most samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
-#: Bank intervals of a stated correlation time, at most: TIME_MAX in bank_states.c.
+#: Most bank intervals of a stated correlation time, and of an oscillation's period over 2 pi: TIME_MAX in
+#: lib/bank_states.c.
 TIME_MAX = 1e6
 
 
@@ -314,7 +315,7 @@ def _check_times(model: Model, dt: float) -> None:
         where = f"hypotheses.{name}: "
         for term in law.terms:
             if term.kind == "oscillation":
-                most_s = 2.0 * math.pi * SWING_MOST * dt
+                most_s = 2.0 * math.pi * TIME_MAX * dt
                 check(f"{where}period_s", 2.0 * math.pi / term.bandwidth, SWING_LEAST * dt, most_s)
         for term in law.terms:
             if term.stated and term.kind == "markov":
