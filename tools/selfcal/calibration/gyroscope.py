@@ -23,15 +23,14 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
-from selfcal.calibration.accelerometer import NONE, Accelerometer, forces, means_covariance, shaped
+from selfcal.calibration.accelerometer import ANGLE_SD, NONE, SCALE_SD, Accelerometer, forces, means_covariance, shaped
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import GYRO, Tumble, Turn
 from selfcal.calibration.tumble_fit import Fit, Problem
 
-#: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); scale; angle, rad; temperature
-#: coefficient, rad/s/degC (0.05 deg/s/degC).
+#: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); temperature coefficient,
+#: rad/s/degC (0.05 deg/s/degC). Scale and angles have the accelerometers'.
 BIAS_SD, G_SD, THERMAL_SD = math.radians(10.0), math.radians(0.1), math.radians(0.05)
-SCALE_SD, ANGLE_SD = 0.02, 0.02
 #: The accelerometers' parameters.
 OF_ACCEL = accelerometer.THERMAL.stop
 #: Windows of a turn that show signs and units, s. A gyro's factor may be off by WRONG. Share of the most turned axis,

@@ -34,7 +34,7 @@ FLATS = ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0))
 EDGES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, 1, -1))
 OPPOSITE = tuple((-x, -y, -z) for x, y, z in EDGES)
 CORNERS = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1))
-POSITIONS = {6: FLATS, 12: FLATS + EDGES, 24: FLATS + EDGES + OPPOSITE + CORNERS}
+POSITIONS = {len(up): up for up in (FLATS, FLATS + EDGES, FLATS + EDGES + OPPOSITE + CORNERS)}
 #: Lengths of a rest that are looked at, s, and the time of a turn between two, s.
 LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
 #: A hand places the part off by so much, rad, sd of each of two angles. Placements that are drawn, and the share of
