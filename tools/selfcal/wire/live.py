@@ -18,11 +18,11 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
+from selfcal import _library32
 from selfcal.base.units import parameter_unit, typeset
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import (
     AXES,
-    OFF_GRID,
     REASONS,
     AxisReport,
     Decoder,
@@ -595,7 +595,9 @@ def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> lis
         label = "1/alpha" if inverse else parameter
         unit = "s" if inverse else typeset(parameter_unit(parameter, axis_unit(report.axis)))
         said.append(f"{label} {middle} [{low}, {high}] {unit if unit != '1' else ''}".rstrip())
-    if any(int(report.values.get(f"h{k}_{place}_flags", 0)) & OFF_GRID for place in PLACE_NAMES[: len(given)]):
+    if any(
+        int(report.values.get(f"h{k}_{place}_flags", 0)) & _library32.OFF_GRID for place in PLACE_NAMES[: len(given)]
+    ):
         said.append("grid of nodes too coarse")
     if named or not names.known:
         name = names.hypotheses[k] if k < len(names.hypotheses) else BY_PLACE.hypotheses[k]
