@@ -1,14 +1,13 @@
 """The Allan deviation of a record and of the laws: closed forms, and how far apart the two may be.
 
 Every law is a sum of terms: white noise, a random walk, Gauss-Markov drifts. With X the sum of the readings of a term,
-one even function G tells all that is needed here: for weights that remove a line, the covariance of two weighted sums
+one even function G suffices here: for weights that remove a line, the covariance of two weighted sums
 of X is the sum of the weights times G at the distance between them. At m readings apart
 
     u_k = (X_(k+2m) - 2 X_(k+m) + X_k) / m,     Allan variance = E[u^2] / 2,     and Cov(u_k, u_(k+j)) follow from G.
 
-Readings are the bank's: means over blocks of samples, at whose instants the drift is a point. Of readings that are no
-means a random walk's Allan variance is K^2 tau / 3 (1 + 1 / (2 m^2)), of means over many samples the continuous one,
-K^2 tau / 3.
+Readings are the bank's: means over blocks of samples, at whose instants the drift is a point. A random walk's Allan
+variance is K^2 tau / 3 (1 + 1 / (2 m^2)) of single readings, and K^2 tau / 3 of means over many samples.
 """
 
 from __future__ import annotations
@@ -29,20 +28,19 @@ from selfcal.model.laws import Law, averaged, named
 
 _Floats = NDArray[np.float64]
 
-#: A record is this many times as long as the longest averaging time: fewer windows say little.
+#: Least length of a record over its longest averaging time: fewer windows say little.
 LONGEST = 5
 #: Step in the ln of a parameter for derivatives.
 _STEP = 1e-3
 #: Correlation times after which a Gauss-Markov drift is forgotten.
 _FORGOTTEN = 14.0
-#: Where the record's Allan variance and the model's are nearly one number, S - V is the small difference of two: at
-#: least this part of S is left.
+#: Least share of S that S - V keeps (curve_of): nearly equal numbers have a small difference.
 _LEAST_LEFT = 0.2
-#: Posterior draws of the band.
+#: Number of posterior draws of the band.
 _DRAWS = 200
-#: Averaging times of a curve.
+#: Averaging times of a curve in an octave.
 _PER_OCTAVE = 4
-#: Stretches without a gap, the longest ones, that the deviation of a recording's samples is made from.
+#: Most stretches without a gap that the deviation of a recording's samples is made from: the longest ones.
 _MOST_STRETCHES = 200
 
 
@@ -184,7 +182,7 @@ def _around(
 def information_of(
     of: Law, parameters: Mapping[str, float], dt_s: float, n: float, white: float = 1.0, block: int = 1
 ) -> _Floats:
-    """What `n` readings every `dt_s` say of ln of each parameter, [d, d].
+    """Information [d, d] of `n` readings every `dt_s` on ln of each parameter.
 
     Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum."""
     ln_estimate = np.log([parameters[name] for name in of.parameters])
@@ -205,7 +203,7 @@ def fit_of(
     white: float = 1.0,
     block: int = 1,
 ) -> Fit:
-    """The curve at `parameters` that `n` readings have determined, beside the group's priors. `white` multiplies the
+    """The curve at `parameters` that `n` readings have determined, with the group's priors. `white` multiplies the
     white noise's variance. A reading is the mean of `block` samples."""
     of = group.laws[law]
     ln_estimate = np.log([parameters[name] for name in of.parameters])
@@ -235,14 +233,14 @@ def deviations(ratio: float, variance: float) -> float:
 
 
 def ratio_at(deviations: float, variance: float) -> float:
-    """The ratio that is so many standard deviations above 1, 0 where there is none."""
+    """Ratio at so many standard deviations from 1, at least 0."""
     ninth = variance / 9.0
     return max(0.0, 1.0 - ninth + deviations * math.sqrt(ninth)) ** 3
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Allan deviation of a record of bank readings beside a law's that was identified from it, at `tau_s` [t], s.
+    """Allan deviation of a record of bank readings, and of a law that was identified from it, at `tau_s` [t], s.
 
     `recording` [t] with its `freedom`, the equivalent degrees of freedom of its square under the law; `model` [t] at
     the posterior medians with the limits `model_q05` and `model_q95` [t]; `octave` [t] says which are octaves of two
@@ -276,9 +274,9 @@ def curve_of(
     half_life_s: float = 0.0,
     block: int = 1,
 ) -> Curve | None:
-    """Readings `y` every `dt_s` (NaN: missing), means of `block` samples, beside `law` at its posterior medians.
+    """Readings `y` every `dt_s` (NaN: missing), means of `block` samples, compared with `law` at its posterior medians.
 
-    None if there are too few.
+    None if there are too few readings.
 
     The record has also determined the parameters, so the two are nearer to each other than a record is to a curve known
     beforehand. With a the logarithm of the record's Allan variance, S its variance about the true curve, and V the

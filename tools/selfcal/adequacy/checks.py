@@ -21,29 +21,29 @@ from selfcal.model.tables import Tables
 from selfcal.readings.readings import CLOCK_LEAST, Readings
 from selfcal.readings.tests import TESTS
 
-#: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
+#: Largest deviation of a check's statistic that passes, sd: a false alarm in 16 000 checks.
 CHECK_LIMIT = 4.0
-#: A part that is not from the batch, sd of `batch_check`: by chance one law's two parameters in 1000 parts.
+#: Largest distance of a part from its batch that passes, sd: one law's two parameters exceed it in 1 of 1000 parts.
 BATCH_LIMIT = 3.5
-#: A law of the batch has this prior probability at least.
+#: Least prior probability of a law of the batch.
 BATCH_LAW = 0.1
-#: Of the prior's variance, what a record that shows nothing leaves to compare by.
+#: Least share of the prior's variance by which a record and the prior are compared.
 LEFT_LEAST = 0.1
-#: Bank samples without which there are no checks.
+#: Fewest bank samples that are checked.
 FEWEST = 20
-#: Share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at 0.9,
-#: where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
+#: Largest share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at
+#: 0.9, where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84
-#: Times of a filter's corner in an average that shows the white noise before it: N of a first-order filter to 5 %.
+#: Length of an average over a filter's time constant: it shows N before a first-order filter to 5 %.
 CORNERS = 10.0
-#: Spacing of float32 in the noise of a reading from which on it makes N too large: by 0.4 %.
+#: Largest spacing of float32 in the noise of a reading: beyond it N is 0.4 % too large.
 SPACING_MOST = 0.3
 
 
 @dataclass(frozen=True)
 class Judged:
     """A record against its most probable law, at its posterior medians: the `checks` of adequacy, and the `curve` of
-    its Allan deviation, None where the record is too short, or too long, to tell."""
+    its Allan deviation, None where the record is too short, or too long."""
 
     checks: Mapping[str, Mapping[str, Any]]
     curve: Curve | None

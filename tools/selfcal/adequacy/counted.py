@@ -1,7 +1,7 @@
 """Quantization noise that the lattice of the readings makes possible: N of a data sheet is marginal over its size.
 
 Increments of a counter have remainders that are carried on: Q is the increment over sqrt(12) then, where they are white
-(lattice.py). Readings of any other lattice may be increments: then Q is that at most. White noise beside quantization
+(lattice.py). Readings of any other lattice may be increments: then Q is that at most. White noise with quantization
 noise is the law `moving_average` (diagnosis/causes/quantization_noise.py).
 """
 
@@ -21,11 +21,11 @@ from selfcal.model.tables import Tables
 from selfcal.readings.lattice import Lattice
 
 COUNTED = "moving_average"
-#: Q may be so many times that of the lattice: remainders that are nearly white have a little more of it.
+#: Largest Q over the lattice's own: remainders that are nearly white have a little more.
 WIDER = 1.25
-#: Odds over an average law that increments which are carried on have the law; others have it as an average law.
+#: Prior odds of the law over an average law where increments are carried on; elsewhere 1.
 SURE_ODDS = 100.0
-#: Standard deviations of N by which such noise must be able to change it.
+#: Least change of N by such noise that is weighed, sd of N.
 MATTERS = 0.5
 
 
@@ -45,7 +45,7 @@ def weigh_counted(
     mask: int = 0,
     offset: float = 0.0,
 ) -> Beside | None:
-    """White noise beside quantization noise on the readings of the one axis of `tables`, where its lattice makes that
+    """White noise with quantization noise on the readings of the one axis of `tables`, where its lattice makes that
     possible and N would change. None elsewhere, and where the remainders are not white."""
     if lattice is None or lattice.too_coarse_over(tables.dt_s):
         return None

@@ -21,7 +21,7 @@ from selfcal.base.output import write_json
 from selfcal.logs.recording import Recording
 
 SCHEMA = "selfcal.identify/1"
-#: Where metadata have the device's serial number and the date.
+#: Keys of metadata with the device's serial number and the date.
 SERIALS, DATES = ("serial", "serial_number"), ("recorded_at", "date")
 #: Stamps between 2001 and 2100 count from 1970, s; no device is powered for so long.
 EPOCH_S = (1e9, 4.1e9)

@@ -1,6 +1,6 @@
 """Checks of the drift: does the law take another axis, a side channel, a jump, or settling after power-on for drift?
 
-A walk follows nearly anything slow, so its innovations hide the cause. Each candidate is a column beside the bias, and
+A walk follows nearly anything slow, so its innovations hide the cause. Each candidate is a column next to the bias, and
 the engine of the diagnosis (likelihood/columns.py) weighs it on a bounded grid.
 """
 
@@ -27,12 +27,12 @@ from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables
 
-#: A check fails from this worth on, nats: as seldom as one at four standard deviations (checks.py), searches counted.
+#: Largest worth of a column that passes, nats: as rare as CHECK_LIMIT standard deviations, searches counted.
 LEAST = 9.67
-#: Drifts whose sizes are over e to these, and nats by which a smaller one must be the likelier one beside a column:
-#: noise that axes share is no drift.
+#: Sizes of the drift that are tried with a column, as ln of a divisor; and least gain of a smaller size, nats: noise
+#: that axes share is no drift.
 SIZES, CLEARLY = (0.0, 0.7, *SMALLER), 3.0
-#: Means that are looked at, at least: fewer show no drift.
+#: Fewest means that are looked at: fewer show no drift.
 FEWEST = 60
 #: Smoothing, lags and the window of a rate, s: a channel's own noise hides its slow change.
 SMOOTH_S, LAGS_S, RATE_S = 20.0, (5.0, 30.0, 120.0, 600.0), 60.0
@@ -75,8 +75,8 @@ def drift_checks(
 def _check(
     state: State, shapes: Sequence[Shape], stated: Callable[[Shape], dict[str, Any]], *, drift: bool = True
 ) -> dict[str, Any]:
-    """The best of some shapes: what it is worth net of the search, and what is `told` of it. It is worth nothing if it
-    explains no `drift`: one must be clearly likelier than none, and beside it a smaller one."""
+    """The best of some shapes: what it is worth net of the search, and what is `stated` of it. It is worth nothing if
+    it explains no `drift`: a drift must be clearly likelier than none, and with the shape a smaller one."""
     trials = columns.tried(state, shapes, slow=True).values()
     best = max(trials, key=lambda trial: trial.net, default=None)
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)

@@ -28,7 +28,7 @@ from selfcal.readings.gate import gated
 from selfcal.readings.readings import Readings, copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
 
-#: Spacing of float32 in the noise of a reading from which on a nominal offset is taken off before.
+#: Largest spacing of float32 in the noise of a reading that is fed without taking a nominal offset off.
 SPACING_LEAST = 0.01
 
 
@@ -72,7 +72,7 @@ def identify_axis(
     draw: bool = False,
 ) -> Identified:
     """One axis by one engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that
-    is too coarse. Readings that are none are left out (`readings.py`). With regressors every subset of them is scored;
+    is too coarse. Wrong readings are left out (`readings.py`). With regressors every subset of them is scored;
     `advance` is called after each. `draw`: with the Allan deviation of the samples."""
     recording = recording.along(name)
     fed = _fed(recording, name, model, decimate)
@@ -151,7 +151,7 @@ class _Fed:
 
 
 def _fed(recording: Recording, name: str, model: Model, decimate: float | None) -> _Fed:
-    """The samples of an axis without readings that are none. Raises UserError where it has no result."""
+    """The samples of an axis without wrong readings. Raises UserError where it has no result."""
     group, regressors = model.group_of(name), offered(model, name)
     if most := mostly_beyond(recording.in_unit(name, group.unit), group):
         raise UserError(most)

@@ -1,11 +1,11 @@
-"""1/f noise beside the laws of a model: how likely it is, its B, and the white noise beside it.
+"""1/f noise as a law next to the laws of a model: how likely it is, its B, and the white noise next to it.
 
 The law `flicker` has three terms, so 1/f noise above the fastest one looks white to it: its N is too large. White noise
-beside 1/f noise is what the law's spectrum has more than B^2 / (2 pi f) at a third of the bank's rate. There the two
+next to 1/f noise is what the law's spectrum has more than B^2 / (2 pi f) at a third of the bank's rate. There the two
 agree best on records of 10 minutes to 4 hours (tests/noise_coverage.py).
 
 The paper's laws put the Allan deviation's minimum of true 1/f noise 10 to 40 % too high. So the data sheet's numbers
-weigh the law `flicker` beside the model's laws.
+weigh the law `flicker` with the model's laws.
 """
 
 from __future__ import annotations
@@ -29,20 +29,20 @@ from selfcal.model.tables import HypothesisTable, Tables, make_grid, priors_of
 _Floats = NDArray[np.float64]
 
 FLICKER = "flicker"
-#: From this probability on the drift is 1/f noise. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
+#: Least probability of 1/f noise that is called sure. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
 #: root of a second, 5 reach 0.9 and none 0.97.
 SURE = 0.98
-#: Radians a bank interval at which the white noise is what the spectrum has beside 1/f noise.
+#: Frequency at which the white noise is the rest of the spectrum, radians a bank interval.
 _OMEGA = 2.0 * math.pi / 3.0
 #: Images of the bank's rate that count: more change the density by 1e-4.
 _IMAGES = 100
-#: Of the law's own white noise, the least part that is left.
+#: Least share of the law's own white noise that is left.
 _LEAST = 1e-3
 #: Nodes of rho and of alpha.
 _NODES = (24, 20)
-#: A prior of sigma_m about a known batch is this much wider of B, either way.
+#: Factor by which B's limits are wider than those of a sigma_m about a known batch, either way.
 _WIDER = 10.0
-#: Draws of a posterior.
+#: Number of draws of a posterior.
 _DRAWS = 1024
 
 
@@ -63,21 +63,21 @@ def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
 
 
 def white_of(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floats:
-    """N [k] beside 1/f noise of draws [k] of the parameters of the law `flicker`."""
+    """N [k] next to 1/f noise, of draws [k] of the parameters of the law `flicker`."""
     square = draws["N"] ** 2
     left = square - density_above(draws["alpha"], dt_s, block) * draws["B"] ** 2
     return np.asarray(np.sqrt(np.maximum(left, _LEAST**2 * square)))
 
 
 def beside_its_law(parameters: Mapping[str, float], dt_s: float, block: int) -> float:
-    """The law's N whose white noise is `parameters["N"]` beside 1/f noise: the inverse of white_of()."""
+    """The law's N whose white noise is `parameters["N"]` next to 1/f noise: the inverse of white_of()."""
     above = float(density_above(np.array([parameters["alpha"]]), dt_s, block)[0])
     return math.sqrt(max(parameters["N"] ** 2 + above * parameters["B"] ** 2, 0.0))
 
 
 def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> AxisResult:
-    """The same with N of the law `flicker` beside 1/f noise. The result as it is without that law, or where the record
-    is too short for it."""
+    """The same with N of the law `flicker` next to 1/f noise. The result is unchanged without that law, or where the
+    record is too short for it."""
     estimates = result.parameters.get(FLICKER, {})
     medians = {name: estimate.median for name, estimate in estimates.items()}
     if not estimates or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
@@ -93,7 +93,7 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
 
 @dataclass(frozen=True)
 class Beside:
-    """A `law` beside a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
+    """A `law` added to a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
     one every `dt_s`, under the priors of `group`."""
 
     probability: float

@@ -35,13 +35,13 @@ from selfcal.readings.rest import rest_of
 STATED, OF_PART = ("N", "density", "K", "B", "bias", "range", "lsb"), ("rate",)
 #: Kinds of axes by a unit of each: their group's name, and its unit where the recording does not decide it.
 KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "degC": "temperature", "V": "voltage"}
-#: A stated K or B has so many decades of prior, as the default model has of K.
+#: Width of the prior of a stated K or B, decades: as of K in the default model.
 DECADES_STATED = 3.0
-#: Axes of one group whose N differ by more have priors of their own.
+#: Largest ratio of an axis' N to its group's: beyond it the axis has priors of its own.
 ALIKE = 10.0
-#: A recording is no faster than its sensor: its rate is above it by no more.
+#: Largest ratio of a recording's rate to its sensor's.
 FASTER = 1.01
-#: A bias prior of an axis of another kind is no narrower than so many times N.
+#: Least sd of the bias prior over N, of an axis of another kind, 1/sqrt(s).
 LEAST_BIAS = 1000.0
 
 
@@ -206,7 +206,7 @@ def _known(readings: Readings) -> NDArray[np.float64]:
 
 
 def of_sheet(tree: dict[str, Any], stated: Sequence[Stated], measured: bool) -> list[str]:
-    """Put the numbers of a data sheet into `tree`; a line for each. N goes first: the others are beside it."""
+    """Put the numbers of a data sheet into `tree`; a line for each. N goes first: the others are laid about it."""
     for number in sorted(stated, key=lambda number: (number.key != "N", bool(number.of))):
         if number.key == "rate":
             if number.of or not unit_module.same_kind(number.unit, "Hz"):
@@ -315,7 +315,7 @@ def rounding(group: Mapping[str, Any], rate_hz: float) -> float:
 
 
 def without(N: float, added: float) -> float:
-    """The density beside which another one makes N."""
+    """The density that makes N together with `added`."""
     return math.sqrt(max(N * N - added * added, 1e-4 * N * N))
 
 
@@ -326,8 +326,8 @@ def tree_of(
     name: str | None = None,
     rate: float | None = None,
 ) -> tuple[dict[str, Any], list[str]]:
-    """The tree of a part's model file, and a line for each of its numbers. `axes`: columns that are axes beside gx to
-    az; `stated`: numbers of its data sheet; `rate`, Hz: without a recording. Raises UserError."""
+    """The tree of a part's model file, and a line for each of its numbers. `axes`: columns that are axes apart from gx
+    to az; `stated`: numbers of its data sheet; `rate`, Hz: without a recording. Raises UserError."""
     tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
     said: list[str] = []
     if recording is not None:

@@ -3,9 +3,9 @@
 The white noise (angle random walk, of an accelerometer velocity random walk) is N. The rate random walk is K; a
 Gauss-Markov drift counts as the walk that it is over times short against 1 / alpha, K = sigma_m sqrt(2 alpha); no drift
 has K = 0. The bias instability is the first minimum of the law's Allan deviation over 0.664 (IEEE Std 952, annex C).
-Of 1/f noise it is B, and the white noise is that beside 1/f noise (one_over_f.py). Its law is weighed beside the
-model's own; the walk is theirs alone.
-Coloured noise of a spectral ratio below 1 is white noise beside quantization noise; at the bank's interval dt
+Of 1/f noise it is B, and the white noise is the rest (one_over_f.py). Its law is weighed with the model's own; the
+walk is theirs alone.
+Coloured noise of a spectral ratio below 1 is white noise with quantization noise; at the bank's interval dt
 Q = N sqrt(dt) sqrt(1 / ratio^2 - 1) / 2. The number is there where such noise is sure. Each law counts by its
 probability.
 """
@@ -30,15 +30,15 @@ _Floats = NDArray[np.float64]
 
 #: The parameter of coloured noise, and the sizes of drifts.
 COLOURED, _SIZES = "spectral_ratio", ("K", "sigma_m", "B")
-#: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
+#: Number of draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
 _DRAWS, _PER_OCTAVE = 256, 16
-#: Times the record that a longer rest is looked at, and halvings of its logarithm: to 2 %.
+#: Longest rest that is looked at, in lengths of the record, and halvings of its logarithm: to 2 %.
 MOST_REST, _HALVINGS = 100.0, 8
-#: Laws of smaller probability do not count.
+#: Least probability of a law that counts.
 _LEAST = 1e-3
-#: White noise over that of the other axes of a sensor that a line names: their data sheets have one number for all.
+#: Least ratio of an axis' N to its siblings' or its data sheet's that a line names.
 NOISIER = 2.0
-#: Share of the posterior that must have a walk, or a minimum, for the number to be identified.
+#: Least share of the posterior with a walk, or a minimum, that identifies the number.
 _SURE = 0.95
 #: Why a number is not identified: words of the table and the JSON.
 NO_WALK = "no walk is sure"
@@ -68,8 +68,8 @@ def summarize(
 ) -> dict[str, Number]:
     """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
     the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
-    record is too short for an Allan deviation. `beside`: 1/f noise beside the laws of the result. `counted`: likewise
-    white noise beside quantization noise (counted.py)."""
+    record is too short for an Allan deviation. `beside`: 1/f noise, added to the laws of the result. `counted`:
+    likewise white noise with quantization noise (counted.py)."""
     if n < 2 * LONGEST:
         return {}
     more = 0.0 if beside is None else beside.probability
@@ -77,7 +77,7 @@ def summarize(
     laws = [
         Beside(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
-        if probability >= _LEAST  # of the model's, whatever stands beside them
+        if probability >= _LEAST  # of the model's, whatever is added to them
     ]
     of_model = len(laws)
     others = ((beside, more * left), (counted, 1.0 - left))
@@ -166,7 +166,7 @@ def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
 def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, float | None]:
     """Of each parameter of the likeliest law that the record leaves open: the further rest that halves its interval, s.
 
-    By the Fisher information at the medians, beside the priors. An open interval is wider than this information says,
+    By the Fisher information at the medians, with the priors. An open interval is wider than this information says,
     and falls faster with the rest: the geometric mean of both variances is taken for that of now. The median over
     records of a kind is then 0.2 to 0.76 times as wide (tests/tools/test_summary.py). None: not even MOST_REST times
     the record does.
@@ -215,7 +215,7 @@ def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
 
 
 def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
-    """The first minimum of the Allan deviation at `m` readings, and 0; where there is none inside, the lowest value
+    """The first minimum of the Allan deviation at `m` readings, and 0; where none lies inside, the lowest value
     with -1 (it rises from the first on) or 1 (it falls to the last)."""
     variance = terms.allan_variance(m)
     inside = np.flatnonzero((variance[1:-1] < variance[:-2]) & (variance[1:-1] <= variance[2:]))

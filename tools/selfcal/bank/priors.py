@@ -314,7 +314,7 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
 
 
 def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float]) -> bool:
-    """Whether the record may show more than the priors hold: what it cannot tell lies well below a least, or the drift
+    """Whether the record may show more than the priors hold: what it cannot show lies well below a least, or the drift
     comes near a most."""
     below = any(math.e * least[key] < prior.min for key, prior in priors.items() if key in least)
     reach = float(seen.deviation[-1]) * math.sqrt(3.0 / float(seen.tau_s[-1]))

@@ -29,7 +29,7 @@ _Indices = NDArray[np.int64]
 _DEPTH = 16.0
 #: First step in each direction, in conditional standard deviations.
 _STEP = 0.75
-#: Steps a direction has at least between its limits.
+#: Fewest steps of a direction between its limits.
 _FEWEST = 24
 #: Most nodes of a hypothesis: a larger posterior is out of this engine's reach.
 _MOST = 1_000_000
@@ -310,8 +310,8 @@ class _Lattice:
         self._spread()
 
     def _spread(self) -> None:
-        """Filter every node next to one above the depth. A turn looks beside the nodes that the last one added: beside
-        older ones all is there."""
+        """Filter every node next to one above the depth. A turn looks next to the nodes that the last turn added: all
+        nodes next to older ones are there."""
         directions = np.eye(len(self.low), dtype=np.int64)
         known = set(self._key(self.index).tolist())
         first = 0

@@ -75,7 +75,7 @@ def shown(value: object) -> str:
 
 
 def install(what: str) -> str:
-    """The line to type for a package that is not installed beside this one: its name, or `selfcal[extra]`."""
+    """The line to type for a package that is not installed with this one: its name, or `selfcal[extra]`."""
     return f"{shlex.quote(sys.executable)} -m pip install {shlex.quote(what)}"
 
 

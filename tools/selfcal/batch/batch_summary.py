@@ -33,11 +33,11 @@ from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
 
-#: Evidence of a unit's law over the batch's law, nats: at most 1 in e^12 by chance.
+#: Least evidence of an odd unit's law over the batch's law, nats: at most 1 in e^12 by chance.
 OTHER_LAW = 12.0
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Most devices of a line.
+#: Most devices that a line names.
 MOST_NAMED = 20
 #: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0

@@ -130,7 +130,7 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 def compared_of(
     seen: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]], verdicts: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Compared]:
-    """Each recording beside the one before, by axis. `seen`: the recordings with the quantities of each axis;
+    """Each recording compared with the one before, by axis. `seen`: the recordings with the quantities of each axis;
     `verdicts`: by recording and axis."""
     compared = {name: Compared() for axes in verdicts.values() for name in axes}
     for (first, before), (second, after) in pairwise(seen):

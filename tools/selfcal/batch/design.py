@@ -33,9 +33,10 @@ from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Terms
 from selfcal.model.file import Model
 
-#: Stages of the register that makes the bits.
+#: Number of stages of the register that makes the bits.
 STAGES = 9
-#: Records that a length is tried with, how exact the predicted one is, and how much longer the next is.
+#: Records that a length is tried with, largest ratio of the predicted length to a shorter one that fails, and ratio of
+#: the next length to one that was too short.
 DRAWN, STEP, LONGER = 20, 1.1, 1.2
 LAG = Structure("lag", ("gain",), ("lag_s",))
 

@@ -33,7 +33,7 @@ MOST_ROWS_NAMED = 5
 class Source:
     """A recording of the batch.
 
-    `path` as the pattern has it. `sha256` of the file, `content` of the file and the metadata beside it. `device`: ""
+    `path` as the pattern has it. `sha256` of the file, `content` of the file and the metadata next to it. `device`: ""
     until the recording is read, if its metadata have the serial number. `copy_of`: the recording of another device with
     the same content.
     """

@@ -46,11 +46,12 @@ SCHEMA = "selfcal.plan/1"
 LEAST, MOST = 64, 200_000
 #: Halvings of the last step of the length, in its logarithm.
 HALVINGS = 3
-#: A bank so many times faster or slower is worth a line if it shortens the length to this share, or lengthens it less.
+#: Ratio of the rates of banks that a line compares, and largest ratio of the lengths that is worth a line: a slower
+#: bank may lengthen the record by the inverse.
 FASTER, WORTH = 10.0, 0.8
-#: A bias is in its steady state where half the length has an interval that is wider by less than this factor.
+#: Largest ratio of a bias' interval at half the length to the whole: it is in its steady state.
 STEADY = 1.1
-#: Record without another wish, s.
+#: Length of a record without another wish, s.
 SWEEP_S = 3600.0
 #: Forms whose column is in proportion to the channel.
 LINEAR = ("static", "lag", "rate")

@@ -23,7 +23,7 @@ from selfcal.readings.tests import TESTS
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
-#: Checks of the readings, and of the innovations; deviation of a mark, in standard deviations.
+#: Checks of the readings, and of the innovations; least deviation of a mark, sd.
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0

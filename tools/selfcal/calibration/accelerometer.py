@@ -22,15 +22,15 @@ from selfcal.calibration.tumble_fit import FALSE_ALARM, Fit, Problem, fit
 BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
 #: sd of the square of the scale, s^2/m: 0.5 mg at 1 g. Data sheets' 0.1 to 0.5 % of a range of 2 to 16 g are 0.1 to 1.
 SQUARE_SD = 5e-5
-#: Where the parameters are.
+#: Places of the parameters.
 BIAS, SCALE, ANGLE, GRAVITY, THERMAL = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 2))
-#: sd of a parameter that the logs do not have.
+#: sd of a parameter that the logs do not have: not 0, so that the prior has an inverse.
 NONE = 1e-12
 #: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
 REACH = 10.0
-#: Rests without which there is no answer.
+#: Fewest rests that give an answer.
 FEWEST = 3
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from selfcal.base.errors import UserError
 from selfcal.base.units import STANDARD_GRAVITY
 
-#: Earth's rate, rad/s; semi-major axis, m; flattening; gravity at the equator, m/s^2; Somigliana's constant; m.
+#: Earth's rate, rad/s; semi-major axis, m; flattening.
 RATE, MAJOR, FLATTENING = 7.292115e-5, 6378137.0, 1.0 / 298.257223563
-#: Height that is not stated: sd, m.
+#: sd of a height that is not stated, m.
 HEIGHT_SD = 500.0
-#: Heights that are taken, m; gravity that is taken, m/s^2.
+#: Limits of a height, m, and of gravity, m/s^2.
 HEIGHTS, GRAVITIES = (-500.0, 10_000.0), (9.7, 9.9)
 
 

@@ -31,12 +31,12 @@ from selfcal.calibration.tumble_fit import Fit, Problem
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); temperature coefficient,
 #: rad/s/degC (0.05 deg/s/degC). Scale and angles have the accelerometers'.
 BIAS_SD, G_SD, THERMAL_SD = math.radians(10.0), math.radians(0.1), math.radians(0.05)
-#: The accelerometers' parameters.
+#: Number of the accelerometers' parameters.
 OF_ACCEL = accelerometer.THERMAL.stop
-#: Windows of a turn that show signs and units, s. A gyro's factor may be off by WRONG. Share of the most turned axis,
-#: or of a turn, from which on it is judged. Information below which there is none.
+#: Windows of a turn that show signs and units, s; largest error of a gyro's factor; least share of the most turned
+#: axis, or of a turn, that is judged; information that is added to every entry of the factors.
 WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
-#: Where the parameters are, behind the accelerometers'.
+#: Places of the parameters, behind the accelerometers'.
 BIAS, G, SCALE, ANGLE, THERMAL = (slice(a, b) for a, b in ((0, 3), (3, 12), (12, 15), (15, 21), (22, 25)))
 VERTICAL, LEVEL = 21, 25
 #: Row and column of each angle.

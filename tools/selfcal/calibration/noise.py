@@ -24,7 +24,7 @@ from selfcal.model.laws import Law
 
 #: Shortest rest that identifies the law of the part, s.
 LONG_S = 1200.0
-#: Differences of piece means that measure N: fewer leave it to the model.
+#: Fewest differences of piece means that measure N: fewer leave it to the model.
 FEWEST = 30
 
 

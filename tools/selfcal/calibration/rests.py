@@ -22,13 +22,13 @@ from selfcal.readings.rest import PIECE_S, rest_of
 
 ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
-#: Seconds that are cut off a rest beside a motion: its first and last movement is below the noise of a piece.
+#: Time that is cut off a rest next to a motion, s: its first and last movement is below the noise of a piece.
 SETTLE_S = PIECE_S
 #: Shortest rest that is advised, s, and what the search for motion takes off both ends of one at most, s.
 REST_S, CUT_S = 10.0, 6.0 * PIECE_S
 #: Most rests: the fit is dense.
 MOST = 200
-#: Pieces of a rest: their differences show its drift.
+#: Number of pieces of a rest: their differences show its drift.
 PIECES = 8
 #: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
 #: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
@@ -86,7 +86,7 @@ class Tumble:
         return GYRO[0] in self.noise
 
     def wide(self, names: Sequence[str]) -> int:
-        """Terms of the drift of axes whose prior spans decades; 0: there are none."""
+        """Terms of the drift of axes whose prior spans decades; 0 without such an axis."""
         return max((len(self.noise[name].terms) for name in names if self.noise[name].wide), default=0)
 
     def with_drift(self, names: Sequence[str], shares: Array) -> Tumble:
@@ -401,11 +401,11 @@ def _bridged(values: Array) -> tuple[Array, Array]:
 
 
 def _flat(part: Array, values: Array, step: float) -> bool:
-    """Whether readings of a turn [n] stop at the record's extreme: equal there, and the readings beside far off."""
+    """Whether readings of a turn [n] stop at the record's extreme: equal there, and their neighbours far off."""
     for extreme in (float(np.nanmax(values)), float(np.nanmin(values))):
         for first, behind in runs(part == extreme):
             beside = part[[max(first - 1, 0), min(behind, part.size - 1)]]
-            # A turn clips at three readings in a row, three steps of the lattice from the readings beside them.
+            # A turn clips at three readings in a row, three steps of the lattice from their neighbours.
             if behind - first >= 3 and np.abs(beside - extreme).min() > 3.0 * step:
                 return True
     return False

@@ -150,7 +150,7 @@ def side_of(up: Array) -> str:
 
 
 def _positions(accel: Accelerometer) -> list[str]:
-    """Further rests by which every parameter would be identified, one after another that tells most."""
+    """Further rests by which every parameter would be identified, the most informative one first."""
     fit, place, own = accel.fit, accel.place, slice(0, len(OF_ACCEL))
     if fit.identified[own].all():
         return []
@@ -200,7 +200,7 @@ def _turns(gyro: Gyroscope, tumble: Tumble) -> list[str]:
 
 
 def _notes_of_turns(accel: Accelerometer) -> list[str]:
-    """Turns that are left out, and those that tell little."""
+    """Turns that are left out, and turns that show little."""
     tumble, lines = accel.tumble, []
     f = accel.force(tumble.accel, tumble.warmth)
     u = f / np.linalg.norm(f, axis=1)[:, None]
@@ -211,7 +211,7 @@ def _notes_of_turns(accel: Accelerometer) -> list[str]:
             continue
         way = float(np.linalg.norm(turn.gyro - tumble.rests[turn.first].gyro, axis=1).sum()) * turn.dt
         apart = math.acos(float(np.clip(u[turn.first] @ u[turn.first + 1], -1.0, 1.0)))
-        # A turn of more than 30 deg that ends within 15 deg of where it began tells little.
+        # A turn of more than 30 deg that ends within 15 deg of where it began shows little.
         if way > math.radians(30.0) and apart < math.radians(15.0):
             lines.append(f"{where}: {math.degrees(way):.0f} deg, and the same side is up: it tells little")
     return lines

@@ -16,16 +16,17 @@ from selfcal.base.grid import Array, Mask
 #: Residuals [m], their derivatives [m, n] and their covariance [m, m] at parameters [n].
 Problem = Callable[[Array], tuple[Array, Array, Array]]
 
-#: Iterations and halvings of a step at most. A step below 0.3 posterior sd is taken as it is. The last step is below
+#: Most iterations, and most halvings of a step. A step below 0.3 posterior sd is taken as it is. The last step is below
 #: 1e-4 posterior sd.
 ITERATIONS, HALVINGS = 50, 8
 UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
 NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
-#: A parameter is identified if the data leave this share of its prior variance at most, with priors so much wider.
+#: Largest share of its prior variance that the data leave an identified parameter, and the factor by which priors are
+#: wider then.
 IDENTIFIED, WIDER = 0.2, 8.0
-#: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
+#: Probability that a right model's residuals are called too large, and that a cause is named, a calibration each.
 FALSE_ALARM = 0.005
-#: Residuals beyond the parameters that a check takes at least.
+#: Fewest residuals beyond the parameters that are checked.
 FREE_LEAST = 0.5
 
 

@@ -35,9 +35,9 @@ EDGES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, 1, -1))
 OPPOSITE = tuple((-x, -y, -z) for x, y, z in EDGES)
 CORNERS = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1))
 POSITIONS = {len(up): up for up in (FLATS, FLATS + EDGES, FLATS + EDGES + OPPOSITE + CORNERS)}
-#: Lengths of a rest that are looked at, s, and the time of a turn between two, s.
+#: Lengths of a rest that are tried, s, and the time of a turn between two rests, s.
 LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
-#: A hand places the part off by so much, rad, sd of each of two angles. Placements that are drawn, and the share of
+#: sd of each of two angles by which a hand places the part off, rad; number of placements that are drawn; share of
 #: them that have what is planned.
 PLACED, DRAWN, SHARE = math.radians(3.0), 10, 0.9
 #: What may be wished: the sensor, the unit here, and where the sensor's parameters are.

@@ -17,7 +17,7 @@ from selfcal.base.output import console_of, plotter, print_line, save_picture
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration.tumble_document import side_of
 
-#: By group of parameters, in data sheets' units: word, unit, factor, and what is taken off before.
+#: Data sheets' terms by group of parameters: word, unit, factor, and the number that is subtracted before.
 SHEET = {
     ("accelerometer", "bias"): ("bias", "ug", 1e6 / STANDARD_GRAVITY, 0.0),
     ("accelerometer", "scale"): ("scale - 1", "ppm", 1e6, 1.0),

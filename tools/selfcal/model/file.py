@@ -40,29 +40,29 @@ DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 PARTS = DEFAULT.parent / "parts"
 DEFAULT_PART = "adis16405"
 
-#: Prior limits of what no law of the file has, so that it need not state them: as in the default model, by whether they
-#: are times the limits of N.
+#: Prior limits of parameters that no law of the file has: as in the default model at 1 Hz; and whether they multiply
+#: the limits of N.
 ABOUT_N = {"K": (0.02, 0.04, True), "sigma_m": (0.5, 1.0, True), "alpha": (2e-4, 0.2, False)}
 #: Least nodes of a grid dimension, as a quintic spline needs them; and the limits of a dimension.
 LEAST_NODES = 6
 NODES = (LEAST_NODES, _library32.GRID_MAX)
-#: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
+#: Largest sd of a bias prior over the least N: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
 WIDEST_BIAS = 1e8
-#: Characters of a name or another text.
+#: Most characters of a name or another text.
 LONGEST_TEXT = 200
-#: Axes of a model, and taps of the sensor's filter: more than any part has.
+#: Most axes of a model, and most taps of the sensor's filter: more than any part has.
 MOST_AXES, MOST_TAPS = 64, 1024
-#: The largest number of any kind: its square is still a float.
+#: Largest number of any kind: its square is still a float.
 LARGEST = 1e18
-#: The smallest but 0: below what any prior may reach.
+#: Smallest number but 0: below what any prior may reach.
 SMALLEST = 1e-20
-#: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
+#: Largest ln of a parameter that a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
 #: sd from the middle of a log-normal prior to its limits: SELFCAL_LOG_NORMAL in lib/selfcal_tables.h.
 LOG_NORMAL_REACH = 4.0
-#: sd of a log-normal prior: below, the limits of large logarithms are equal floats.
+#: Limits of the sd of a log-normal prior: below, the limits of large logarithms are equal floats.
 LOG_NORMAL_SD = (1e-4, 5.0)
-#: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
+#: Kinds of regressors, and the keys of an entry of each apart from name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
     "column": ("column", "unit", "reference", "window_s", "input", "form", "lag_s", "width", "knots"),
@@ -72,11 +72,11 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "turn_on": ("tau_s",),
     "pulse": ("start_s", "end_s"),
 }
-#: Knots of a curve.
+#: Most knots of a curve.
 MOST_KNOTS = 200
-#: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
+#: Most hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
-#: What a term of a law may state beside its kind and deviation.
+#: Keys that a term of a law may state apart from its kind and deviation.
 KEYS_OF_TERM = {"walk": (), "markov": ("bandwidth", "correlation_time_s"), "oscillation": ("period_s", "damping")}
 #: Most columns of a bank's regressors together, and most that a model file may state.
 MOST_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
@@ -248,7 +248,7 @@ class GridNodes:
 class HiddenInput:
     """One quantity that nobody recorded and that moves several axes, a Gauss-Markov process: its standard deviation,
     its bandwidth `alpha`, 1/s, what a unit of it does to each axis, in the axis' unit, and the correlation of the white
-    noise of pairs of axes beside it (`gx-gy`). The bank of one axis knows nothing of it: its law is the axis' total."""
+    noise of pairs of axes (`gx-gy`). The bank of one axis knows nothing of it: its law is the axis' total."""
 
     deviation: float
     alpha: float

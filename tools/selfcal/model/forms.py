@@ -15,11 +15,11 @@ from selfcal.base.grid import Array
 
 #: Forms, the simplest first.
 FORMS = ("static", "lag", "rate", "square", "cube", "play", "free")
-#: The entry that has a form's number.
+#: Entry with a form's number.
 NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width"}
 #: A curve: values of the channel, rising, and heights. Between two the line through both holds, beyond the ends these.
 Knots = tuple[tuple[float, float], ...]
-#: The power of the channel's unit.
+#: Power of the channel's unit, by form.
 POWER = {"square": 2, "cube": 3}
 #: `selfcal_column_kind_t`: names in C, by number.
 COLUMN_KINDS = (

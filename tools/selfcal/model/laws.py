@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-#: Terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
+#: Most terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
 MOST_TERMS = 3
-#: What a deviation and a bandwidth may multiply: FACTOR_MIN, FACTOR_MAX in lib/bank_states.c.
+#: Limits of the factors of a deviation and a bandwidth: FACTOR_MIN, FACTOR_MAX in lib/bank_states.c.
 FACTORS = (1e-3, 1e3)
 #: Parameters of every group's priors, in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
@@ -136,7 +136,7 @@ class Law:
 def averaged(x: float, block: int) -> tuple[float, float]:
     """Means of a Gauss-Markov drift over `block` readings, `x` its bandwidth times the interval of a mean.
 
-    They are a first-order process beside white noise of a negative variance. Returns the process's variance and what
+    They are a first-order process with white noise of a negative variance. Returns the process's variance and what
     the white noise lacks, both over the drift's own (lib/DESIGN.md, "Block means of the drift"). Of a walk of step
     variance q per interval the white noise lacks (1 - 1 / block^2) q / 6.
     """

@@ -92,7 +92,7 @@ class RegressorTable:
 
     `source`: kind, number and second number (`selfcal_source_t`), and the channel's name and unit, "" without one.
     `ln_odds` [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]:
-    none is 0."""
+    empty for 0."""
 
     name: str
     unit: str
@@ -159,7 +159,7 @@ class Tables:
 
     @property
     def channels(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of what the regressors take beside the readings of these axes."""
+        """Name and unit of what the regressors take apart from the readings of these axes."""
         axes = {(axis.name, axis.unit) for axis in self.axes}
         taken = dict.fromkeys(column.source[3:] for column in self.regressors if column.source[3])
         return tuple(channel for channel in taken if channel not in axes)

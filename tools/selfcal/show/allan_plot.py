@@ -30,7 +30,7 @@ def figure_of(document: Mapping[str, Any], *, datasheet: bool = False) -> Any:
     Black: the overlapping Allan deviation of the recording's samples with its 90 % interval, of its bank's means where
     the answer was not made for a picture. In blue: the most
     probable law at its medians, the band of its posterior (5 to 95 %), and, pale, where the recording may lie.
-    Averaging times outside are red. Raises UserError where there is none.
+    Averaging times outside are red. Raises UserError for an answer without an Allan deviation.
     """
     pyplot = plotter()
     from matplotlib.lines import Line2D

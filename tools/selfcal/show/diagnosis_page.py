@@ -29,7 +29,7 @@ from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outsi
 from selfcal.show.findings import before_after, noisier_of
 from selfcal.show.template import number, render, spaced
 
-#: Bytes of the line in place of a picture.
+#: Length of the line in place of a picture, bytes.
 LINE = 140
 #: Name of the Allan figure, and the share of its points outside the band from which on the curve leaves it. Each point
 #: of a fitting record is outside the range of 20 with a probability of 2/21, neighbours together: 1 of 400 fitting

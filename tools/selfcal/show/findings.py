@@ -18,7 +18,7 @@ from selfcal.base.output import console_of, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
 
-#: Characters of a line without a terminal.
+#: Width of a line without a terminal, characters.
 WIDTH = 114
 
 

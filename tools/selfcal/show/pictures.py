@@ -22,7 +22,7 @@ from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope
 
-#: Simulated records of a band.
+#: Number of simulated records of a band.
 RECORDS = 20
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60

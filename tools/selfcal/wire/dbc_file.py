@@ -28,7 +28,7 @@ HYPOTHESES, COLUMNS = MOST_HYPOTHESES, MOST_COLUMNS
 PLACE_NAMES = ("N", "p1", "p2")
 #: Signal of an axis's judgement whose words are those of every `reason_gx` to `reason_az`, too.
 REASON = "reason"
-#: Letters of a name in a DBC file, at most.
+#: Most letters of a name in a DBC file.
 LONGEST = 32
 
 

@@ -703,7 +703,7 @@ class Streams:
         return Statistics(**total)
 
 
-#: Bytes of a serial line without an end that are kept: a frame's line has 22.
+#: Most bytes of a serial line without an end that are kept: a frame's line has 22.
 LINE_MAX = 4096
 
 
