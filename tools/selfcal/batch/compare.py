@@ -159,8 +159,6 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         before, after = (row.side(name, "-") for name in ("before", "after"))
         quantity = row.change["quantity"].replace("_", " ")
         table.add_row(row.axes, quantity, before, after, row.unit, distance, printable(logs))
-    if not console.is_terminal:
-        console.width = max(console.width, 140)
     if rows:
         console.print(table)
     errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}

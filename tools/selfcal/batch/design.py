@@ -99,15 +99,13 @@ def designed(
         {key: value for key, value in truth.items() if key in model.laws[law].parameters}
         for law, truth in (part_of(model, axis, seed) for seed in seeds)
     ]
-    most = {each_wish.parameter: each_wish.most for each_wish in wishes}
+    most = {wish.parameter: wish.most for wish in wishes}
 
     def lacks(bit_s: float, samples: int) -> bool:
         """Whether fewer than SHARE of the parts have it."""
         u = experiment.input(bit_s, samples, dt)
         each = [halves(experiment, truth, u, dt) for truth in parts]
-        return any(
-            float(np.quantile([each_wish[key] for each_wish in each], SHARE)) > wish for key, wish in most.items()
-        )
+        return any(float(np.quantile([part[key] for part in each], SHARE)) > wish for key, wish in most.items())
 
     def length(bit_s: float) -> int | None:
         """Samples of the record."""
@@ -121,7 +119,7 @@ def designed(
             low, high = (middle, high) if lacks(bit_s, middle) else (low, middle)
         return high
 
-    bits = [max(each_wish * experiment.lag_s, 2.0 * dt) for each_wish in (0.5, 1.0, 2.0, 4.0)]
+    bits = [max(times * experiment.lag_s, 2.0 * dt) for times in (0.5, 1.0, 2.0, 4.0)]
     reached = {bit_s: samples for bit_s in bits if (samples := length(bit_s)) is not None}
     if not reached:
         return {"bit_s": None, "duration_s": None}
