@@ -69,7 +69,7 @@ class Terms:
         return np.asarray(total)
 
     def allan_variance(self, m: _Floats) -> _Floats:
-        """At `m` readings."""
+        """Allan variance at `m` readings."""
         return np.asarray((3.0 * self.sums(0.0 * m) - 4.0 * self.sums(m) + self.sums(2.0 * m)) / m**2)
 
     def covariance(self, m: int, lags: int) -> _Floats:
@@ -78,7 +78,7 @@ class Terms:
         weights = {0: 6.0, m: -4.0, -m: -4.0, 2 * m: 1.0, -2 * m: 1.0}
         nearby = sum(weight * self.sums(near + shift) for shift, weight in weights.items()) / m**2
         far = np.zeros(lags - near.size)
-        for variance, alpha in self.markov:  # farther than 2 m the others have none
+        for variance, alpha in self.markov:  # farther than 2 m the other terms have no covariance
             j = np.arange(near.size, lags, dtype=float)
             scale = variance * np.exp(-alpha) / np.expm1(-alpha) ** 2 * np.expm1(-alpha * m) ** 4 / m**2
             far -= (scale * np.exp(-alpha * (j - 2 * m))).real
@@ -121,8 +121,8 @@ def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int 
 
 
 def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
-    """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading, and which ones
-    those are [n - 2 m + 1]. NaN without any."""
+    """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading; and which
+    windows these are [n - 2 m + 1]. NaN without a window."""
     missing = np.isnan(y)
     total = np.concatenate([[0.0], np.cumsum(np.where(missing, 0.0, y))])
     absent = np.concatenate([[0], np.cumsum(missing)])
@@ -161,7 +161,7 @@ class Fit:
 
     @property
     def variance(self) -> _Floats:
-        """Of the curve's logarithm [t], as the estimate has it."""
+        """Variance of the curve's logarithm [t] by the estimate."""
         return np.asarray(np.einsum("dt,de,et->t", self.jacobian, self.covariance, self.jacobian))
 
 

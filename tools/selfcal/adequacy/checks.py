@@ -58,7 +58,7 @@ def judge(
     others: Sequence[str] = (),
     used: Sequence[int] = (),
 ) -> Judged:
-    """What in the record speaks against the most probable law, with the columns `used`. `others`: the recording's
+    """Evidence in the record against the most probable law, with the columns `used`. `others`: the recording's
     columns that may act on the axis. Without a recording nothing is held against the drift."""
     from selfcal.adequacy.drift_checks import drift_checks
 

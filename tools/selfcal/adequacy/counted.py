@@ -53,7 +53,7 @@ def weigh_counted(
     share = (most / N) ** 2 / tables.dt_s  # Q^2 / (N^2 dt): the share of N that it may be
     if not share > MATTERS / math.sqrt(2.0 * result.n):
         return None
-    # That N holds both: N^2 = n^2 + 2 Q^2 / dt, and n may be much less.
+    # This N holds both: N^2 = n^2 + 2 Q^2 / dt, and n may be much less.
     least = max(RATIO_LIMITS[0], 1.0 / math.sqrt(1.0 + 4.0 * share / max(1.0 - 2.0 * share / WIDER**2, 0.01)))
     prior = {"spectral_ratio": Prior("log_uniform", least, 1.0)}
     odds = SURE_ODDS * len(tables.hypotheses) if lattice.carried else 1.0

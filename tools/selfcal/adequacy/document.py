@@ -68,7 +68,7 @@ class Telemetry:
 
 
 def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
-    """What a document says of its recording."""
+    """The entry of a recording in a document."""
     return {
         "path": str(recording.path),
         "rate_hz": recording.rate_hz,
@@ -84,8 +84,8 @@ def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
 
 
 def _of_file(recording: Recording) -> dict[str, Any]:
-    """What could not be read of it. The device's serial number and the date, where the metadata have them. The date
-    also by stamps since 1970."""
+    """Damage of the file; the device's serial number and the date, where the metadata have them. The date also by
+    stamps since 1970."""
     damaged = recording.damaged
     entry: dict[str, Any] = {}
     if damaged:

@@ -1,4 +1,4 @@
-"""One axis of a recording by one engine: the posterior of every law, and what speaks against the likeliest."""
+"""One axis of a recording by one engine: the posterior of every law, and the evidence against the likeliest."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def identify_axis(
 
 @dataclass(frozen=True)
 class _Fed:
-    """What an engine gets of an axis: its `samples` [n] less `offset` and `columns` [n, p] of the `regressors`, both as
+    """Input of an engine for an axis: its `samples` [n] less `offset` and `columns` [n, p] of the `regressors`, both as
     float32; and the `blocks` of the bank. `recording`: of the rows that `readings` have."""
 
     recording: Recording
@@ -163,7 +163,7 @@ def _fed(recording: Recording, name: str, model: Model, decimate: float | None) 
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
     values, offset = readings.working, 0.0
     if readings.clipped is not None or readings.coarse > SPACING_LEAST:
-        # What takes the place of clipped readings may lie beyond the range, and so may readings less an offset.
+        # Substitutes of clipped readings may lie beyond the range, and so may readings less an offset.
         beyond = np.abs(values) >= (group.range if readings.clipped is None and group.range > 0.0 else np.inf)
         values = np.where(beyond, np.nan, values)
         group = replace(group, range=0.0)

@@ -30,8 +30,8 @@ from selfcal.readings.lattice import step_of
 from selfcal.readings.readings import ROUNDED, Readings, look
 from selfcal.readings.rest import rest_of
 
-#: What a data sheet may state of a group or an axis, and what it states of the part. `density` is one-sided, as data
-#: sheets have it; an angle or velocity random walk is N.
+#: Keys of a data sheet for a group or an axis, and for the part. `density` is one-sided, as data sheets have
+#: it; an angle or velocity random walk is N.
 STATED, OF_PART = ("N", "density", "K", "B", "bias", "range", "lsb"), ("rate",)
 #: Kinds of axes by a unit of each: their group's name, and its unit where the recording does not decide it.
 KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "degC": "temperature", "V": "voltage"}
@@ -242,7 +242,7 @@ def _unit_of(key: str, unit: str) -> str:
 
 
 def _put(group: dict[str, Any], number: Stated, axis: str, measured: bool) -> None:
-    """One number into a group's tree, of one `axis` of it where that is not "". `measured`: a recording laid N."""
+    """Put a number into a group's tree, for its `axis` alone where that is not "". `measured`: a recording laid N."""
     value = number.value * factor(number.unit, _unit_of(number.key, group["unit"]))
     if number.key in ("range", "lsb"):
         if axis:
@@ -357,7 +357,7 @@ def as_text(tree: Mapping[str, Any], recording: Recording | None, said: Sequence
 
 
 def show(model: Model) -> None:
-    """What was written, on stdout."""
+    """Print the groups of the file that was written."""
     print(f"{model.path}: model '{model.name}', {model.sensor_rate_hz:g} Hz")
     for group in model.groups:
         N = group.priors["N"]

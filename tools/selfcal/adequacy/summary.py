@@ -164,7 +164,7 @@ def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
 
 
 def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, float | None]:
-    """Of each parameter of the likeliest law that the record leaves open: the further rest that halves its interval, s.
+    """Further rest that halves the interval of each parameter that the record leaves open under the likeliest law, s.
 
     By the Fisher information at the medians, with the priors. An open interval is wider than this information says,
     and falls faster with the rest: the geometric mean of both variances is taken for that of now. The median over
@@ -198,7 +198,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
 
 
 def _walk(draws: Mapping[str, _Floats]) -> _Floats:
-    """K of each draw; 0 of a law that has no walk and is like none."""
+    """K of each draw; 0 of a law without a walk and without a drift that is like one."""
     if "K" in draws:
         return draws["K"]
     if "sigma_m" in draws and "alpha" in draws:
@@ -207,7 +207,7 @@ def _walk(draws: Mapping[str, _Floats]) -> _Floats:
 
 
 def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
-    """Q of each draw; 0 of a law whose noise has no memory, or one of the other sign."""
+    """Q of each draw; 0 of a law whose noise has no memory, or a memory of the other sign."""
     if COLOURED not in draws:
         return np.zeros(draws["N"].size)
     over = np.maximum(draws[COLOURED] ** -2.0 - 1.0, 0.0)

@@ -178,7 +178,7 @@ def _posterior(
 
 
 def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Floats, _Floats]:
-    """What the drift some time on takes of each state now [m, states], and the variance that it gains until then [m],
+    """Weight of each state now in the drift some time on [m, states], and the variance that it gains until then [m],
     at the drift and second parameters [m]."""
     taken: list[_Floats] = []
     gained = np.zeros(drift.size)

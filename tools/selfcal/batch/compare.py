@@ -56,9 +56,9 @@ def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict
 
 
 def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What can change: N, K and B with all findings in the model, the other parameters of the likeliest law, the bias,
-    the coefficients of the model file's regressors, and each cause found with its sizes. A cause is `small` where it
-    changes no number by as much as matters. Without a model of the findings the parameters are those of `identify`."""
+    """Quantities that can change: N, K and B with all findings in the model, the other parameters of the likeliest law,
+    the bias, the coefficients of the model file's regressors, and each cause found with its sizes. A cause is `small`
+    where it changes no number by as much as matters. Without a model of the findings, parameters are of `identify`."""
     sizes: dict[str, Mapping[str, Any]] = {}
     known = diagnosed.get("posterior") or identified
     if "hypotheses" in known:
@@ -100,8 +100,8 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
 
 
 def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What is in one recording alone and matters there, and what changed beyond the limit, a row each. A number that
-    one of the recordings does not identify counts by its interval, and the row has what it lies below."""
+    """Findings of one recording alone that matter there, and changes beyond the limit, a row each. A number that one of
+    the recordings does not identify counts by its interval, and the row has its upper limit."""
     rows: list[dict[str, Any]] = []
     for key in sorted(before.keys() | after.keys()):
         a, b = before.get(key), after.get(key)
@@ -146,7 +146,7 @@ def compared_of(
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """One line a change, the largest first, then what each recording shows that matters."""
+    """Print a line a change, the largest first, then the findings of each recording that matter."""
     from selfcal.show.comparison_page import told_of
 
     console = console_of(to_stderr=to_stderr)

@@ -91,7 +91,7 @@ def _within_any(path: Path, own: Sequence[Path]) -> bool:
 
 
 def _no_file(path: Path) -> str:
-    """What is neither file nor folder; empty for these."""
+    """Kind of a path that is neither file nor folder; empty for these."""
     if not path.exists():
         return "a link to nothing"
     return "" if path.is_file() or path.is_dir() else "a pipe or a device"

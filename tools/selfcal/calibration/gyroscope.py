@@ -85,7 +85,7 @@ def turned(rate: Array, dt: float) -> tuple[Array, Array]:
 
 
 def fault_of(accel: Accelerometer) -> str:
-    """What the turns say is wrong with signs, axes or units of the gyros; "" for nothing. Gravity's direction u moves
+    """Faults of signs, axes or units of the gyros by the turns; "" without a fault. Gravity's direction u moves
     by u x w, which is linear in the rates: M [3, 3] of w = M y needs no start. An axis of few turns is not judged."""
     rests, moves, angles, middles = accel.tumble.rests, [], [], []
     for turn in (turn for turn in accel.tumble.turns if not turn.reason):
@@ -152,7 +152,7 @@ def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
 
 @dataclass(frozen=True)
 class _Directions:
-    """Of the rests: directions `u` [n, 3], forces `f` [n, 3] in g, and the derivatives of `u` to the accelerometers'
+    """Rests: directions `u` [n, 3], forces `f` [n, 3] in g, and the derivatives of `u` to the accelerometers'
     parameters [n, 3, k] and to their readings [n, 3, 3]. `matrix`: T K of the accelerometers."""
 
     u: Array

@@ -123,7 +123,7 @@ def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
 
 
 def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise | None:
-    """What `identify` finds of an axis in a long rest, in `unit`; None where it has no answer."""
+    """The noise of an axis by `identify` of a long rest, in `unit`; None where it has no answer."""
     try:
         identified = identify_axis(recording, axis, model, "library", None)
     except UserError:

@@ -115,8 +115,7 @@ class Tumble:
         return fit(problem_of(weighed), start, mean, prior, held), weighed
 
     def _pieces(self, names: Sequence[str]) -> Iterator[tuple[int, Array, Array]]:
-        """Of each rest and axis the number of the rest, its pieces [PIECES], and their covariance but for what they
-        share."""
+        """Number, pieces [PIECES] and their covariance, less their common part, of each rest and axis."""
         for k, name in enumerate(ACCEL + GYRO):
             for n, rest in enumerate(self.rests if name in names else ()):
                 edges = np.linspace(rest.begin_s, rest.end_s, PIECES + 1)

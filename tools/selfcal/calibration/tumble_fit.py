@@ -34,9 +34,9 @@ FREE_LEAST = 0.5
 class Fit:
     """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
     `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
-    makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step` [n]:
-    to the least sum of squares by these derivatives, which takes `gain` off it. `outside`: places of parameters of the
-    surroundings, whose prior is no part's."""
+    scales them: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step`
+    [n]: to the least sum of squares by these derivatives, which takes `gain` off it. `outside`: places of parameters of
+    the surroundings, whose prior is no part's."""
 
     theta: Array
     covariance: Array
@@ -94,8 +94,8 @@ class Fit:
         return math.sqrt(float(self.white @ self.white) / self.free) if self.free > FREE_LEAST else math.nan
 
     def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
-        """Of causes, each in words and by its columns [m, k] of the residuals, those that explain more than chance, the
-        surest first; with their probability by chance, corrected for the number of causes."""
+        """Causes that explain more than chance, each in words and by its columns [m, k] of the residuals, the surest
+        first; with their probability by chance, corrected for the number of causes."""
         if not math.isfinite(self.excess):
             return []
         more = solve_triangular(self.root, np.hstack([columns for _, columns in tried]), lower=True)

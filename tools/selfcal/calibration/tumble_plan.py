@@ -40,7 +40,7 @@ LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
 #: sd of each of two angles by which a hand places the part off, rad; number of placements that are drawn; share of
 #: them that have what is planned.
 PLACED, DRAWN, SHARE = math.radians(3.0), 10, 0.9
-#: What may be wished: the sensor, the unit here, and where the sensor's parameters are.
+#: Quantities of a wish: the sensor, the unit here, and the places of the sensor's parameters.
 WISHES = {
     "accelerometer bias": ("accelerometer", "m/s^2", accelerometer.BIAS),
     "scale": ("accelerometer", "ppm", accelerometer.SCALE),

@@ -39,7 +39,7 @@ COLUMN_KINDS = (
 KIND = {name: number for number, name in enumerate(COLUMN_KINDS)}
 #: Kind, channel, number and second number of a column: `selfcal_source_t`.
 Source = tuple[int, int, float, float]
-#: What of the channel acts: its value, or the variance of its noise.
+#: Inputs: the value of the channel, or the variance of its noise.
 INPUTS = ("value", "variance")
 
 
@@ -59,7 +59,7 @@ def made(
 
 
 def source_of(form: str, channel: int, number: float, about: float, mean_s: float) -> Source:
-    """What the library makes of a form: `selfcal_source_t`. A play's is the channel: the library has none."""
+    """`selfcal_source_t` of a form. A play has the channel's: the library has no play."""
     if form == "lag":
         return KIND["LAG"], channel, number, mean_s
     if form == "rate":
@@ -103,7 +103,7 @@ def slope(values: Array, window_s: float, interval_s: float) -> Array:
 
 
 def played(values: Array, width: float) -> Array:
-    """What follows at half of `width` at most, and moves only if it must."""
+    """Follower of `values` at half of `width` at most, which moves only if it must."""
     out = np.empty(values.size)
     position, half = float(values[0]), 0.5 * width
     for i, value in enumerate(values.tolist()):

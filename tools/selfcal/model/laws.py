@@ -74,7 +74,7 @@ class Law:
 
     @property
     def read(self) -> tuple[float, ...]:
-        """What a reading takes of each state of the drift: an oscillation has a second one, of which it takes none."""
+        """Weight of each state of the drift in a reading: 0 of the second state of an oscillation."""
         return tuple(share for t in self.terms for share in ((1.0, 0.0) if t.kind == "oscillation" else (1.0,)))
 
     @property
@@ -115,7 +115,7 @@ class Law:
 
     @staticmethod
     def bandwidth(term: Term) -> float:
-        """As lib/selfcal_tables.h has it: 0 of a walk."""
+        """Bandwidth of a term in lib/selfcal_tables.h: 0 of a walk."""
         return 0.0 if term.kind == "walk" else term.bandwidth
 
     def node(self, parameters: Mapping[str, float]) -> tuple[float, float]:
@@ -161,7 +161,7 @@ def swing(period_s: float, damping: float, time_s: float) -> NDArray[np.float64]
 
 
 def lost_of(x: float, block: int) -> float:
-    """What lost readings add to the white noise of a mean of `block` readings, beyond its share, over r - 1.
+    """White noise that lost readings add to a mean of `block` readings, beyond its share, over r - 1.
 
     r is the block over the readings left, and `x` is as in averaged(). The number is relative to the variance of the
     first-order process; at x = 0, of a walk, to its step variance. No more of the drift's rest is missing, and the

@@ -35,7 +35,7 @@ class PriorLaw(IntEnum):
     LOG_NORMAL = 2
 
     def __repr__(self) -> str:
-        """As when there were two: a model's checksum stays."""
+        """The text of the first checksums, which knew two laws: a model's checksum stays."""
         return ("False", "True", "log_normal")[self]
 
 

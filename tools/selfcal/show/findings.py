@@ -25,7 +25,7 @@ WIDTH = 114
 def show(
     document: Mapping[str, Any], *, to_stderr: bool = False, details: bool = False, console: Console | None = None
 ) -> None:
-    """What a person reads first. `details`: each finding of each axis, with its evidence and gain, below."""
+    """Print the events and the numbers. `details`: each finding of each axis, with its evidence and gain, below."""
     recording, findings = document["recording"], document["findings"]
     if console is None:
         console = console_of(to_stderr=to_stderr)

@@ -126,7 +126,7 @@ def _figure(item: Compared, pairs: _Pairs) -> Figure:
 
 
 def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> Compared | Figure:
-    """The picture of the statistic that shows it."""
+    """The picture of the statistic that shows the finding."""
     name, state = finding.look.shown_by, finding.before
     if "allan" in name:
         return _allan(state, state, factor, unit)

@@ -59,7 +59,7 @@ def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence
 
 
 def of_report(report: AxisReport, model: Model) -> Known:
-    """What a module's report says of its axis: a column is in use where that is the likelier."""
+    """The state of an axis by a module's report: a column is in use where that is the likelier."""
     stated = report.coefficients(names_of(model))
     sent = [
         stated.get(column, (0.0, 0.0, 0.0)) for regressor in offered(model, report.axis) for column in regressor.columns

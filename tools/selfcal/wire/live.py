@@ -469,7 +469,7 @@ def counted(s: Statistics) -> str:
 
 
 def frame_counts(streams: Streams | Decoder, source: Source) -> str:
-    """One line that says what became of all frames."""
+    """A line on the fate of all frames."""
     return f"{counted(streams.statistics)}, {source.malformed} malformed"
 
 
