@@ -14,13 +14,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from selfcal import _library32
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank import reference
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
-from selfcal.model.file import MOST_COLUMNS, Model
+from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN
 from selfcal.model.tables import make_tables
 from selfcal.verbs.codegen import codegen
@@ -53,10 +52,6 @@ def test_parity_with_the_textbook_bank(count: int, n: int, gaps: bool) -> None:
     records = [a_record(law, n, 0, gaps=gaps, columns=count) for law in PLAIN]
     builds = ("double", "float", "fixed")
     hold(f"p={count} n={n} gaps={gaps}", [compare(y, tables, z, builds=builds, masks=masks) for y, z in records])
-
-
-def test_the_model_allows_what_the_library_holds() -> None:
-    assert MOST_COLUMNS == _library32.REGRESSORS_MAX
 
 
 # ----------------------------------------------------------------------------------------------------------- reports

@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 import yaml
 
-from selfcal import _library32
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank import reference
 from selfcal.bank.blocks import block_means, kept_out
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
-from selfcal.model.file import NODES, Model, Prior
+from selfcal.model.file import Model, Prior
 from selfcal.model.laws import PLAIN
 from selfcal.model.tables import make_tables
 from selfcal.show.identification import show
@@ -266,10 +265,6 @@ def test_equal_readings_are_said(tmp_path: Path) -> None:
     save(log, {"gx": ("deg/s", np.full(500, 0.3))}, 1.0, {})
     with pytest.raises(UserError, match=r"all \d+ averages are equal .*samples kept out: none"):
         identify(log)
-
-
-def test_the_model_allows_what_the_library_holds() -> None:
-    assert NODES[1] == _library32.GRID_MAX
 
 
 def test_a_model_states_the_priors_of_its_laws_alone(tmp_path: Path) -> None:

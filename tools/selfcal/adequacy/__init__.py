@@ -1,1 +1,1 @@
-"""What in a record speaks against a law, and the answer of `identify`."""
+"""Evidence in a record against a law, and the answer of `identify`."""

@@ -1,14 +1,13 @@
 """The Allan deviation of a record and of the laws: closed forms, and how far apart the two may be.
 
 Every law is a sum of terms: white noise, a random walk, Gauss-Markov drifts. With X the sum of the readings of a term,
-one even function G tells all that is needed here: for weights that remove a line, the covariance of two weighted sums
+one even function G suffices here: for weights that remove a line, the covariance of two weighted sums
 of X is the sum of the weights times G at the distance between them. At m readings apart
 
     u_k = (X_(k+2m) - 2 X_(k+m) + X_k) / m,     Allan variance = E[u^2] / 2,     and Cov(u_k, u_(k+j)) follow from G.
 
-Readings are the bank's: means over blocks of samples, at whose instants the drift is a point. Of readings that are no
-means a random walk's Allan variance is K^2 tau / 3 (1 + 1 / (2 m^2)), of means over many samples the continuous one,
-K^2 tau / 3.
+Readings are the bank's: means over blocks of samples, at whose instants the drift is a point. A random walk's Allan
+variance is K^2 tau / 3 (1 + 1 / (2 m^2)) of single readings, and K^2 tau / 3 of means over many samples.
 """
 
 from __future__ import annotations
@@ -29,20 +28,19 @@ from selfcal.model.laws import Law, averaged, named
 
 _Floats = NDArray[np.float64]
 
-#: A record is this many times as long as the longest averaging time: fewer windows say little.
+#: Least length of a record over its longest averaging time: fewer windows say little.
 LONGEST = 5
 #: Step in the ln of a parameter for derivatives.
 _STEP = 1e-3
 #: Correlation times after which a Gauss-Markov drift is forgotten.
 _FORGOTTEN = 14.0
-#: Where the record's Allan variance and the model's are nearly one number, S - V is the small difference of two: at
-#: least this part of S is left.
+#: Least share of S that S - V keeps (curve_of): nearly equal numbers have a small difference.
 _LEAST_LEFT = 0.2
-#: Posterior draws of the band.
+#: Number of posterior draws of the band.
 _DRAWS = 200
-#: Averaging times of a curve.
+#: Averaging times of a curve in an octave.
 _PER_OCTAVE = 4
-#: Stretches without a gap, the longest ones, that the deviation of a recording's samples is made from.
+#: Most stretches without a gap that the deviation of a recording's samples is made from: the longest ones.
 _MOST_STRETCHES = 200
 
 
@@ -62,37 +60,37 @@ class Terms:
     def sums(self, j: _Floats) -> _Floats:
         """G at the distances `j`, whole or not."""
         j = np.abs(j)
-        found = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
+        total = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
         if self.lag1:
-            found = found - self.variance * self.lag1 * np.maximum(j, 1.0)
+            total = total - self.variance * self.lag1 * np.maximum(j, 1.0)
         for variance, alpha in self.markov:
             phi, left = np.exp(-alpha), -np.expm1(-alpha)
-            found = found - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
-        return np.asarray(found)
+            total = total - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
+        return np.asarray(total)
 
     def allan_variance(self, m: _Floats) -> _Floats:
-        """At `m` readings."""
+        """Allan variance at `m` readings."""
         return np.asarray((3.0 * self.sums(0.0 * m) - 4.0 * self.sums(m) + self.sums(2.0 * m)) / m**2)
 
     def covariance(self, m: int, lags: int) -> _Floats:
         """Cov(u_k, u_(k+j)) for j = 0 to `lags` - 1."""
         near = np.arange(min(lags, 2 * m + 2), dtype=float)
         weights = {0: 6.0, m: -4.0, -m: -4.0, 2 * m: 1.0, -2 * m: 1.0}
-        found = sum(weight * self.sums(near + shift) for shift, weight in weights.items()) / m**2
+        nearby = sum(weight * self.sums(near + shift) for shift, weight in weights.items()) / m**2
         far = np.zeros(lags - near.size)
-        for variance, alpha in self.markov:  # farther than 2 m the others have none
+        for variance, alpha in self.markov:  # farther than 2 m the other terms have no covariance
             j = np.arange(near.size, lags, dtype=float)
             scale = variance * np.exp(-alpha) / np.expm1(-alpha) ** 2 * np.expm1(-alpha * m) ** 4 / m**2
             far -= (scale * np.exp(-alpha * (j - 2 * m))).real
-        return np.concatenate([found, far])
+        return np.concatenate([nearby, far])
 
     def spectrum(self, omega: _Floats) -> _Floats:
         """Power of the readings at `omega` rad a reading; white noise of variance 1 has 1."""
         step = 4.0 * np.sin(0.5 * omega) ** 2  # |1 - e^(i omega)|^2
-        found = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
+        power = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
         for variance, alpha in self.markov:
-            found = found - (variance * np.expm1(-2.0 * alpha) / (np.expm1(-alpha) ** 2 + np.exp(-alpha) * step)).real
-        return np.asarray(found)
+            power = power - (variance * np.expm1(-2.0 * alpha) / (np.expm1(-alpha) ** 2 + np.exp(-alpha) * step)).real
+        return np.asarray(power)
 
 
 def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
@@ -123,8 +121,8 @@ def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int 
 
 
 def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
-    """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading, and which ones
-    those are [n - 2 m + 1]. NaN without any."""
+    """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading; and which
+    windows these are [n - 2 m + 1]. NaN without a window."""
     missing = np.isnan(y)
     total = np.concatenate([[0.0], np.cumsum(np.where(missing, 0.0, y))])
     absent = np.concatenate([[0], np.cumsum(missing)])
@@ -163,7 +161,7 @@ class Fit:
 
     @property
     def variance(self) -> _Floats:
-        """Of the curve's logarithm [t], as the estimate has it."""
+        """Variance of the curve's logarithm [t] by the estimate."""
         return np.asarray(np.einsum("dt,de,et->t", self.jacobian, self.covariance, self.jacobian))
 
 
@@ -172,18 +170,19 @@ def _around(
 ) -> tuple[Callable[[_Floats], Terms], list[tuple[Terms, Terms]]]:
     """The terms at given ln parameters, and those a step to either side of `ln_estimate` in each."""
 
-    def at(ln_theta: _Floats) -> Terms:
+    def terms_at(ln_theta: _Floats) -> Terms:
         theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
         terms = terms_of(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
-    return at, [(at(ln_estimate + step), at(ln_estimate - step)) for step in np.eye(ln_estimate.size) * _STEP]
+    steps = np.eye(ln_estimate.size) * _STEP
+    return terms_at, [(terms_at(ln_estimate + step), terms_at(ln_estimate - step)) for step in steps]
 
 
 def information_of(
     of: Law, parameters: Mapping[str, float], dt_s: float, n: float, white: float = 1.0, block: int = 1
 ) -> _Floats:
-    """What `n` readings every `dt_s` say of ln of each parameter, [d, d].
+    """Information [d, d] of `n` readings every `dt_s` on ln of each parameter.
 
     Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum."""
     ln_estimate = np.log([parameters[name] for name in of.parameters])
@@ -204,16 +203,16 @@ def fit_of(
     white: float = 1.0,
     block: int = 1,
 ) -> Fit:
-    """The curve at `parameters` that `n` readings have determined, beside the group's priors. `white` multiplies the
+    """The curve at `parameters` that `n` readings have determined, with the group's priors. `white` multiplies the
     white noise's variance. A reading is the mean of `block` samples."""
     of = group.laws[law]
     ln_estimate = np.log([parameters[name] for name in of.parameters])
     information = information_of(of, parameters, dt_s, n, white, block)
     prior = [group.priors[name].ln_sd ** -2 for name in of.parameters]
-    at, sides = _around(of, ln_estimate, dt_s, white, block)
+    terms_at, sides = _around(of, ln_estimate, dt_s, white, block)
     jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * _STEP)
     covariance = np.linalg.inv(information + np.diag(prior))
-    terms = at(ln_estimate)
+    terms = terms_at(ln_estimate)
     return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.asarray(covariance, np.float64))
 
 
@@ -234,14 +233,14 @@ def deviations(ratio: float, variance: float) -> float:
 
 
 def ratio_at(deviations: float, variance: float) -> float:
-    """The ratio that is so many standard deviations above 1, 0 where there is none."""
+    """Ratio at so many standard deviations from 1, at least 0."""
     ninth = variance / 9.0
     return max(0.0, 1.0 - ninth + deviations * math.sqrt(ninth)) ** 3
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Allan deviation of a record of bank readings beside a law's that was identified from it, at `tau_s` [t], s.
+    """Allan deviation of a record of bank readings, and of a law that was identified from it, at `tau_s` [t], s.
 
     `recording` [t] with its `freedom`, the equivalent degrees of freedom of its square under the law; `model` [t] at
     the posterior medians with the limits `model_q05` and `model_q95` [t]; `octave` [t] says which are octaves of two
@@ -275,9 +274,9 @@ def curve_of(
     half_life_s: float = 0.0,
     block: int = 1,
 ) -> Curve | None:
-    """Readings `y` every `dt_s` (NaN: missing), means of `block` samples, beside `law` at its posterior medians.
+    """Readings `y` every `dt_s` (NaN: missing), means of `block` samples, compared with `law` at its posterior medians.
 
-    None if there are too few.
+    None if there are too few readings.
 
     The record has also determined the parameters, so the two are nearer to each other than a record is to a curve known
     beforehand. With a the logarithm of the record's Allan variance, S its variance about the true curve, and V the
@@ -286,21 +285,21 @@ def curve_of(
     """
     # With forgetting the posterior rests on the last readings. Its sums, weighted by e^(-age / w), have the variance of
     # 2 w readings and 1 - e^-2 of their weight on the last 2 w: Var = S + V - 2 (1 - e^-2) V.
-    memory, known = math.ceil(2.0 * half_life_s / math.log(2.0) / dt_s), 1.0
+    memory, shared = math.ceil(2.0 * half_life_s / math.log(2.0) / dt_s), 1.0
     if 0 < memory < y.size:
-        y, known = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
+        y, shared = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
     n = int(np.isfinite(y).sum())
     if n < 2 * LONGEST:
         return None
     y = y - float(np.nanmean(y))
-    found = [(int(m), *overlapping(y, int(m))) for m in lengths(n, _PER_OCTAVE)]
-    found = [entry for entry in found if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
-    m = np.array([entry[0] for entry in found], float)
-    recorded = np.array([entry[1] for entry in found])
+    rows = [(int(m), *overlapping(y, int(m))) for m in lengths(n, _PER_OCTAVE)]
+    rows = [entry for entry in rows if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
+    m = np.array([entry[0] for entry in rows], float)
+    recorded = np.array([entry[1] for entry in rows])
     medians = {name: estimate.median for name, estimate in estimates.items()}
     fit = fit_of(law, medians, group, dt_s, n, m, white, block)
-    own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in found])
-    left = np.maximum(own - known * fit.variance, _LEAST_LEFT * own)
+    own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in rows])
+    left = np.maximum(own - shared * fit.variance, _LEAST_LEFT * own)
     ratio = recorded / fit.allan_variance
     low, high = _band(law, estimates, fit, group, dt_s, m, white, block)
     return Curve(
@@ -389,12 +388,12 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     total, terms = np.zeros(m.size), np.zeros(m.size)
     for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):
         stretch = values[start:stop] - values[start:stop].mean()
-        for at in np.flatnonzero(2 * m < stretch.size).tolist():
-            variance, windows = overlapping(stretch, int(m[at]))
-            total[at] += windows.size * variance
-            terms[at] += windows.size
-    known = np.flatnonzero((terms >= m) & (total > 0.0))
-    m, deviation = m[known], np.sqrt(total[known] / terms[known])
+        for k in np.flatnonzero(2 * m < stretch.size).tolist():
+            variance, windows = overlapping(stretch, int(m[k]))
+            total[k] += windows.size * variance
+            terms[k] += windows.size
+    kept = np.flatnonzero((terms >= m) & (total > 0.0))
+    m, deviation = m[kept], np.sqrt(total[kept] / terms[kept])
     slope = np.gradient(np.log(deviation), np.log(m)) if m.size > 1 else np.full(m.size, -0.5)
     powers = np.clip(np.rint(2.0 * slope), -1.0, 1.0)
     half = np.array([0.5 * freedom_of(power, length, n) for power, length in zip(powers, m.tolist(), strict=True)])

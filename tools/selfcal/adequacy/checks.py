@@ -21,29 +21,29 @@ from selfcal.model.tables import Tables
 from selfcal.readings.readings import CLOCK_LEAST, Readings
 from selfcal.readings.tests import TESTS
 
-#: A check fails beyond this many standard deviations of its statistic: a false alarm in 16 000 checks.
+#: Largest deviation of a check's statistic that passes, sd: a false alarm in 16 000 checks.
 CHECK_LIMIT = 4.0
-#: A part that is not from the batch, sd of `batch_check`: by chance one law's two parameters in 1000 parts.
+#: Largest distance of a part from its batch that passes, sd: one law's two parameters exceed it in 1 of 1000 parts.
 BATCH_LIMIT = 3.5
-#: A law of the batch has this prior probability at least.
+#: Least prior probability of a law of the batch.
 BATCH_LAW = 0.1
-#: Of the prior's variance, what a record that shows nothing leaves to compare by.
+#: Least share of the prior's variance by which a record and the prior are compared.
 LEFT_LEAST = 0.1
-#: Bank samples without which there are no checks.
+#: Fewest bank samples that are checked.
 FEWEST = 20
-#: Share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at 0.9,
-#: where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
+#: Largest share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at
+#: 0.9, where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84
-#: Times of a filter's corner in an average that shows the white noise before it: N of a first-order filter to 5 %.
+#: Length of an average over a filter's time constant: it shows N before a first-order filter to 5 %.
 CORNERS = 10.0
-#: Spacing of float32 in the noise of a reading from which on it makes N too large: by 0.4 %.
+#: Largest spacing of float32 in the noise of a reading: beyond it N is 0.4 % too large.
 SPACING_MOST = 0.3
 
 
 @dataclass(frozen=True)
 class Judged:
     """A record against its most probable law, at its posterior medians: the `checks` of adequacy, and the `curve` of
-    its Allan deviation, None where the record is too short, or too long, to tell."""
+    its Allan deviation, None where the record is too short, or too long."""
 
     checks: Mapping[str, Mapping[str, Any]]
     curve: Curve | None
@@ -58,7 +58,7 @@ def judge(
     others: Sequence[str] = (),
     used: Sequence[int] = (),
 ) -> Judged:
-    """What in the record speaks against the most probable law, with the columns `used`. `others`: the recording's
+    """Evidence in the record against the most probable law, with the columns `used`. `others`: the recording's
     columns that may act on the axis. Without a recording nothing is held against the drift."""
     from selfcal.adequacy.drift_checks import drift_checks
 
@@ -83,7 +83,7 @@ def judge(
         block=tables.block,
     )
     checks = drift_check(tables, group, result)
-    if all(one["passed"] for one in checks.values()):  # else the others would show the same
+    if all(check["passed"] for check in checks.values()):  # else the others would show the same
         checks |= batch_check(tables, group, result) | innovation_checks(blocks, tables, group, result, list(used))
         checks |= allan_checks(curve) if curve else {}
     checks |= {} if recording is None else drift_checks(left, tables, result, recording, others)
@@ -95,8 +95,8 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     `value` is the share of the white noise at high frequency that it hides. Nothing where no readings are averaged."""
     if tables.block == 1:
         return {}
-    at = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
-    terms = terms_of(group.laws[result.best], at, tables.dt_s, tables.block)
+    medians = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
+    terms = terms_of(group.laws[result.best], medians, tables.dt_s, tables.block)
     share = terms.lacking / (terms.variance * (1.0 - 2.0 * terms.lag1))
     return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
 
@@ -123,17 +123,17 @@ def with_rate(
         pairs = int(np.isfinite(differences).sum())
         return float(np.nansum(differences**2)) / max(1, pairs) - step**2 / 6.0
 
-    one, two = square(np.diff(values)[near]), square((values[2:] - values[:-2])[near[1:] & near[:-1]])
-    white, walk = one - 0.5 * two, two - one
+    over_one, over_two = square(np.diff(values)[near]), square((values[2:] - values[:-2])[near[1:] & near[:-1]])
+    white, walk = over_one - 0.5 * over_two, over_two - over_one
     rate_hz = tables.block / tables.dt_s
-    told = {"bank_hz": 1.0 / tables.dt_s}
+    rates = {"bank_hz": 1.0 / tables.dt_s}
     alpha = result.parameters[result.best].get("alpha")
     if white > walk:
         alike_hz = rate_hz * math.sqrt(max(walk, 0.0) / white)
-        told["decimate_hz"] = float(f"{min(rate_hz, max(2.0 / tables.dt_s, alike_hz)):.2g}")
+        rates["decimate_hz"] = float(f"{min(rate_hz, max(2.0 / tables.dt_s, alike_hz)):.2g}")
     elif alpha is not None and values.size * alpha.median > FEWEST * CORNERS * rate_hz:
-        told["decimate_hz"] = float(f"{alpha.median / CORNERS:.2g}")
-    return replace(judged, checks={**judged.checks, "drift_in_average": {**judged.checks["drift_in_average"], **told}})
+        rates["decimate_hz"] = float(f"{alpha.median / CORNERS:.2g}")
+    return replace(judged, checks={**judged.checks, "drift_in_average": {**judged.checks["drift_in_average"], **rates}})
 
 
 def batch_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, dict[str, Any]]:
@@ -144,10 +144,12 @@ def batch_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     laws of the batch the least. Nothing where no law that is likely a priori has a log-normal prior of its drift.
     """
     distances = []
-    for one in tables.hypotheses:
-        priors = {name: group.priors[name] for name in one.law.parameters if group.priors[name].law == "log_normal"}
-        if priors.keys() - {"N"} and one.ln_probability >= math.log(BATCH_LAW):
-            distances.append(max(_distance(result.parameters[one.name][name], prior) for name, prior in priors.items()))
+    for hypothesis in tables.hypotheses:
+        own = {name: group.priors[name] for name in hypothesis.law.parameters}
+        priors = {name: prior for name, prior in own.items() if prior.law == "log_normal"}
+        if priors.keys() - {"N"} and hypothesis.ln_probability >= math.log(BATCH_LAW):
+            estimates = result.parameters[hypothesis.name]
+            distances.append(max(_distance(estimates[name], prior) for name, prior in priors.items()))
     if not distances:
         return {}
     value = min(distances)
@@ -179,11 +181,11 @@ def with_readings(
     """
     factor = units.factor(group.unit, unit)
     checks: dict[str, dict[str, Any]] = {}
-    found = readings.lattice
-    if found is not None:
-        told = {"value": found.coarseness, "limit": found.most, "passed": not found.too_coarse_over(dt_s)}
-        white = {"counter_hz": found.white_hz} if found.carried and not told["passed"] else {}
-        checks["lattice"] = {**told, "step": found.step * factor, "distinct": found.distinct, **white}
+    lattice = readings.lattice
+    if lattice is not None:
+        outcome = {"value": lattice.coarseness, "limit": lattice.most, "passed": not lattice.too_coarse_over(dt_s)}
+        white = {"counter_hz": lattice.white_hz} if lattice.carried and not outcome["passed"] else {}
+        checks["lattice"] = {**outcome, "step": lattice.step * factor, "distinct": lattice.distinct, **white}
     start_s = readings.recording.start_s
     more: dict[str, Callable[[], dict[str, Any]]] = {
         "misread": lambda: {"kind": readings.misread and readings.misread.kind},
@@ -197,11 +199,11 @@ def with_readings(
     }
     for test in TESTS:
         if test.statistic(readings) > 0.0:
-            told = {"value": float(np.mean(test.mask(readings))), "limit": 0.0, "passed": False}
-            checks[test.name] = {**told, **more.get(test.name, dict)()}
+            outcome = {"value": float(np.mean(test.mask(readings))), "limit": 0.0, "passed": False}
+            checks[test.name] = {**outcome, **more.get(test.name, dict)()}
     if as_fed:
         if readings.changes:
-            ratio = max((one.after_hz / one.before_hz - 1.0 for one in readings.changes), key=abs)
+            ratio = max((change.after_hz / change.before_hz - 1.0 for change in readings.changes), key=abs)
             checks["rate_change"] = {"value": ratio, "limit": CLOCK_LEAST, "passed": False}
         if readings.coarse > SPACING_MOST:
             checks["float_spacing"] = {"value": readings.coarse, "limit": SPACING_MOST, "passed": False}
@@ -211,11 +213,11 @@ def with_readings(
 def against(checks: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     """The checks that speak against the model, the surest first: each with its distance in standard deviations.
     Infinite where a check has none."""
-    failed = {name: one for name, one in checks.items() if not one["passed"]}
-    sure = {
-        name: abs(one.get("deviations", CHECK_LIMIT * one["value"] / one["limit"] if one["limit"] > 0.0 else math.inf))
-        for name, one in failed.items()
-    }
+    sure = {}
+    for name, check in checks.items():
+        if not check["passed"]:
+            alone = CHECK_LIMIT * check["value"] / check["limit"] if check["limit"] > 0.0 else math.inf
+            sure[name] = abs(check.get("deviations", alone))
     return dict(sorted(sure.items(), key=lambda item: -item[1]))
 
 
@@ -260,7 +262,7 @@ def innovation_checks(
     from selfcal import _reference
 
     law = group.laws[result.best]
-    at = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
+    medians = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
     offset = float(np.nanmean(blocks.mean))
     z = blocks.z - np.array([column.reference for column in tables.regressors])
     sd = np.array([column.coefficient_sd[0] for column in tables.regressors])
@@ -270,8 +272,8 @@ def innovation_checks(
         -offset,
         group.priors["bias"].sd,
         law.as_tuple,
-        *law.node(at),
-        at["N"] / math.sqrt(tables.dt_s),
+        *law.node(medians),
+        medians["N"] / math.sqrt(tables.dt_s),
         blocks.r,
         np.ascontiguousarray(z[:, used]) if used else None,
         sd[used] if used else None,

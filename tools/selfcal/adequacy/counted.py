@@ -1,7 +1,7 @@
 """Quantization noise that the lattice of the readings makes possible: N of a data sheet is marginal over its size.
 
 Increments of a counter have remainders that are carried on: Q is the increment over sqrt(12) then, where they are white
-(lattice.py). Readings of any other lattice may be increments: then Q is that at most. White noise beside quantization
+(lattice.py). Readings of any other lattice may be increments: then Q is that at most. White noise with quantization
 noise is the law `moving_average` (diagnosis/causes/quantization_noise.py).
 """
 
@@ -21,21 +21,21 @@ from selfcal.model.tables import Tables
 from selfcal.readings.lattice import Lattice
 
 COUNTED = "moving_average"
-#: Q may be so many times that of the lattice: remainders that are nearly white have a little more of it.
+#: Largest Q over the lattice's own: remainders that are nearly white have a little more.
 WIDER = 1.25
-#: Odds over an average law that increments which are carried on have the law; others have it as an average law.
+#: Prior odds of the law over an average law where increments are carried on; elsewhere 1.
 SURE_ODDS = 100.0
-#: Standard deviations of N by which such noise must be able to change it.
+#: Least change of N by such noise that is weighed, sd of N.
 MATTERS = 0.5
 
 
-def most_of(found: Lattice, rate_hz: float) -> float:
+def most_of(lattice: Lattice, rate_hz: float) -> float:
     """Q of increments of the lattice's step: the step's white remainders."""
-    return found.step / (rate_hz * math.sqrt(12.0))
+    return lattice.step / (rate_hz * math.sqrt(12.0))
 
 
 def weigh_counted(
-    found: Lattice | None,
+    lattice: Lattice | None,
     result: AxisResult,
     tables: Tables,
     group: Group,
@@ -45,16 +45,16 @@ def weigh_counted(
     mask: int = 0,
     offset: float = 0.0,
 ) -> Beside | None:
-    """White noise beside quantization noise on the readings of the one axis of `tables`, where its lattice makes that
+    """White noise with quantization noise on the readings of the one axis of `tables`, where its lattice makes that
     possible and N would change. None elsewhere, and where the remainders are not white."""
-    if found is None or found.too_coarse_over(tables.dt_s):
+    if lattice is None or lattice.too_coarse_over(tables.dt_s):
         return None
-    N, most = result.parameters[result.best]["N"].median, WIDER * most_of(found, tables.rate_hz)
+    N, most = result.parameters[result.best]["N"].median, WIDER * most_of(lattice, tables.rate_hz)
     share = (most / N) ** 2 / tables.dt_s  # Q^2 / (N^2 dt): the share of N that it may be
     if not share > MATTERS / math.sqrt(2.0 * result.n):
         return None
-    # That N holds both: N^2 = n^2 + 2 Q^2 / dt, and n may be much less.
+    # This N holds both: N^2 = n^2 + 2 Q^2 / dt, and n may be much less.
     least = max(RATIO_LIMITS[0], 1.0 / math.sqrt(1.0 + 4.0 * share / max(1.0 - 2.0 * share / WIDER**2, 0.01)))
     prior = {"spectral_ratio": Prior("log_uniform", least, 1.0)}
-    odds = SURE_ODDS * len(tables.hypotheses) if found.carried else 1.0
+    odds = SURE_ODDS * len(tables.hypotheses) if lattice.carried else 1.0
     return weigh_law(COUNTED, prior, odds, tables, group, samples, missing_before, columns, mask, offset)

@@ -21,7 +21,7 @@ from selfcal.base.output import write_json
 from selfcal.logs.recording import Recording
 
 SCHEMA = "selfcal.identify/1"
-#: Where metadata have the device's serial number and the date.
+#: Keys of metadata with the device's serial number and the date.
 SERIALS, DATES = ("serial", "serial_number"), ("recorded_at", "date")
 #: Stamps between 2001 and 2100 count from 1970, s; no device is powered for so long.
 EPOCH_S = (1e9, 4.1e9)
@@ -68,7 +68,7 @@ class Telemetry:
 
 
 def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
-    """What a document says of its recording."""
+    """The entry of a recording in a document."""
     return {
         "path": str(recording.path),
         "rate_hz": recording.rate_hz,
@@ -77,27 +77,27 @@ def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
         "start_s": recording.start_s,
         "since_power_on_s": recording.since_power_on_s,
         **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
-        **({"options": [list(one) for one in recording.options]} if recording.options else {}),
+        **({"options": [list(option) for option in recording.options]} if recording.options else {}),
         **({"notes": list(recording.notes)} if recording.notes else {}),
         **(_of_file(recording) if isinstance(recording, Recording) else {}),
     }
 
 
 def _of_file(recording: Recording) -> dict[str, Any]:
-    """What could not be read of it. The device's serial number and the date, where the metadata have them. The date
-    also by stamps since 1970."""
+    """Damage of the file; the device's serial number and the date, where the metadata have them. The date also by
+    stamps since 1970."""
     damaged = recording.damaged
-    found: dict[str, Any] = {}
+    entry: dict[str, Any] = {}
     if damaged:
-        found["damaged"] = {"bytes": damaged.bytes, "messages": damaged.messages, "words": damaged.words}
+        entry["damaged"] = {"bytes": damaged.bytes, "messages": damaged.messages, "words": damaged.words}
     for key, names in (("serial", SERIALS), ("recorded_at", DATES)):
         stated = [recording.meta[name] for name in names if isinstance(recording.meta.get(name), str | int)]
         if stated and str(stated[0]).strip():
-            found[key] = short(str(stated[0]).strip())
+            entry[key] = short(str(stated[0]).strip())
     began = recording.started_s
-    if "recorded_at" not in found and began is not None and EPOCH_S[0] < began < EPOCH_S[1]:
-        found["recorded_at"] = datetime.fromtimestamp(math.floor(began), UTC).isoformat().replace("+00:00", "Z")
-    return found
+    if "recorded_at" not in entry and began is not None and EPOCH_S[0] < began < EPOCH_S[1]:
+        entry["recorded_at"] = datetime.fromtimestamp(math.floor(began), UTC).isoformat().replace("+00:00", "Z")
+    return entry
 
 
 def as_typed(recording: Mapping[str, Any]) -> str:
@@ -108,7 +108,7 @@ def as_typed(recording: Mapping[str, Any]) -> str:
 
 def to_document(
     recording: Recording | Telemetry,
-    found: Mapping[str, Identified | UserError],
+    axes: Mapping[str, Identified | UserError],
     *,
     all_failed: Path | str | None = None,
 ) -> dict[str, Any]:
@@ -116,10 +116,10 @@ def to_document(
     if no axis has a result; the reasons are then written to `all_failed`."""
     reasons = {
         name: str(axis).removeprefix(f"{recording.path}: ")
-        for name, axis in found.items()
+        for name, axis in axes.items()
         if isinstance(axis, UserError)
     }
-    if len(reasons) == len(found):
+    if len(reasons) == len(axes):
         columns: dict[str, list[str]] = {}
         for name, reason in reasons.items():
             columns.setdefault(reason, []).append(name)
@@ -151,7 +151,7 @@ def to_document(
                 **({"halved_after_s": dict(axis.halved_after)} if axis.halved_after else {}),
                 **({"more_laws": dict(axis.more_laws)} if axis.more_laws else {}),
             }
-            for name, axis in found.items()
+            for name, axis in axes.items()
         },
     }
 
@@ -186,13 +186,13 @@ def parameters_entry(axis: Identified) -> dict[str, Any]:
 
 def _summary(axis: Identified) -> dict[str, Any] | None:
     """The numbers of a data sheet, in the recording's units and in data sheets' own; None where they are not known."""
-    found: dict[str, Any] = {}
+    entries: dict[str, Any] = {}
     for key, number in axis.summary.items():
         unit, sheet = units.parameter_unit(key, axis.unit), units.datasheet_unit(key, axis.unit)
         own = number.estimate.scaled(units.factor(axis.group_unit, axis.unit))
-        found[key] = {**_spread(own), "unit": unit, "identified": own.identified, "reason": number.reason or None}
-        found[key]["datasheet"] = {**_spread(own.scaled(units.factor(unit, sheet))), "unit": sheet}
-    return found or None
+        entries[key] = {**_spread(own), "unit": unit, "identified": own.identified, "reason": number.reason or None}
+        entries[key]["datasheet"] = {**_spread(own.scaled(units.factor(unit, sheet))), "unit": sheet}
+    return entries or None
 
 
 def _spread(e: Estimate) -> dict[str, float]:
@@ -206,7 +206,7 @@ def _allan(axis: Identified) -> dict[str, Any] | None:
     if curve is None:
         return None
     factor, limit = units.factor(axis.group_unit, axis.unit), allan_limit(curve)
-    found: dict[str, Any] = {
+    entry: dict[str, Any] = {
         "unit": axis.unit,
         "tau_s": curve.tau_s.tolist(),
         "recording": (curve.recording * factor).tolist(),
@@ -218,13 +218,13 @@ def _allan(axis: Identified) -> dict[str, Any] | None:
         "adequate_to": (curve.within(limit) * factor).tolist(),
     }
     if sampled is not None:
-        found["samples"] = {
+        entry["samples"] = {
             "tau_s": sampled.tau_s.tolist(),
             "deviation": (sampled.deviation * factor).tolist(),
             "q05": (sampled.q05 * factor).tolist(),
             "q95": (sampled.q95 * factor).tolist(),
         }
-    return found
+    return entry
 
 
 def regressors_entry(scored: Scored | None) -> dict[str, Any]:
@@ -242,9 +242,9 @@ def regressors_entry(scored: Scored | None) -> dict[str, Any]:
             }
             for name, inclusion in scored.inclusion.items()
         },
-        "regressors_in_use": [one.name for one in scored.choices[scored.best]],
+        "regressors_in_use": [regressor.name for regressor in scored.choices[scored.best]],
         "subsets": [
-            {"regressors": [one.name for one in choice], "probability": probability}
+            {"regressors": [regressor.name for regressor in choice], "probability": probability}
             for choice, probability in zip(scored.choices, scored.probability, strict=True)
         ],
     }

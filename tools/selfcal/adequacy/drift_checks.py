@@ -1,6 +1,6 @@
 """Checks of the drift: does the law take another axis, a side channel, a jump, or settling after power-on for drift?
 
-A walk follows nearly anything slow, so its innovations hide the cause. Each candidate is a column beside the bias, and
+A walk follows nearly anything slow, so its innovations hide the cause. Each candidate is a column next to the bias, and
 the engine of the diagnosis (likelihood/columns.py) weighs it on a bounded grid.
 """
 
@@ -27,12 +27,12 @@ from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables
 
-#: A check fails from this worth on, nats: as seldom as one at four standard deviations (checks.py), searches counted.
+#: Largest worth of a column that passes, nats: as rare as CHECK_LIMIT standard deviations, searches counted.
 LEAST = 9.67
-#: Drifts whose sizes are over e to these, and nats by which a smaller one must be the likelier one beside a column:
-#: noise that axes share is no drift.
+#: Sizes of the drift that are tried with a column, as ln of a divisor; and least gain of a smaller size, nats: noise
+#: that axes share is no drift.
 SIZES, CLEARLY = (0.0, 0.7, *SMALLER), 3.0
-#: Means that are looked at, at least: fewer show no drift.
+#: Fewest means that are looked at: fewer show no drift.
 FEWEST = 60
 #: Smoothing, lags and the window of a rate, s: a channel's own noise hides its slow change.
 SMOOTH_S, LAGS_S, RATE_S = 20.0, (5.0, 30.0, 120.0, 600.0), 60.0
@@ -48,7 +48,7 @@ def drift_checks(
     recording. Nothing where the record is too short, and where the likeliest law is no simple one: then the simple ones
     leave a drift that any column may take."""
     likeliest = max(result.probability, key=lambda law: result.probability[law])
-    simple = any(not one.law.is_sum and one.name == likeliest for one in tables.hypotheses)
+    simple = any(not hypothesis.law.is_sum and hypothesis.name == likeliest for hypothesis in tables.hypotheses)
     state, cells = _state(blocks, tables)
     if np.isfinite(state.y).sum() < FEWEST or not simple:
         return {}
@@ -73,22 +73,22 @@ def drift_checks(
 
 
 def _check(
-    state: State, shapes: Sequence[Shape], told: Callable[[Shape], dict[str, Any]], *, drift: bool = True
+    state: State, shapes: Sequence[Shape], stated: Callable[[Shape], dict[str, Any]], *, drift: bool = True
 ) -> dict[str, Any]:
-    """The best of some shapes: what it is worth net of the search, and what is `told` of it. It is worth nothing if it
-    explains no `drift`: one must be clearly likelier than none, and beside it a smaller one."""
-    found = columns.tried(state, shapes, slow=True).values()
-    best = max(found, key=lambda one: one.net, default=None)
+    """The best of some shapes: what it is worth net of the search, and what is `stated` of it. It is worth nothing if
+    it explains no `drift`: a drift must be clearly likelier than none, and with the shape a smaller one."""
+    trials = columns.tried(state, shapes, slow=True).values()
+    best = max(trials, key=lambda trial: trial.net, default=None)
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)
     if worth > LEAST and drift:
         full, *smaller = (
-            max(float(state.scores([shape.columns], one.shrunk(by))[0]) for one in state.fits) for by in SIZES
+            max(float(state.scores([shape.columns], fit.shrunk(by))[0]) for fit in state.fits) for by in SIZES
         )
         none = finish(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
         drifts = state.best.ln_likelihood > none.ln_likelihood + CLEARLY
         worth = worth if drifts and max(smaller) > full + CLEARLY else 0.0
     passed = {"value": worth, "limit": LEAST, "passed": worth <= LEAST, "deviations": math.sqrt(2.0 * worth)}
-    return {**passed, **told(shape)}
+    return {**passed, **stated(shape)}
 
 
 def _shape(label: str, values: Array, looks: int, **stated: Any) -> Shape:
@@ -107,15 +107,15 @@ def _state(blocks: Blocks, tables: Tables) -> tuple[State, int]:
 def _channels(state: State, begin: int, block: int, recording: Recording, others: Sequence[str]) -> Iterator[Shape]:
     """Each recorded channel in its forms."""
     sides = {column for column, _ in SIDE_CHANNELS.values()}
-    found = [
+    tried = [
         (column, form, values)
         for column in others
         for form, values in _forms(
             _means(recording.columns[column].values, recording, begin, block, state.y.size), state, column in sides
         )
     ]
-    for k, (column, form, values) in enumerate(found):
-        yield _shape(f"{k}", values, len(found), column=column, form=form)
+    for k, (column, form, values) in enumerate(tried):
+        yield _shape(f"{k}", values, len(tried), column=column, form=form)
 
 
 def _forms(means: Array, state: State, side: bool) -> Iterator[tuple[str, Array]]:

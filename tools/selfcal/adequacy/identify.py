@@ -1,4 +1,4 @@
-"""One axis of a recording by one engine: the posterior of every law, and what speaks against the likeliest."""
+"""One axis of a recording by one engine: the posterior of every law, and the evidence against the likeliest."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from selfcal.readings.gate import gated
 from selfcal.readings.readings import Readings, copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
 
-#: Spacing of float32 in the noise of a reading from which on a nominal offset is taken off before.
+#: Largest spacing of float32 in the noise of a reading that is fed without taking a nominal offset off.
 SPACING_LEAST = 0.01
 
 
@@ -38,12 +38,12 @@ def stretch_of(recording: Recording, model: Model, start_s: float | None, end_s:
     return gated(stretch, model) if gate else stretch
 
 
-def with_reasons(found: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
+def with_reasons(axes: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
     """Give the axes outside the priors their reason: one for all of them."""
-    outside = [name for name, axis in found.items() if isinstance(axis, OutsidePriors)]
+    outside = [name for name, axis in axes.items() if isinstance(axis, OutsidePriors)]
     if outside:
         reason = UserError(outside_priors(recording, model, outside))
-        found.update(dict.fromkeys(outside, reason))
+        axes.update(dict.fromkeys(outside, reason))
 
 
 def chosen_axes(recording: Recording, model: Model, wanted: Sequence[str]) -> tuple[str, ...]:
@@ -72,7 +72,7 @@ def identify_axis(
     draw: bool = False,
 ) -> Identified:
     """One axis by one engine. The record is fed as float32, as the firmware gets it; less a nominal offset where that
-    is too coarse. Readings that are none are left out (`readings.py`). With regressors every subset of them is scored;
+    is too coarse. Wrong readings are left out (`readings.py`). With regressors every subset of them is scored;
     `advance` is called after each. `draw`: with the Allan deviation of the samples."""
     recording = recording.along(name)
     fed = _fed(recording, name, model, decimate)
@@ -81,16 +81,16 @@ def identify_axis(
     else:
         results = _by_library(fed, engine == "fixed", advance)
     group, tables, readings = fed.group, fed.tables, fed.readings
-    unit, at = recording.columns[name].unit, (tables.dt_s, fed.blocks.mean.size, tables.block)
-    told = [in_unit(with_white(result, group, *at), group.unit, unit) for result in results]
-    best, inside, scored, known = 0, results[0], None, told[0]
+    unit, means = recording.columns[name].unit, (tables.dt_s, fed.blocks.mean.size, tables.block)
+    converted = [in_unit(with_white(result, group, *means), group.unit, unit) for result in results]
+    best, inside, scored, answer = 0, results[0], None, converted[0]
     if fed.regressors:
         if not any(math.isfinite(value) for result in results for value in result.log_evidence.values()):
             raise OutsidePriors
         combined = combine(fed.choices, results, model.hypotheses, group.unit)
         best, inside = combined.best, combined.result
-        scored = combine(fed.choices, told, model.hypotheses, unit)
-        known = scored.result
+        scored = combine(fed.choices, converted, model.hypotheses, unit)
+        answer = scored.result
     result, mask = results[best], mask_of(fed.regressors, fed.choices[best])
     used = _used(mask)
     others = may_act(model, fed.recording, name)
@@ -103,24 +103,24 @@ def identify_axis(
     missing, columns = fed.recording.missing_before, fed.columns if fed.regressors else None
     again = tables, group, fed.samples, missing, columns, mask, fed.offset
     beside, counted = weigh(*again), weigh_counted(readings.lattice, result, *again)
-    more_laws = [one.laws(known.probability) for one in (beside, counted) if one is not None]
+    more_laws = [law.laws(answer.probability) for law in (beside, counted) if law is not None]
     return Identified(
         unit,
         group.unit,
-        known,
+        answer,
         judged,
         kept_out_of(fed.blocks, fed.recording, int(readings.moving.sum())),
         scored,
         fed.curve(explained) if draw else None,
-        summarize(inside, group, *at, beside, counted),
-        halved_after(inside, group, *at),
+        summarize(inside, group, *means, beside, counted),
+        halved_after(inside, group, *means),
         next(filter(None, more_laws), {}),
     )
 
 
 @dataclass(frozen=True)
 class _Fed:
-    """What an engine gets of an axis: its `samples` [n] less `offset` and `columns` [n, p] of the `regressors`, both as
+    """Input of an engine for an axis: its `samples` [n] less `offset` and `columns` [n, p] of the `regressors`, both as
     float32; and the `blocks` of the bank. `recording`: of the rows that `readings` have."""
 
     recording: Recording
@@ -146,16 +146,16 @@ class _Fed:
     def curve(self, explained: NDArray[np.float64] | float) -> Sampled:
         """The Allan deviation of the samples less what is `explained` [n] of them."""
         values = self.used
-        at = sample_lengths(int(np.isfinite(values).sum()), self.tables.block)
-        return sampled(values - explained, self.recording.missing_before, self.recording.rate_hz, at)
+        lengths = sample_lengths(int(np.isfinite(values).sum()), self.tables.block)
+        return sampled(values - explained, self.recording.missing_before, self.recording.rate_hz, lengths)
 
 
 def _fed(recording: Recording, name: str, model: Model, decimate: float | None) -> _Fed:
-    """The samples of an axis without readings that are none. Raises UserError where it has no result."""
+    """The samples of an axis without wrong readings. Raises UserError where it has no result."""
     group, regressors = model.group_of(name), offered(model, name)
     if most := mostly_beyond(recording.in_unit(name, group.unit), group):
         raise UserError(most)
-    before = [one for one in model.axes[: model.axes.index(name)] if one in recording.columns]
+    before = [axis for axis in model.axes[: model.axes.index(name)] if axis in recording.columns]
     if reason := copied(recording, name, before):
         raise UserError(reason)
     readings = look(recording, name, group)
@@ -163,7 +163,7 @@ def _fed(recording: Recording, name: str, model: Model, decimate: float | None) 
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
     values, offset = readings.working, 0.0
     if readings.clipped is not None or readings.coarse > SPACING_LEAST:
-        # What takes the place of clipped readings may lie beyond the range, and so may readings less an offset.
+        # Substitutes of clipped readings may lie beyond the range, and so may readings less an offset.
         beyond = np.abs(values) >= (group.range if readings.clipped is None and group.range > 0.0 else np.inf)
         values = np.where(beyond, np.nan, values)
         group = replace(group, range=0.0)
@@ -220,10 +220,10 @@ def _by_reference(fed: _Fed, model: Model, advance: Callable[[], object]) -> lis
 def may_act(model: Model, recording: Recording, name: str) -> list[str]:
     """The columns that may act on an axis: the side channels and the other axes, but for those that the model file has
     move together with it."""
-    known = {*model.axes, *(column for column, _ in SIDE_CHANNELS.values())} - {name}
+    candidates = {*model.axes, *(column for column, _ in SIDE_CHANNELS.values())} - {name}
     if model.hidden_input is not None and name in model.hidden_input.loadings:
-        known -= model.hidden_input.loadings.keys()
-    return [column for column in recording.columns if column in known]
+        candidates -= model.hidden_input.loadings.keys()
+    return [column for column in recording.columns if column in candidates]
 
 
 def kept_out_of(blocks: Blocks, recording: Recording, moved: int) -> dict[str, int]:

@@ -1,11 +1,11 @@
-"""1/f noise beside the laws of a model: how likely it is, its B, and the white noise beside it.
+"""1/f noise as a law next to the laws of a model: how likely it is, its B, and the white noise next to it.
 
 The law `flicker` has three terms, so 1/f noise above the fastest one looks white to it: its N is too large. White noise
-beside 1/f noise is what the law's spectrum has more than B^2 / (2 pi f) at a third of the bank's rate. There the two
+next to 1/f noise is what the law's spectrum has more than B^2 / (2 pi f) at a third of the bank's rate. There the two
 agree best on records of 10 minutes to 4 hours (tests/noise_coverage.py).
 
 The paper's laws put the Allan deviation's minimum of true 1/f noise 10 to 40 % too high. So the data sheet's numbers
-weigh the law `flicker` beside the model's laws.
+weigh the law `flicker` with the model's laws.
 """
 
 from __future__ import annotations
@@ -19,31 +19,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import LONGEST, fit_of, posterior_draws, terms_of
+from selfcal.bank.priors import MOST_INTERVALS
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError
-from selfcal.model.file import MOST_HYPOTHESES, Group, Prior
+from selfcal.model.file import ABOUT_N, MOST_HYPOTHESES, Group, Prior
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import HypothesisTable, Tables, make_grid, priors_of
 
 _Floats = NDArray[np.float64]
 
 FLICKER = "flicker"
-#: From this probability on the drift is 1/f noise. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
+#: Least probability of 1/f noise that is called sure. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
 #: root of a second, 5 reach 0.9 and none 0.97.
 SURE = 0.98
-#: Radians a bank interval at which the white noise is what the spectrum has beside 1/f noise.
+#: Frequency at which the white noise is the rest of the spectrum, radians a bank interval.
 _OMEGA = 2.0 * math.pi / 3.0
 #: Images of the bank's rate that count: more change the density by 1e-4.
 _IMAGES = 100
-#: Of the law's own white noise, the least part that is left.
+#: Least share of the law's own white noise that is left.
 _LEAST = 1e-3
-#: Nodes of rho and alpha, and bank intervals at most: longer records are averaged further.
-_NODES, _MOST = (24, 20), 20_000
-#: Limits of alpha times the bank's interval, as models/sums.yaml has them.
-_ALPHA = (2e-4, 0.2)
-#: A prior of sigma_m about a known batch is this much wider of B, either way.
+#: Nodes of rho and of alpha.
+_NODES = (24, 20)
+#: Factor by which B's limits are wider than those of a sigma_m about a known batch, either way.
 _WIDER = 10.0
-#: Draws of a posterior.
+#: Number of draws of a posterior.
 _DRAWS = 1024
 
 
@@ -57,28 +56,28 @@ def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
     whole = float((passed / image).sum())  # 1 / (2 pi f), f per interval
     law = NAMED[FLICKER]
     own = [
-        float(terms_of(law, {"N": 0.0, "B": 1.0, "alpha": one}, dt_s, block).spectrum(np.array(_OMEGA)))
-        for one in alpha.tolist()
+        float(terms_of(law, {"N": 0.0, "B": 1.0, "alpha": bandwidth}, dt_s, block).spectrum(np.array(_OMEGA)))
+        for bandwidth in alpha.tolist()
     ]
     return np.asarray(dt_s * (whole - np.array(own)))
 
 
 def white_of(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floats:
-    """N [k] beside 1/f noise of draws [k] of the parameters of the law `flicker`."""
+    """N [k] next to 1/f noise, of draws [k] of the parameters of the law `flicker`."""
     square = draws["N"] ** 2
     left = square - density_above(draws["alpha"], dt_s, block) * draws["B"] ** 2
     return np.asarray(np.sqrt(np.maximum(left, _LEAST**2 * square)))
 
 
 def beside_its_law(parameters: Mapping[str, float], dt_s: float, block: int) -> float:
-    """The law's N whose white noise is `parameters["N"]` beside 1/f noise: the inverse of white_of()."""
+    """The law's N whose white noise is `parameters["N"]` next to 1/f noise: the inverse of white_of()."""
     above = float(density_above(np.array([parameters["alpha"]]), dt_s, block)[0])
     return math.sqrt(max(parameters["N"] ** 2 + above * parameters["B"] ** 2, 0.0))
 
 
 def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> AxisResult:
-    """The same with N of the law `flicker` beside 1/f noise. The result as it is without that law, or where the record
-    is too short for it."""
+    """The same with N of the law `flicker` next to 1/f noise. The result is unchanged without that law, or where the
+    record is too short for it."""
     estimates = result.parameters.get(FLICKER, {})
     medians = {name: estimate.median for name, estimate in estimates.items()}
     if not estimates or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
@@ -87,14 +86,14 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
     draws = posterior_draws(estimates, fit.covariance, _DRAWS)
     white = white_of(draws, dt_s, block)
     low, middle, high = np.quantile(white, (0.05, 0.5, 0.95)).tolist()
-    known = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
-    own = Estimate(float(white.mean()), middle, float(white.std()), low, high, known, estimates["N"].off_grid)
+    identified = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
+    own = Estimate(float(white.mean()), middle, float(white.std()), low, high, identified, estimates["N"].off_grid)
     return replace(result, parameters={**result.parameters, FLICKER: {**estimates, "N": own}})
 
 
 @dataclass(frozen=True)
 class Beside:
-    """A `law` beside a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
+    """A `law` added to a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
     one every `dt_s`, under the priors of `group`."""
 
     probability: float
@@ -125,13 +124,13 @@ def weigh(
 
     `mask`: the columns in use. `offset`: see Bank. None where the tables have the law, no room for it, or no result.
     """
-    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * _MOST)))
+    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * MOST_INTERVALS)))
     tables = replace(tables, dt_s=times * tables.dt_s, block=times * tables.block)
     drift = group.priors["sigma_m"]
     wider = _WIDER if drift.law == "log_normal" else 1.0
     own = {
         "B": Prior("log_uniform", drift.min / wider, drift.max * wider),
-        "alpha": Prior("log_uniform", *(limit / tables.dt_s for limit in _ALPHA)),
+        "alpha": Prior("log_uniform", *(limit / tables.dt_s for limit in ABOUT_N["alpha"][:2])),
     }
     return weigh_law(FLICKER, own, 1.0, tables, group, samples, missing_before, columns, mask, offset)
 
@@ -152,20 +151,20 @@ def weigh_law(
     from selfcal.bank.library import Bank
 
     count = len(tables.hypotheses)
-    if count >= MOST_HYPOTHESES or any(one.name == name for one in tables.hypotheses):
+    if count >= MOST_HYPOTHESES or any(hypothesis.name == name for hypothesis in tables.hypotheses):
         return None
     law = NAMED[name]
     own = replace(group, priors={**group.priors, **priors}, laws={**group.laws, name: law})
     rho, alpha = map(make_grid, _NODES)
     one_more = HypothesisTable(name, law, math.log(odds / (count + odds)), rho, alpha, (priors_of(own, name),))
     share = math.log(count / (count + odds))
-    others = (replace(one, ln_probability=one.ln_probability + share) for one in tables.hypotheses)
+    others = (replace(hypothesis, ln_probability=hypothesis.ln_probability + share) for hypothesis in tables.hypotheses)
     bank = Bank(replace(tables, hypotheses=(*others, one_more)), offset=offset)
     bank.push(samples[:, None], missing_before, columns)
     try:
-        found = bank.report(0, mask)
+        result = bank.report(0, mask)
     except UserError:
         return None
-    if not math.isfinite(found.probability[name]):
+    if not math.isfinite(result.probability[name]):
         return None
-    return Beside(found.probability[name], found.parameters[name], own, tables.dt_s, found.n, tables.block, name)
+    return Beside(result.probability[name], result.parameters[name], own, tables.dt_s, result.n, tables.block, name)

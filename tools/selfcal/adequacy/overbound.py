@@ -21,8 +21,8 @@ _Floats = NDArray[np.float64]
 
 
 def upper_limit(deviation: _Floats, freedom: _Floats, level: float) -> _Floats:
-    """What the true Allan deviations [t] lie below with the probability `level`, each: measured `deviation` [t] with so
-    many degrees of `freedom` [t], its square distributed as chi-square over them."""
+    """Upper limits [t] of the true Allan deviations with the probability `level`, each: measured `deviation` [t] with
+    so many degrees of `freedom` [t], its square distributed as chi-square over them."""
     return np.asarray(deviation * np.sqrt(freedom / chdtri(freedom, level)))
 
 

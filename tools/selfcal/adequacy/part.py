@@ -18,6 +18,7 @@ import yaml
 from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
+from selfcal.adequacy.summary import NOISIER
 from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
 from selfcal.bank.result import in_unit
 from selfcal.base import units as unit_module
@@ -29,24 +30,18 @@ from selfcal.readings.lattice import step_of
 from selfcal.readings.readings import ROUNDED, Readings, look
 from selfcal.readings.rest import rest_of
 
-#: What a data sheet may state of a group or an axis, and what it states of the part. `density` is one-sided, as data
-#: sheets have it; an angle or velocity random walk is N.
+#: Keys of a data sheet for a group or an axis, and for the part. `density` is one-sided, as data sheets have
+#: it; an angle or velocity random walk is N.
 STATED, OF_PART = ("N", "density", "K", "B", "bias", "range", "lsb"), ("rate",)
 #: Kinds of axes by a unit of each: their group's name, and its unit where the recording does not decide it.
 KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "degC": "temperature", "V": "voltage"}
-#: A stated K or B has so many decades of prior, as the default model has of K.
+#: Width of the prior of a stated K or B, decades: as of K in the default model.
 DECADES_STATED = 3.0
-#: Axes of one group whose N differ by more have priors of their own.
+#: Largest ratio of an axis' N to its group's: beyond it the axis has priors of its own.
 ALIKE = 10.0
-#: A recording's N so many times off the data sheet's is told of.
-DIFFERENT = 2.0
-#: Equal readings in a row that are stuck, as the default model has it; none on a lattice coarser than the noise.
-STUCK = 1000
-#: The default model simulates at this rate, Hz, which a data sheet's part takes.
-SIMULATED_HZ = 10.0
-#: A recording is no faster than its sensor: its rate is above it by no more.
+#: Largest ratio of a recording's rate to its sensor's.
 FASTER = 1.01
-#: A bias prior of an axis of another kind is no narrower than so many times N.
+#: Least sd of the bias prior over N, of an axis of another kind, 1/sqrt(s).
 LEAST_BIAS = 1000.0
 
 
@@ -85,58 +80,58 @@ def parse(text: str) -> Stated:
 def groups(default: Mapping[str, Any], recording: Recording, axes: Sequence[str]) -> dict[str, Any]:
     """The trees of the groups that the recording's axes make: those of the default model where it has them, else one
     for each kind and unit, whose priors are laid later."""
-    found: dict[str, Any] = {}
-    for axis in (one for one in recording.columns if one in SENSORS or one in axes):
+    trees: dict[str, Any] = {}
+    for axis in (column for column in recording.columns if column in SENSORS or column in axes):
         unit = recording.columns[axis].unit
         home = next((name for name, group in default.items() if axis in group["axes"]), None)
         if home is not None:
             unit, name = default[home]["unit"], home
         else:
-            kind = next((kind for one, kind in KINDS.items() if unit_module.same_kind(unit, one)), axis)
+            kind = next((kind for example, kind in KINDS.items() if unit_module.same_kind(unit, example)), axis)
             name = kind if kind not in default else axis
-            unit = found.get(name, {"unit": unit})["unit"]
-        group = found.setdefault(name, copy.deepcopy(default[home or "gyro"]) | {"unit": unit, "axes": []})
+            unit = trees.get(name, {"unit": unit})["unit"]
+        group = trees.setdefault(name, copy.deepcopy(default[home or "gyro"]) | {"unit": unit, "axes": []})
         group["axes"].append(axis)
-    if not found:
+    if not trees:
         raise UserError(
             f"{recording.path}: no column is an axis ({', '.join(SENSORS)}); name yours with --axis "
             f"{next(iter(recording.columns))}"
         )
-    for group in found.values():
-        group |= {"range": 0.0, "lsb": 0.0, "stuck_limit": STUCK}
-    return found
+    for group in trees.values():
+        group |= {"range": 0.0, "lsb": 0.0}
+    return trees
 
 
 def of_recording(tree: dict[str, Any], recording: Recording) -> list[str]:
     """Put the rate, the read-out and the priors that a recording shows into `tree`; a line for each."""
     model = Model.of_tree(tree, recording.path)
     own = {axis: recording.along(axis) for axis in model.axes}
-    for axis, one in own.items():
-        rest = rest_of(one, [axis])
+    for axis, record in own.items():
+        rest = rest_of(record, [axis])
         if rest.moved:
             longest = f": --start {rest.longest[0]:.10g} --end {rest.longest[1]:.10g}" if rest.longest else ""
             raise UserError(f"{recording.path}: {axis} moved; take a stretch at rest{longest}")
-    readings = {axis: look(one, axis, model.group_of(axis)) for axis, one in own.items()}
+    readings = {axis: look(record, axis, model.group_of(axis)) for axis, record in own.items()}
     said = [read_out(tree, model, readings)]
     for group in model.groups:
-        seen = {axis: _seen(own[axis], axis, model) for axis in group.axes}
+        by_axis = {axis: _seen(own[axis], axis, model) for axis in group.axes}
         fields = tree["groups"][group.name]
-        typical = math.exp(float(np.mean([math.log(one.N) for one in seen.values()])))
-        level = max(seen.values(), key=lambda one: abs(one.level)).level
+        typical = math.exp(float(np.mean([math.log(seen.N) for seen in by_axis.values()])))
+        level = max(by_axis.values(), key=lambda seen: abs(seen.level)).level
         about_it = group
         if not any(axis in SENSORS for axis in group.axes):
             wide = rounded(max(LEVEL_SD * abs(level), LEAST_BIAS * typical))
             about_it = replace(group, priors={**group.priors, "bias": Prior("normal", sd=wide)})
-        widest = replace(max(seen.values(), key=lambda one: float(one.deviation.max())), level=level)
+        widest = replace(max(by_axis.values(), key=lambda seen: float(seen.deviation.max())), level=level)
         priors = about(about_it, _at(widest, typical))
         fields["priors"] = {key: prior_tree(prior) for key, prior in priors.items()}
-        listed = ", ".join(f"{axis} {one.N:.3g}" for axis, one in seen.items())
+        listed = ", ".join(f"{axis} {seen.N:.3g}" for axis, seen in by_axis.items())
         said.append(f"{group.name}: N about {listed} {parameter_unit('N', group.unit)} (Allan deviation)")
-        far = {axis: one for axis, one in seen.items() if not 1.0 / ALIKE < one.N / typical < ALIKE}
+        far = {axis: seen for axis, seen in by_axis.items() if not 1.0 / ALIKE < seen.N / typical < ALIKE}
         if far:
             fields["own_priors"] = {
-                axis: {key: prior_tree(prior) for key, prior in about(about_it, one).items() if prior != priors[key]}
-                for axis, one in far.items()
+                axis: {key: prior_tree(prior) for key, prior in about(about_it, seen).items() if prior != priors[key]}
+                for axis, seen in far.items()
             }
     return said
 
@@ -147,13 +142,13 @@ def _at(seen: Seen, N: float) -> Seen:
 
 
 def _seen(recording: Recording, axis: str, model: Model) -> Seen:
-    found = seen_of(recording, axis, model)
-    if found is None:
+    seen = seen_of(recording, axis, model)
+    if seen is None:
         raise UserError(
             f"{recording.path}: {axis} is too short for a part's noise, or all its readings are alike: record a minute "
             "and more at rest"
         )
-    return found
+    return seen
 
 
 def read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Readings], *, stated: bool = False) -> str:
@@ -162,7 +157,7 @@ def read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Readings
     `readings`: of the axes that are looked at. `stated`: a user states the model's read-out. Then an entry stays that
     the readings do not contradict: those of a log that averages its sensor do not show the sensor's.
     """
-    sensor, rate_hz = tree["sensor"], max(one.recording.rate_hz for one in readings.values())
+    sensor, rate_hz = tree["sensor"], max(axis.recording.rate_hz for axis in readings.values())
     averaged = stated and sensor["rate_hz"] > FASTER * rate_hz
     if not stated or rate_hz > FASTER * sensor["rate_hz"]:
         sensor |= {"rate_hz": float(f"{rate_hz:.6g}"), "filter_taps": 1}
@@ -174,14 +169,14 @@ def read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Readings
             fields |= {"range": 0.0, "lsb": 0.0}
         if not own:
             continue
-        steps = [step for one in own if (step := _step(one)) > 0.0]
+        steps = [step for axis in own if (step := _step(axis)) > 0.0]
         # Means of a lattice lie on a finer one, which may show or not.
         if not averaged or (steps and not _divides(min(steps), group.lsb)):
             fields["lsb"] = float(f"{min(steps, default=0.0):.6g}")
-        if not stated and any(one.lattice is not None and one.lattice.too_coarse for one in own):
+        if not stated and any(axis.lattice is not None and axis.lattice.too_coarse for axis in own):
             fields["stuck_limit"] = 0
-        limits = [abs(one.clipped.limit) for one in own if one.clipped is not None]
-        if limits and all(_inside(one, min(limits)) for one in own):
+        limits = [abs(axis.clipped.limit) for axis in own if axis.clipped is not None]
+        if limits and all(_inside(axis, min(limits)) for axis in own):
             fields["range"] = float(f"{min(limits):.6g}")
         lattice = f"lattice {fields['lsb']:.6g} {group.unit}" if fields.get("lsb") else "no lattice"
         reach = f"range {fields['range']:.6g} {group.unit}" if fields.get("range") else "no end of its range seen"
@@ -201,8 +196,8 @@ def _divides(step: float, lsb: float) -> bool:
 
 def _inside(readings: Readings, limit: float) -> bool:
     """Whether a range of both signs keeps no reading of an axis out; where it clips, its level alone counts."""
-    known = _known(readings)
-    largest = np.abs(known).max() if readings.clipped is None else abs(np.median(known))
+    values = _known(readings)
+    largest = np.abs(values).max() if readings.clipped is None else abs(np.median(values))
     return bool(largest <= limit * (1.0 + ROUNDED))
 
 
@@ -211,34 +206,34 @@ def _known(readings: Readings) -> NDArray[np.float64]:
 
 
 def of_sheet(tree: dict[str, Any], stated: Sequence[Stated], measured: bool) -> list[str]:
-    """Put the numbers of a data sheet into `tree`; a line for each. N goes first: the others are beside it."""
-    for one in sorted(stated, key=lambda one: (one.key != "N", bool(one.of))):
-        if one.key == "rate":
-            if one.of or not unit_module.same_kind(one.unit, "Hz"):
-                raise UserError(f"--datasheet {one.text}: the rate is one of the part, in Hz: rate=200Hz")
-            tree["sensor"]["rate_hz"] = one.value * factor(one.unit, "Hz")
+    """Put the numbers of a data sheet into `tree`; a line for each. N goes first: the others are laid about it."""
+    for number in sorted(stated, key=lambda number: (number.key != "N", bool(number.of))):
+        if number.key == "rate":
+            if number.of or not unit_module.same_kind(number.unit, "Hz"):
+                raise UserError(f"--datasheet {number.text}: the rate is one of the part, in Hz: rate=200Hz")
+            tree["sensor"]["rate_hz"] = number.value * factor(number.unit, "Hz")
             continue
-        fits = {name: group for name, group in tree["groups"].items() if _fits(one, group)}
-        meant = [name for name, group in fits.items() if one.of in ("", name) or one.of in group["axes"]]
+        fits = {name: group for name, group in tree["groups"].items() if _fits(number, group)}
+        meant = [name for name, group in fits.items() if number.of in ("", name) or number.of in group["axes"]]
         if not meant:
-            raise UserError(f"--datasheet {one.text}: {_not_meant(one, tree['groups'])}")
+            raise UserError(f"--datasheet {number.text}: {_not_meant(number, tree['groups'])}")
         for name in meant:
-            _put(tree["groups"][name], one, one.of if one.of != name else "", measured)
-    return [f"data sheet: {one.text}" for one in stated]
+            _put(tree["groups"][name], number, number.of if number.of != name else "", measured)
+    return [f"data sheet: {number.text}" for number in stated]
 
 
-def _fits(one: Stated, group: Mapping[str, Any]) -> bool:
+def _fits(number: Stated, group: Mapping[str, Any]) -> bool:
     """Whether its unit is one of this group's."""
-    return unit_module.same_kind(one.unit, _unit_of(one.key, group["unit"]))
+    return unit_module.same_kind(number.unit, _unit_of(number.key, group["unit"]))
 
 
-def _not_meant(one: Stated, groups: Mapping[str, Any]) -> str:
+def _not_meant(number: Stated, groups: Mapping[str, Any]) -> str:
     """Why a number goes nowhere."""
     names = [*groups, *(axis for group in groups.values() for axis in group["axes"])]
-    if one.of and one.of not in names:
-        return f"there is no group or axis '{short(one.of)}' (there are {', '.join(names)})"
-    wanted = ", ".join(dict.fromkeys(_unit_of(one.key, group["unit"]) for group in groups.values()))
-    return f"'{short(one.unit)}' is no unit of {one.key} here (as {wanted})"
+    if number.of and number.of not in names:
+        return f"there is no group or axis '{short(number.of)}' (there are {', '.join(names)})"
+    wanted = ", ".join(dict.fromkeys(_unit_of(number.key, group["unit"]) for group in groups.values()))
+    return f"'{short(number.unit)}' is no unit of {number.key} here (as {wanted})"
 
 
 def _unit_of(key: str, unit: str) -> str:
@@ -246,28 +241,28 @@ def _unit_of(key: str, unit: str) -> str:
     return unit if key in ("range", "lsb") else parameter_unit(key, unit)
 
 
-def _put(group: dict[str, Any], one: Stated, axis: str, measured: bool) -> None:
-    """One number into a group's tree, of one `axis` of it where that is not "". `measured`: a recording laid N."""
-    value = one.value * factor(one.unit, _unit_of(one.key, group["unit"]))
-    if one.key in ("range", "lsb"):
+def _put(group: dict[str, Any], number: Stated, axis: str, measured: bool) -> None:
+    """Put a number into a group's tree, for its `axis` alone where that is not "". `measured`: a recording laid N."""
+    value = number.value * factor(number.unit, _unit_of(number.key, group["unit"]))
+    if number.key in ("range", "lsb"):
         if axis:
-            raise UserError(f"--datasheet {one.text}: range and lsb are of a group: leave '{axis}.' out")
-        group[one.key] = float(f"{value:.6g}")
+            raise UserError(f"--datasheet {number.text}: range and lsb are of a group: leave '{axis}.' out")
+        group[number.key] = float(f"{value:.6g}")
         return
     held = group["priors"] if not axis else group.setdefault("own_priors", {}).setdefault(axis, {})
     before = {key: Prior(**prior) for key, prior in {**group["priors"], **held}.items()}
-    if one.key == "N":
+    if number.key == "N":
         N = _noise(group)
-        if measured and not 1.0 / DIFFERENT < value / N < DIFFERENT:
-            note(f"{one.text}: the recording has {N:.3g} {parameter_unit('N', group['unit'])}")
+        if measured and not 1.0 / NOISIER < value / N < NOISIER:
+            note(f"{number.text}: the recording has {N:.3g} {parameter_unit('N', group['unit'])}")
         of_group = group["priors"] if axis else {}
         about_it = {key: prior_tree(prior) for key, prior in laid(before, value).items()}
         held |= {key: prior for key, prior in about_it.items() if prior != of_group.get(key)}
-    elif one.key == "bias":
+    elif number.key == "bias":
         held["bias"] = {"law": "normal", "sd": rounded(value)}
     else:
         # A data sheet's bias instability is the size of the slow drift: the deviation of a Gauss-Markov one.
-        name = "sigma_m" if one.key == "B" else one.key
+        name = "sigma_m" if number.key == "B" else number.key
         half = math.sqrt(10.0**DECADES_STATED)
         held[name] = prior_tree(Prior("log_uniform", min=rounded(value / half), max=rounded(value * half)))
 
@@ -288,7 +283,7 @@ def finish(tree: dict[str, Any], name: str, recording: Recording | None) -> list
     # Without a recording the drift is drawn from its priors; the noise is known.
     noise = {axis: {"N": rounded(middle[key])} for key, group in tree["groups"].items() for axis in group["axes"]}
     rate_hz = tree["sensor"]["rate_hz"]
-    tree["simulate"] |= {"rate_hz": min(SIMULATED_HZ, rate_hz), "axes": noise}
+    tree["simulate"] |= {"rate_hz": min(tree["simulate"]["rate_hz"], rate_hz), "axes": noise}
     said = []
     if recording is not None:
         tree["simulate"] |= {"rate_hz": rate_hz, "duration_s": recording.duration_s}
@@ -306,10 +301,10 @@ def finish(tree: dict[str, Any], name: str, recording: Recording | None) -> list
 
 def _measured(recording: Recording, axis: str, model: Model) -> dict[str, Any]:
     """The `simulate` entry of an axis: its likeliest law and medians. Raises UserError where it has no result."""
-    found, group = identify_axis(recording, axis, model, "library", None), model.group_of(axis)
-    result, law = in_unit(found.result, found.unit, group.unit), found.result.best
+    identified, group = identify_axis(recording, axis, model, "library", None), model.group_of(axis)
+    result, law = in_unit(identified.result, identified.unit, group.unit), identified.result.best
     numbers = {"bias": float(np.nanmedian(recording.in_unit(axis, group.unit)))}
-    numbers |= {key: one.median for key, one in result.parameters[law].items()}
+    numbers |= {key: estimate.median for key, estimate in result.parameters[law].items()}
     numbers["N"] = without(numbers["N"], rounding({"lsb": group.lsb}, model.sensor_rate_hz))
     return {"hypothesis": law, **{key: float(f"{value:.6g}") for key, value in numbers.items()}}
 
@@ -320,7 +315,7 @@ def rounding(group: Mapping[str, Any], rate_hz: float) -> float:
 
 
 def without(N: float, added: float) -> float:
-    """The density beside which another one makes N."""
+    """The density that makes N together with `added`."""
     return math.sqrt(max(N * N - added * added, 1e-4 * N * N))
 
 
@@ -331,8 +326,8 @@ def tree_of(
     name: str | None = None,
     rate: float | None = None,
 ) -> tuple[dict[str, Any], list[str]]:
-    """The tree of a part's model file, and a line for each of its numbers. `axes`: columns that are axes beside gx to
-    az; `stated`: numbers of its data sheet; `rate`, Hz: without a recording. Raises UserError."""
+    """The tree of a part's model file, and a line for each of its numbers. `axes`: columns that are axes apart from gx
+    to az; `stated`: numbers of its data sheet; `rate`, Hz: without a recording. Raises UserError."""
     tree: dict[str, Any] = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
     said: list[str] = []
     if recording is not None:
@@ -344,7 +339,7 @@ def tree_of(
         tree["gate"]["N"] = dict.fromkeys(tree["groups"], 1.0)  # until N is known
         said += of_recording(tree, recording)
     else:
-        if rate is None and not any(one.key == "rate" for one in stated):
+        if rate is None and not any(number.key == "rate" for number in stated):
             raise UserError("without a recording the part's rate is needed: --datasheet rate=200Hz")
         tree["sensor"] = {"name": "", "rate_hz": rate, "filter_taps": 1}
         for group in tree["groups"].values():
@@ -362,7 +357,7 @@ def as_text(tree: Mapping[str, Any], recording: Recording | None, said: Sequence
 
 
 def show(model: Model) -> None:
-    """What was written, on stdout."""
+    """Print the groups of the file that was written."""
     print(f"{model.path}: model '{model.name}', {model.sensor_rate_hz:g} Hz")
     for group in model.groups:
         N = group.priors["N"]

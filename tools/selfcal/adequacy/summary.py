@@ -3,9 +3,9 @@
 The white noise (angle random walk, of an accelerometer velocity random walk) is N. The rate random walk is K; a
 Gauss-Markov drift counts as the walk that it is over times short against 1 / alpha, K = sigma_m sqrt(2 alpha); no drift
 has K = 0. The bias instability is the first minimum of the law's Allan deviation over 0.664 (IEEE Std 952, annex C).
-Of 1/f noise it is B, and the white noise is that beside 1/f noise (one_over_f.py). Its law is weighed beside the
-model's own; the walk is theirs alone.
-Coloured noise of a spectral ratio below 1 is white noise beside quantization noise; at the bank's interval dt
+Of 1/f noise it is B, and the white noise is the rest (one_over_f.py). Its law is weighed with the model's own; the
+walk is theirs alone.
+Coloured noise of a spectral ratio below 1 is white noise with quantization noise; at the bank's interval dt
 Q = N sqrt(dt) sqrt(1 / ratio^2 - 1) / 2. The number is there where such noise is sure. Each law counts by its
 probability.
 """
@@ -30,15 +30,15 @@ _Floats = NDArray[np.float64]
 
 #: The parameter of coloured noise, and the sizes of drifts.
 COLOURED, _SIZES = "spectral_ratio", ("K", "sigma_m", "B")
-#: Draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
+#: Number of draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
 _DRAWS, _PER_OCTAVE = 256, 16
-#: Times the record that a longer rest is looked at, and halvings of its logarithm: to 2 %.
+#: Longest rest that is looked at, in lengths of the record, and halvings of its logarithm: to 2 %.
 MOST_REST, _HALVINGS = 100.0, 8
-#: Laws of smaller probability do not count.
+#: Least probability of a law that counts.
 _LEAST = 1e-3
-#: White noise over that of the other axes of a sensor that a line names: their data sheets have one number for all.
+#: Least ratio of an axis' N to its siblings' or its data sheet's that a line names.
 NOISIER = 2.0
-#: Share of the posterior that must have a walk, or a minimum, for the number to be identified.
+#: Least share of the posterior with a walk, or a minimum, that identifies the number.
 _SURE = 0.95
 #: Why a number is not identified: words of the table and the JSON.
 NO_WALK = "no walk is sure"
@@ -68,8 +68,8 @@ def summarize(
 ) -> dict[str, Number]:
     """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
     the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
-    record is too short for an Allan deviation. `beside`: 1/f noise beside the laws of the result. `counted`: likewise
-    white noise beside quantization noise (counted.py)."""
+    record is too short for an Allan deviation. `beside`: 1/f noise, added to the laws of the result. `counted`:
+    likewise white noise with quantization noise (counted.py)."""
     if n < 2 * LONGEST:
         return {}
     more = 0.0 if beside is None else beside.probability
@@ -77,38 +77,38 @@ def summarize(
     laws = [
         Beside(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
-        if probability >= _LEAST  # of the model's, whatever stands beside them
+        if probability >= _LEAST  # of the model's, whatever is added to them
     ]
     of_model = len(laws)
     others = ((beside, more * left), (counted, 1.0 - left))
-    laws += [replace(one, probability=share) for one, share in others if one is not None and share >= _LEAST]
-    known = [
-        (one, k < of_model)
-        for k, one in enumerate(laws)
-        if all(math.isfinite(e.median) for e in one.estimates.values())
+    laws += [replace(law, probability=share) for law, share in others if law is not None and share >= _LEAST]
+    sound = [
+        (law, k < of_model)
+        for k, law in enumerate(laws)
+        if all(math.isfinite(e.median) for e in law.estimates.values())
     ]
-    if not known:
+    if not sound:
         return {}
-    white, walk, q, floor, place = (
-        np.concatenate(rows) for rows in zip(*(_draws(one) for one, _ in known), strict=True)
+    white, walk, q, floor, side = (
+        np.concatenate(rows) for rows in zip(*(_draws(law) for law, _ in sound), strict=True)
     )
-    w, own = np.repeat([[one.probability, float(mine)] for one, mine in known], _DRAWS, axis=0).T
+    w, own = np.repeat([[law.probability, float(mine)] for law, mine in sound], _DRAWS, axis=0).T
     w = w / w.sum()
     w_walk = w * own / max(float(w @ own), 1e-300) if (w * own).any() else w
-    found = {
+    numbers = {
         "arw": _number(white, w),
         "rrw": _number(walk, w_walk),
         "bias_instability": _number(floor / units.FLICKER_FLOOR, w),
     }
     if float(w[q > 0.0].sum()) >= _SURE:
-        of_Q = sum(one.probability for one in laws if COLOURED in one.estimates and one.estimates[COLOURED].identified)
+        of_Q = sum(law.probability for law in laws if COLOURED in law.estimates and law.estimates[COLOURED].identified)
         Q = _number(q, w)
-        found["quantization_noise"] = Q if of_Q > 0.5 * sum(one.probability for one in laws) else _without(Q, WIDE)
+        numbers["quantization_noise"] = Q if of_Q > 0.5 * sum(law.probability for law in laws) else _without(Q, WIDE)
     # Laws with a drift: whether each size of it is identified.
-    sizes = [(one.probability, [e.identified for key, e in one.estimates.items() if key in _SIZES]) for one, _ in known]
+    sizes = [(law.probability, [e.identified for key, e in law.estimates.items() if key in _SIZES]) for law, _ in sound]
     drifts = sum(share for share, each in sizes if each)
     left_open = sum(share for share, each in sizes if each and not any(each)) > 0.5 * drifts
-    rrw, why = found["rrw"].estimate, ""
+    rrw, why = numbers["rrw"].estimate, ""
     if more >= SURE:
         why = ONE_OVER_F
     elif float(w_walk[walk > 0.0].sum()) < _SURE:
@@ -117,34 +117,35 @@ def summarize(
         why = WIDE
     if why:
         # Its limit holds if there is a walk, however little a law with one counts.
-        most = [one["K"].q95 for one in result.parameters.values() if "K" in one and math.isfinite(one["K"].q95)]
+        ends = [estimates["K"].q95 for estimates in result.parameters.values() if "K" in estimates]
+        most = [end for end in ends if math.isfinite(end)]
         if (w_walk * walk > 0.0).any():
             most.append(_number(walk, np.where(walk > 0.0, w_walk, 0.0) / w_walk[walk > 0.0].sum()).estimate.q95)
-        found["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
-    if float(w[place == 0].sum()) < _SURE:
-        reason = BELOW if float(w[place < 0].sum()) > 0.5 else NO_MINIMUM
-        found["bias_instability"] = _without(found["bias_instability"], reason)
+        numbers["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
+    if float(w[side == 0].sum()) < _SURE:
+        reason = BELOW if float(w[side < 0].sum()) > 0.5 else NO_MINIMUM
+        numbers["bias_instability"] = _without(numbers["bias_instability"], reason)
     elif left_open:  # then the prior of the drift makes the minimum
-        found["bias_instability"] = _without(found["bias_instability"], WIDE)
-    return found
+        numbers["bias_instability"] = _without(numbers["bias_instability"], WIDE)
+    return numbers
 
 
-def _draws(one: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
+def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
     """Draws of a law's posterior [k] each: white noise, walk (0: none), Q, the first minimum of the Allan deviation,
     and where it is."""
-    law, group, dt_s, n, block = one.law, one.group, one.dt_s, one.n, one.block
-    medians = {name: estimate.median for name, estimate in one.estimates.items()}
+    law, group, dt_s, n, block = beside.law, beside.group, beside.dt_s, beside.n, beside.block
+    medians = {name: estimate.median for name, estimate in beside.estimates.items()}
     m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
-    draws = posterior_draws(one.estimates, fit_of(law, medians, group, dt_s, n, m, block=block).covariance, _DRAWS)
+    draws = posterior_draws(beside.estimates, fit_of(law, medians, group, dt_s, n, m, block=block).covariance, _DRAWS)
     if law == FLICKER:
         white, floor = white_of(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
-        place = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
+        side = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
     else:
         rows = (dict(zip(draws, map(float, row), strict=True)) for row in zip(*draws.values(), strict=True))
         lowest = [_minimum(terms_of(group.laws[law], row, dt_s, block), m) for row in rows]
-        white, (floor, place) = draws["N"], np.array(lowest, dtype=float).T
+        white, (floor, side) = draws["N"], np.array(lowest, dtype=float).T
     walk = _walk(draws)
-    return white, np.where(np.isnan(walk), 0.0, walk), _quantization(draws, dt_s), floor, place
+    return white, np.where(np.isnan(walk), 0.0, walk), _quantization(draws, dt_s), floor, side
 
 
 def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -152,19 +153,20 @@ def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
     NOISIER times their median or more, the 90 % intervals apart. `white`: median, q05, q95 and unit."""
     lines = []
     for name, own in white.items():
-        others = [one for one in white if one != name and one[:-1] == name[:-1] and white[one]["unit"] == own["unit"]]
+        alike = [axis for axis in white if axis[:-1] == name[:-1] and white[axis]["unit"] == own["unit"]]
+        others = [axis for axis in alike if axis != name]
         if len(others) < 2:
             continue
-        times = own["median"] / float(np.median([white[one]["median"] for one in others]))
-        if times >= NOISIER and own["q05"] > max(white[one]["q95"] for one in others):
+        times = own["median"] / float(np.median([white[other]["median"] for other in others]))
+        if times >= NOISIER and own["q05"] > max(white[other]["q95"] for other in others):
             lines.append(f"{name} is {times:.2g} times as noisy as {' and '.join(others)}")
     return lines
 
 
 def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: int) -> dict[str, float | None]:
-    """Of each parameter of the likeliest law that the record leaves open: the further rest that halves its interval, s.
+    """Further rest that halves the interval of each parameter that the record leaves open under the likeliest law, s.
 
-    By the Fisher information at the medians, beside the priors. An open interval is wider than this information says,
+    By the Fisher information at the medians, with the priors. An open interval is wider than this information says,
     and falls faster with the rest: the geometric mean of both variances is taken for that of now. The median over
     records of a kind is then 0.2 to 0.76 times as wide (tests/tools/test_summary.py). None: not even MOST_REST times
     the record does.
@@ -181,22 +183,22 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
         return dict(zip(estimates, np.diag(fit.covariance).tolist(), strict=True))
 
     now = variance(1.0)
-    found: dict[str, float | None] = {}
+    rest_s: dict[str, float | None] = {}
     for name in open_:
         wanted = 0.25 * math.sqrt(now[name]) * estimates[name].ln_sd
         low, high = 0.0, math.log(MOST_REST)
         if not variance(MOST_REST)[name] <= wanted:
-            found[name] = None
+            rest_s[name] = None
             continue
         for _ in range(_HALVINGS):
-            at = 0.5 * (low + high)
-            low, high = (low, at) if variance(math.exp(at))[name] <= wanted else (at, high)
-        found[name] = n * dt_s * math.expm1(high)
-    return found
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if variance(math.exp(middle))[name] <= wanted else (middle, high)
+        rest_s[name] = n * dt_s * math.expm1(high)
+    return rest_s
 
 
 def _walk(draws: Mapping[str, _Floats]) -> _Floats:
-    """K of each draw; 0 of a law that has no walk and is like none."""
+    """K of each draw; 0 of a law without a walk and without a drift that is like one."""
     if "K" in draws:
         return draws["K"]
     if "sigma_m" in draws and "alpha" in draws:
@@ -205,7 +207,7 @@ def _walk(draws: Mapping[str, _Floats]) -> _Floats:
 
 
 def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
-    """Q of each draw; 0 of a law whose noise has no memory, or one of the other sign."""
+    """Q of each draw; 0 of a law whose noise has no memory, or a memory of the other sign."""
     if COLOURED not in draws:
         return np.zeros(draws["N"].size)
     over = np.maximum(draws[COLOURED] ** -2.0 - 1.0, 0.0)
@@ -213,12 +215,12 @@ def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
 
 
 def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
-    """The first minimum of the Allan deviation at `m` readings, and 0; where there is none inside, the lowest value
+    """The first minimum of the Allan deviation at `m` readings, and 0; where none lies inside, the lowest value
     with -1 (it rises from the first on) or 1 (it falls to the last)."""
     variance = terms.allan_variance(m)
     inside = np.flatnonzero((variance[1:-1] < variance[:-2]) & (variance[1:-1] <= variance[2:]))
-    at = int(inside[0]) + 1 if inside.size else int(np.argmin(variance))
-    return math.sqrt(max(0.0, float(variance[at]))), 0 if inside.size else (-1 if at == 0 else 1)
+    lowest = int(inside[0]) + 1 if inside.size else int(np.argmin(variance))
+    return math.sqrt(max(0.0, float(variance[lowest]))), 0 if inside.size else (-1 if lowest == 0 else 1)
 
 
 def _number(values: _Floats, weight: _Floats) -> Number:

@@ -1,4 +1,4 @@
-"""What the library's averager makes of a record, worked out on its own in double: the block means."""
+"""Block means of a record, as the library's averager makes them, worked out on their own in double."""
 
 from __future__ import annotations
 
@@ -23,13 +23,12 @@ MOST_DENSE = 10_000_000
 
 @dataclass(frozen=True)
 class Blocks:
-    """What the library's averager makes of a record, worked out on its own in double for the reference and the checks.
+    """Block means of a record for the reference and the checks.
 
     `mean` [m] of each bank interval, NaN where fewer than half of its samples are usable; `r` [m] samples a block over
-    those used; `kept_out` counts the
-    samples that were not used, by reason; `z` [m, p] are the means of the regressors' columns. `after`: samples from
-    the last whole block to the last usable sample, missing ones included. `begin`: sample instants from the record's
-    first one to the first block. Blocks beyond MOST_DENSE intervals are not
+    those used; `kept_out` counts the samples that were not used, by reason; `z` [m, p] are the means of the
+    regressors' columns. `after`: samples from the last whole block to the last usable sample, missing ones included.
+    `begin`: sample instants from the record's first one to the first block. Blocks beyond MOST_DENSE intervals are not
     worked out.
     """
 

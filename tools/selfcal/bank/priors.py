@@ -37,8 +37,8 @@ FEWEST = 8
 LEVEL_SD = 2.0
 #: Nats by which a law must gain: of records that a model's limits hold, at most 1 in 20 gain so much (Markov's bound).
 LEANS_GAIN = math.log(20.0)
-#: Most bank intervals in the search for leaning.
-LEANS_INTERVALS = 20_000
+#: Most bank intervals of a search beyond the bank's own: a longer record is averaged further.
+MOST_INTERVALS = 20_000
 #: Smallest visible drift over a record of T: K in N / T, sigma_m in N / sqrt(T); of alpha 1 / T.
 UNSEEN = 0.5
 #: Noise of the gate over the record's noise: default.yaml has two to six.
@@ -244,7 +244,7 @@ def moved_along(
     """The `priors` of an axis with the limits moved that a posterior leans on. As they are where none does, or where no
     law gains by it.
 
-    The laws are those of one drift term, without regressors, on the means of LEANS_INTERVALS intervals at most."""
+    The laws are those of one drift term, without regressors, on the means of MOST_INTERVALS intervals at most."""
     recording = recording.along(name)
     length_s = recording.duration_s
     size = UNSEEN * seen.N / math.sqrt(length_s)
@@ -257,7 +257,7 @@ def moved_along(
 
     plain = {law: weight for law, weight in model.hypotheses.items() if not model.laws[law].is_sum}
     readings = look(recording, name, replace(model.group_of(name), priors=priors))
-    own, rate_hz = readings.recording, min(model.bank_rate_hz, LEANS_INTERVALS / length_s)
+    own, rate_hz = readings.recording, min(model.bank_rate_hz, MOST_INTERVALS / length_s)
     offset = float(np.nanmedian(readings.working))
     samples = as_float(readings.working - offset)[:, None]
 
@@ -314,7 +314,7 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
 
 
 def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float]) -> bool:
-    """Whether the record may show more than the priors hold: what it cannot tell lies well below a least, or the drift
+    """Whether the record may show more than the priors hold: what it cannot show lies well below a least, or the drift
     comes near a most."""
     below = any(math.e * least[key] < prior.min for key, prior in priors.items() if key in least)
     reach = float(seen.deviation[-1]) * math.sqrt(3.0 / float(seen.tau_s[-1]))

@@ -29,7 +29,7 @@ _Indices = NDArray[np.int64]
 _DEPTH = 16.0
 #: First step in each direction, in conditional standard deviations.
 _STEP = 0.75
-#: Steps a direction has at least between its limits.
+#: Fewest steps of a direction between its limits.
 _FEWEST = 24
 #: Most nodes of a hypothesis: a larger posterior is out of this engine's reach.
 _MOST = 1_000_000
@@ -178,7 +178,7 @@ def _posterior(
 
 
 def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Floats, _Floats]:
-    """What the drift some time on takes of each state now [m, states], and the variance that it gains until then [m],
+    """Weight of each state now in the drift some time on [m, states], and the variance that it gains until then [m],
     at the drift and second parameters [m]."""
     taken: list[_Floats] = []
     gained = np.zeros(drift.size)
@@ -310,20 +310,20 @@ class _Lattice:
         self._spread()
 
     def _spread(self) -> None:
-        """Filter every node next to one above the depth. A turn looks beside the nodes that the last one added: beside
-        older ones all is there."""
+        """Filter every node next to one above the depth. A turn looks next to the nodes that the last turn added: all
+        nodes next to older ones are there."""
         directions = np.eye(len(self.low), dtype=np.int64)
         known = set(self._key(self.index).tolist())
-        seen = 0
+        first = 0
         while True:
-            inside = self.index[seen:][self.value[seen:] > self.top - _DEPTH]
+            inside = self.index[first:][self.value[first:] > self.top - _DEPTH]
             near = np.concatenate([inside + sign * direction for direction in directions for sign in (-1, 1)])
             near = near[((near >= 0) & (near <= self.count)).all(axis=1)]
             keys = np.array(sorted(set(self._key(near).tolist()) - known), np.int64)
             if keys.size == 0:
                 return
             known.update(keys.tolist())
-            seen = len(self.index)
+            first = len(self.index)
             self._add(self._index(keys))
 
     def refine(self) -> None:

@@ -1,4 +1,4 @@
-"""What follows from the evidence of every subset of a model's regressors."""
+"""Posterior over all subsets of a model's regressors, by their evidence."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def combine(
 
 
 def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coefficient:
-    """One whose posterior is normal."""
+    """A coefficient whose posterior is normal."""
     return Coefficient(column, unit, mean, sd, mean - HALF_90 * sd, mean, mean + HALF_90 * sd)
 
 

@@ -1,1 +1,1 @@
-"""What every folder knows, and what knows no other folder."""
+"""Helpers that every folder uses, and that use no other folder."""

@@ -84,16 +84,16 @@ class Held:
 
     @property
     def asked(self) -> bool:
-        """One came."""
+        """A signal came."""
         return _state.came is not None
 
     @property
     def overdue(self) -> bool:
-        """One came 0.6 s ago: results have to be written."""
+        """A signal came 0.6 s ago: results have to be written."""
         return _state.came is not None and time.monotonic() > _state.came_at + 0.6
 
     def check(self) -> None:
-        """Raise Ended if one came."""
+        """Raise Ended if a signal came."""
         if _state.came is not None:
             number, _state.came = _state.came, None
             _end(number)

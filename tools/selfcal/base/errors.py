@@ -75,7 +75,7 @@ def shown(value: object) -> str:
 
 
 def install(what: str) -> str:
-    """The line to type for a package that is not installed beside this one: its name, or `selfcal[extra]`."""
+    """The line to type for a package that is not installed with this one: its name, or `selfcal[extra]`."""
     return f"{shlex.quote(sys.executable)} -m pip install {shlex.quote(what)}"
 
 
@@ -109,15 +109,15 @@ def in_python(text: str) -> str:
         name, kind = _KEYWORDS.get(match["name"], ("", ""))
         if not name:
             return match[0]
-        given = [one.strip("'") for one in re.findall(_VALUE, match["more"])]
+        given = [word.strip("'") for word in re.findall(_VALUE, match["more"])]
         if kind == "pairs":
-            pairs = dict(one.partition("=")[::2] for one in given)
+            pairs = dict(word.partition("=")[::2] for word in given)
             shown_as = "({0[0]}, {1!r})" if name == "scale" else "{2!r}"  # a size and its unit
-            told = (
+            entries = (
                 f"{key!r}: " + shown_as.format(value.split("["), value.partition("[")[2].rstrip("]"), value)
                 for key, value in pairs.items()
             )
-            return f"{name}={{{', '.join(told) or '...'}}}"
+            return f"{name}={{{', '.join(entries) or '...'}}}"
         if kind == "list":
             return f"{name}={given or '[...]'}"
         return f"{name}={(given or ['...'])[0]}" if kind else f"{name}=True{match['more']}"

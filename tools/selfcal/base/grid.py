@@ -60,7 +60,7 @@ def regridded(values: Array, dt: float, n: int, to_dt: float) -> Array:
 
 def noise_of(values: Array) -> float:
     """White noise of values [n] by the median of their differences. On a lattice coarser than it most of them are
-    none: then by the 60 % quantile. A walk that is slower than the noise has no part in it, nor have rare jumps."""
+    0: then by the 60 % quantile. A walk that is slower than the noise has no part in it, nor have rare jumps."""
     steps = np.abs(np.diff(values))
     steps = steps[np.isfinite(steps)]
     if not steps.size:

@@ -226,7 +226,7 @@ def same_kind(unit: str, other: str) -> bool:
 
 
 def factor(unit: str, to: str) -> float:
-    """What a difference in `unit` is multiplied with to be in `to`. Raises UserError if they are of different kinds."""
+    """Factor of a difference in `unit` to be in `to`. Raises UserError if they are of different kinds."""
     source, target = parse(unit), parse(to)
     if source.dimension != target.dimension:
         raise UserError(f"'{unit}' cannot be converted to '{to}'")

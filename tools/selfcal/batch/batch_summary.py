@@ -33,11 +33,11 @@ from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
 
-#: Evidence of a unit's law over the batch's law, nats: at most 1 in e^12 by chance.
+#: Least evidence of an odd unit's law over the batch's law, nats: at most 1 in e^12 by chance.
 OTHER_LAW = 12.0
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Most devices of a line.
+#: Most devices that a line names.
 MOST_NAMED = 20
 #: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0
@@ -496,8 +496,8 @@ def seen_from_words(population: Population) -> str:
 def _drift_words(drift: Drift) -> str:
     of = drift.of
     rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if of.logarithm else f"{drift.per_day:+.3g} {of.unit}"
-    seen = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
-    return f"{of.quantity} {rate} a day, {seen}"
+    basis = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
+    return f"{of.quantity} {rate} a day, {basis}"
 
 
 def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:

@@ -56,9 +56,9 @@ def verdict(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict
 
 
 def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
-    """What can change: N, K and B with all findings in the model, the other parameters of the likeliest law, the bias,
-    the coefficients of the model file's regressors, and each cause found with its sizes. A cause is `small` where it
-    changes no number by as much as matters. Without a model of the findings the parameters are those of `identify`."""
+    """Quantities that can change: N, K and B with all findings in the model, the other parameters of the likeliest law,
+    the bias, the coefficients of the model file's regressors, and each cause found with its sizes. A cause is `small`
+    where it changes no number by as much as matters. Without a model of the findings, parameters are of `identify`."""
     sizes: dict[str, Mapping[str, Any]] = {}
     known = diagnosed.get("posterior") or identified
     if "hypotheses" in known:
@@ -100,8 +100,8 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
 
 
 def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """What is in one recording alone and matters there, and what changed beyond the limit, a row each. A number that
-    one of the recordings does not identify counts by its interval, and the row has what it lies below."""
+    """Findings of one recording alone that matter there, and changes beyond the limit, a row each. A number that one of
+    the recordings does not identify counts by its interval, and the row has its upper limit."""
     rows: list[dict[str, Any]] = []
     for key in sorted(before.keys() | after.keys()):
         a, b = before.get(key), after.get(key)
@@ -119,9 +119,9 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
         if abs(distance) >= LIMIT:
             row = {"before": a["median"], "after": b["median"], "unit": a["unit"], "distance_sd": distance}
             below = {
-                f"{side}_below": one["q95"]
-                for side, one in (("before", a), ("after", b))
-                if not one.get("identified", True)
+                f"{side}_below": estimate["q95"]
+                for side, estimate in (("before", a), ("after", b))
+                if not estimate.get("identified", True)
             }
             rows.append({"quantity": key, "what": "changed", **row, **below})
     return rows
@@ -130,7 +130,7 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
 def compared_of(
     seen: Sequence[tuple[str, Mapping[str, Mapping[str, Any]]]], verdicts: Mapping[str, Mapping[str, Any]]
 ) -> dict[str, Compared]:
-    """Each recording beside the one before, by axis. `seen`: the recordings with the quantities of each axis;
+    """Each recording compared with the one before, by axis. `seen`: the recordings with the quantities of each axis;
     `verdicts`: by recording and axis."""
     compared = {name: Compared() for axes in verdicts.values() for name in axes}
     for (first, before), (second, after) in pairwise(seen):
@@ -146,7 +146,7 @@ def compared_of(
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """One line a change, the largest first, then what each recording shows that matters."""
+    """Print a line a change, the largest first, then the findings of each recording that matter."""
     from selfcal.show.comparison_page import told_of
 
     console = console_of(to_stderr=to_stderr)
@@ -159,8 +159,6 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         before, after = (row.side(name, "-") for name in ("before", "after"))
         quantity = row.change["quantity"].replace("_", " ")
         table.add_row(row.axes, quantity, before, after, row.unit, distance, printable(logs))
-    if not console.is_terminal:
-        console.width = max(console.width, 140)
     if rows:
         console.print(table)
     errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}
@@ -173,8 +171,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             for cause in judged.get("causes", ()):
                 if cause in (*judged["material"], "unexplained"):
                     on.setdefault(cause.replace("_", " "), []).append(name)
-        told = "; ".join(f"{cause} on {' '.join(names)}" for cause, names in on.items())
-        line = f"{printable(Path(log).name)}: {told or 'no finding that matters'}"
+        findings = "; ".join(f"{cause} on {' '.join(names)}" for cause, names in on.items())
+        line = f"{printable(Path(log).name)}: {findings or 'no finding that matters'}"
         console.print(line, highlight=False, markup=False, soft_wrap=True)
     for name, error in errors.items():
         console.print(f"{name}: not compared: {printable(error)}", highlight=False, markup=False, soft_wrap=True)

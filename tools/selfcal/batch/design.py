@@ -33,9 +33,10 @@ from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Terms
 from selfcal.model.file import Model
 
-#: Stages of the register that makes the bits.
+#: Number of stages of the register that makes the bits.
 STAGES = 9
-#: Records that a length is tried with, how exact the predicted one is, and how much longer the next is.
+#: Records that a length is tried with, largest ratio of the predicted length to a shorter one that fails, and ratio of
+#: the next length to one that was too short.
 DRAWN, STEP, LONGER = 20, 1.1, 1.2
 LAG = Structure("lag", ("gain",), ("lag_s",))
 
@@ -60,8 +61,8 @@ class Experiment:
 
     def input(self, bit_s: float, samples: int, dt: float) -> Array:
         """[samples]: the input about its middle."""
-        at, levels = self.set_points(bit_s, samples * dt)
-        wanted = levels[np.searchsorted(at, np.arange(samples) * dt, side="right") - 1] - 0.5 * sum(self.levels)
+        starts, levels = self.set_points(bit_s, samples * dt)
+        wanted = levels[np.searchsorted(starts, np.arange(samples) * dt, side="right") - 1] - 0.5 * sum(self.levels)
         return np.asarray(late(np.append(0.0, wanted), max(self.input_lag_s, 1e-3 * dt), dt)[1:])
 
 
@@ -79,13 +80,14 @@ def terms_of(truth: Mapping[str, float], dt: float) -> tuple[Terms, Array, float
 def halves(experiment: Experiment, truth: Mapping[str, float], u: Array, dt: float) -> dict[str, float]:
     """Half the 90 % intervals of gain and lag that a part's record of the input [n] would have, each over its size."""
     terms, theta, sigma = terms_of(truth, dt)
-    drive, at, near = Drive(u, dt), experiment.lag_s, 1e-3 * experiment.lag_s
-    here = drive.columns(LAG, (at,))
-    by_lag = experiment.gain * (drive.columns(LAG, (at + near,))[0] - drive.columns(LAG, (at - near,))[0]) / (2 * near)
+    drive, lag, near = Drive(u, dt), experiment.lag_s, 1e-3 * experiment.lag_s
+    here = drive.columns(LAG, (lag,))
+    change = drive.columns(LAG, (lag + near,))[0] - drive.columns(LAG, (lag - near,))[0]
+    by_lag = experiment.gain * change / (2 * near)
     columns = np.vstack([np.ones(u.size), here[1:], here[:1], by_lag])
     sums = run(Series(np.zeros(u.size), dt, np.ones(u.size), columns), terms, theta)[0][0]
     sd = sigma * np.sqrt(np.diag(sums.coefficients()[1])[-2:])
-    return {"gain": HALF_90 * float(sd[0]) / abs(experiment.gain), "lag": HALF_90 * float(sd[1]) / at}
+    return {"gain": HALF_90 * float(sd[0]) / abs(experiment.gain), "lag": HALF_90 * float(sd[1]) / lag}
 
 
 def designed(
@@ -97,15 +99,13 @@ def designed(
         {key: value for key, value in truth.items() if key in model.laws[law].parameters}
         for law, truth in (part_of(model, axis, seed) for seed in seeds)
     ]
-    most = {each_wish.parameter: each_wish.most for each_wish in wishes}
+    most = {wish.parameter: wish.most for wish in wishes}
 
     def lacks(bit_s: float, samples: int) -> bool:
         """Whether fewer than SHARE of the parts have it."""
         u = experiment.input(bit_s, samples, dt)
         each = [halves(experiment, truth, u, dt) for truth in parts]
-        return any(
-            float(np.quantile([each_wish[key] for each_wish in each], SHARE)) > wish for key, wish in most.items()
-        )
+        return any(float(np.quantile([part[key] for part in each], SHARE)) > wish for key, wish in most.items())
 
     def length(bit_s: float) -> int | None:
         """Samples of the record."""
@@ -119,7 +119,7 @@ def designed(
             low, high = (middle, high) if lacks(bit_s, middle) else (low, middle)
         return high
 
-    bits = [max(each_wish * experiment.lag_s, 2.0 * dt) for each_wish in (0.5, 1.0, 2.0, 4.0)]
+    bits = [max(times * experiment.lag_s, 2.0 * dt) for times in (0.5, 1.0, 2.0, 4.0)]
     reached = {bit_s: samples for bit_s in bits if (samples := length(bit_s)) is not None}
     if not reached:
         return {"bit_s": None, "duration_s": None}
@@ -143,10 +143,10 @@ def drawn_rows(model: Model, axis: str, experiment: Experiment, bit_s: float, sa
     u = experiment.input(bit_s, samples, dt)
     acts = experiment.gain * late(np.append(0.0, u), experiment.lag_s, dt)[1:]
     state = State(axis, model.group_of(axis).unit, y + acts, dt, 0.0, np.ones(samples)).refit()
-    found = answer_of(state, [Input(u, u, "degC")])[0].get("estimate", {})
+    estimate = answer_of(state, [Input(u, u, "degC")])[0].get("estimate", {})
     return [
         {
-            name: 0.5 * (found[key]["q95"] - found[key]["q05"]) / abs(size) if key in found else math.inf
+            name: 0.5 * (estimate[key]["q95"] - estimate[key]["q05"]) / abs(size) if key in estimate else math.inf
             for name, key, size in (("gain", "gain", experiment.gain), ("lag", "lag_s", experiment.lag_s))
         }
     ]

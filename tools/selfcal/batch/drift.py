@@ -118,7 +118,7 @@ def _square(series: Sequence[Series]) -> float:
 
 
 def _alike(series: Sequence[Series]) -> list[Series]:
-    """Those that scatter as the others do: the others leave in rounds, each with the r of those that are left."""
+    """Series that scatter alike: the others leave in rounds, each with the r of those that are left."""
     kept = list(series)
     while len(kept) > 1:
         square, limit = _square(kept), FALSE_ALARM / len(kept)

@@ -95,8 +95,8 @@ def exit_code(document: Mapping[str, Any], wanted: str | None) -> int:
             note(line)
         codes.append(asked.code)
     if "limits" in document:
-        known = ("recording", "device")
-        verdicts = [Verdict.of({k: v for k, v in entry.items() if k not in known}) for entry in document["limits"]]
+        head = ("recording", "device")
+        verdicts = [Verdict.of({k: v for k, v in entry.items() if k not in head}) for entry in document["limits"]]
         for verdict, entry in zip(verdicts, document["limits"], strict=True):
             if verdict.verdict != PASS:
                 note(f"{entry['recording']}: {verdict.words}" if "recording" in entry else verdict.words)

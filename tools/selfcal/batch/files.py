@@ -33,7 +33,7 @@ MOST_ROWS_NAMED = 5
 class Source:
     """A recording of the batch.
 
-    `path` as the pattern has it. `sha256` of the file, `content` of the file and the metadata beside it. `device`: ""
+    `path` as the pattern has it. `sha256` of the file, `content` of the file and the metadata next to it. `device`: ""
     until the recording is read, if its metadata have the serial number. `copy_of`: the recording of another device with
     the same content.
     """
@@ -91,7 +91,7 @@ def _within_any(path: Path, own: Sequence[Path]) -> bool:
 
 
 def _no_file(path: Path) -> str:
-    """What is neither file nor folder; empty for these."""
+    """Kind of a path that is neither file nor folder; empty for these."""
     if not path.exists():
         return "a link to nothing"
     return "" if path.is_file() or path.is_dir() else "a pipe or a device"
@@ -149,8 +149,8 @@ def sources_of(
     first: dict[str, Source] = {}
     copies: dict[str, str] = {}
     for path, device in named.items():
-        known: dict[str, Any] = {"device": device, **units.get(path, {})}
-        source = replace(hashed(path), **known)
+        fields: dict[str, Any] = {"device": device, **units.get(path, {})}
+        source = replace(hashed(path), **fields)
         other = first.setdefault(source.content, source)
         if other is source:
             sources.append(source)

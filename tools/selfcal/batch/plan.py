@@ -46,11 +46,12 @@ SCHEMA = "selfcal.plan/1"
 LEAST, MOST = 64, 200_000
 #: Halvings of the last step of the length, in its logarithm.
 HALVINGS = 3
-#: A bank so many times faster or slower is worth a line if it shortens the length to this share, or lengthens it less.
+#: Ratio of the rates of banks that a line compares, and largest ratio of the lengths that is worth a line: a slower
+#: bank may lengthen the record by the inverse.
 FASTER, WORTH = 10.0, 0.8
-#: A bias is in its steady state where half the length has an interval that is wider by less than this factor.
+#: Largest ratio of a bias' interval at half the length to the whole: it is in its steady state.
 STEADY = 1.1
-#: Record without another wish, s.
+#: Length of a record without another wish, s.
 SWEEP_S = 3600.0
 #: Forms whose column is in proportion to the channel.
 LINEAR = ("static", "lag", "rate")
@@ -183,19 +184,19 @@ class Ensemble:
 
     def curve(self, k: int) -> list[dict[str, float]]:
         """By length: what a tenth, half and nine tenths of the records keep."""
-        found = []
+        rows = []
         for samples, metrics in sorted(self.at.items()):
             metric = metrics[~np.isnan(metrics[:, k]), k]
             q10, q50, q90 = np.quantile(metric, (0.1, 0.5, 0.9)).tolist()
-            found.append({"duration_s": samples / self.model.bank_rate_hz, "q10": q10, "q50": q50, "q90": q90})
-        return found
+            rows.append({"duration_s": samples / self.model.bank_rate_hz, "q10": q10, "q50": q50, "q90": q90})
+        return rows
 
 
 def cycling(
     model: Model, axis: str, wish: Wish, regressor: Regressor, samples: int, seeds: Sequence[int], scheduler: str | None
 ) -> list[dict[str, float]]:
     """The swing of the regressor's channel, from its lowest to its highest value, that SHARE of the records need."""
-    bare, found = replace(model, regressors=()), []
+    bare, sweeps = replace(model, regressors=()), []
     parts = [part_of(bare, axis, seed) for seed in seeds]
     needed = (HALF_90 / wish.most) ** 2 - regressor.sd[model.group_of(axis).name] ** -2
     # One sweep is half a cycle.
@@ -216,8 +217,8 @@ def cycling(
             # The information of a swing is as its square: each record's own swing by the one that it had.
             own = [(HALF_90 / row["half"]) ** 2 - regressor.sd[model.group_of(axis).name] ** -2 for row in rows]
             swing *= math.sqrt(needed / float(np.quantile(own, 1.0 - SHARE)))
-        found.append({"cycles": cycles, "period_s": samples / model.bank_rate_hz / cycles, "swing": swing})
-    return found
+        sweeps.append({"cycles": cycles, "period_s": samples / model.bank_rate_hz / cycles, "swing": swing})
+    return sweeps
 
 
 def swung(samples: int, cycles: float, swing: float) -> Array:
@@ -285,7 +286,7 @@ def rates(
 ) -> list[dict[str, Any]]:
     """The lengths at other rates of the bank, by the Fisher information of a typical part: only of wishes about a
     parameter."""
-    found = []
+    rows = []
     own = model.bank_rate_hz
     for factor in (0.1, 0.2, 0.5, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0):
         rate = own * factor
@@ -301,11 +302,11 @@ def rates(
                 continue
             low, high = math.log(1e-3), math.log(1e3)
             for _ in range(40):
-                at = 0.5 * (low + high)
-                half = _half_interval(*law, wish.parameter, rate, duration_s * math.exp(at))
-                low, high = (low, at) if half is not None and half <= target else (at, high)
-            found.append({"wish": wish.text, "rate_hz": rate, "duration_s": duration_s * math.exp(high)})
-    return found
+                middle = 0.5 * (low + high)
+                half = _half_interval(*law, wish.parameter, rate, duration_s * math.exp(middle))
+                low, high = (low, middle) if half is not None and half <= target else (middle, high)
+            rows.append({"wish": wish.text, "rate_hz": rate, "duration_s": duration_s * math.exp(high)})
+    return rows
 
 
 def _half_interval(

@@ -38,7 +38,7 @@ FALSE_NAME = 0.03
 FALSE_ALARM = 1e-3
 #: Largest share of odd units, and the most numbers of odd units that are tried.
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
-#: Rounds of fit and choice at most.
+#: Most rounds of fit and choice.
 _ROUNDS = 20
 #: Evidence of two groups over one, nats: 1 in 1000 normal batches of 8 to 24 units exceeds it.
 _SPLIT = 8.0

@@ -106,7 +106,7 @@ def _odds(model: Model, batch: Batch) -> dict[str, float]:
     for axis in model.axes:
         share = dict(model.hypotheses)
         if axis in there:
-            known = [results[-1]["hypotheses"] for results in sound_of(batch.devices, axis).values()]
-            share = {law: (1.0 + sum(prior[law] for prior in known)) / (len(known) + len(share)) for law in share}
+            units = [results[-1]["hypotheses"] for results in sound_of(batch.devices, axis).values()]
+            share = {law: (1.0 + sum(unit[law] for unit in units)) / (len(units) + len(share)) for law in share}
         total = {law: total[law] + share[law] for law in total}
     return {law: _rounded(odds / len(model.axes)) for law, odds in total.items()}

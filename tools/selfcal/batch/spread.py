@@ -41,9 +41,9 @@ Row = dict[str, Any]
 Work = tuple[int, list[Job]]
 #: Timeout of a scheduler, s.
 PATIENCE_S = 10.0
-#: Seeds that the simulator takes.
+#: Number of seeds that the simulator takes.
 SEEDS = 2**64
-#: Dead workers of a piece after which the piece is the reason.
+#: Number of dead workers of a piece after which the piece is the reason.
 DEATHS = 4
 _KILLED = "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"
 
@@ -87,8 +87,8 @@ def spread(
 ) -> list[Row]:
     """The rows of `function` for all `jobs`, in their order.
 
-    `settings`: everything that decides the rows beside the jobs; a folder of other settings is refused. `piece`: jobs
-    that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this package.
+    `settings`: everything that decides the rows apart from the jobs; a folder of other settings is refused. `piece`:
+    jobs that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this package.
     `results`: the folder, or what keeps the pieces. `count`: workers here, by default as many as processors. `lost`:
     the rows of a job whose workers die; without it such a job ends the work. `weights` [jobs]: the work of each, for
     the remaining time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.

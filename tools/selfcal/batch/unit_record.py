@@ -23,7 +23,7 @@ from selfcal.readings.tests import TESTS
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
-#: Checks of the readings, and of the innovations; deviation of a mark, in standard deviations.
+#: Checks of the readings, and of the innovations; least deviation of a mark, sd.
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
@@ -108,8 +108,8 @@ def own_pages(
     jobs = {}
     for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_PAGES]:
         source = devices[name][-1].source
-        known = keeper.place((source.path, source.content)).stem[:12]
-        jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{known}.html"))
+        digest = keeper.place((source.path, source.content)).stem[:12]
+        jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{digest}.html"))
     todo = [job for job in jobs.values() if not Path(job[1]).exists()]
     spread(partial(_paged, verbs, options), todo, settings={}, piece=1, count=count, lost=lambda _: [{}], verb="pages")
     return {name: f"{pages.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
@@ -140,8 +140,8 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
         if name in INNOVATIONS and abs(float(check["value"])) > FAR * float(check["limit"]) / CHECK_LIMIT
     ]
     lattice = checks.get("lattice", {})
-    known = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= 8 else {}
-    return {"marks": list(dict.fromkeys(marks)), **known}
+    stated = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= 8 else {}
+    return {"marks": list(dict.fromkeys(marks)), **stated}
 
 
 class ByContent:

@@ -26,10 +26,10 @@ class Unit:
     """One recording of the batch with its answer: `record` (batch/unit_record.py), or `error`."""
 
     def __init__(self, source: Source, record: Mapping[str, Any]) -> None:
-        known = record.get("recording", {})
+        recording = record.get("recording", {})
         self.source, self.record = source, record
-        self.device: str = source.device or known.get("serial", "") or stem(source.path)
-        dated: str = source.recorded_at or known.get("recorded_at", "")
+        self.device: str = source.device or recording.get("serial", "") or stem(source.path)
+        dated: str = source.recorded_at or recording.get("recorded_at", "")
         self.moment = moment(dated)
         #: Invalid date of its metadata.
         self.undated = dated if self.moment is None else ""
@@ -71,10 +71,10 @@ def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
             yield head | {"axis": name, "error": axis["error"]}
             continue
         law = likeliest(axis["hypotheses"])
-        known = {"law": law, "probability": axis["hypotheses"][law], "adequate": axis["adequate"]}
-        known |= {key: ";".join(unit.causes(name, key)) for key in ("causes", "material")}
+        extra = {"law": law, "probability": axis["hypotheses"][law], "adequate": axis["adequate"]}
+        extra |= {key: ";".join(unit.causes(name, key)) for key in ("causes", "material")}
         unjudged = unit.record.get("diagnosis", {}).get(name, {}).get("error")
-        known |= {} if unjudged is None else {"error": f"not diagnosed: {unjudged}"}
+        extra |= {} if unjudged is None else {"error": f"not diagnosed: {unjudged}"}
         coefficients = {
             column: coefficient
             for of in axis.get("regressors", {}).values()
@@ -82,7 +82,7 @@ def rows_of(unit: Unit, version: str) -> Iterator[dict[str, Any]]:
         }
         for parameter, estimate in {**axis["parameters"][law], **coefficients, "bias": bias_of(axis)}.items():
             numbers = {key: estimate[key] for key in ("median", "q05", "q95")}
-            yield {**head, "axis": name, "parameter": parameter, **numbers, "parameter_unit": estimate["unit"], **known}
+            yield {**head, "axis": name, "parameter": parameter, **numbers, "parameter_unit": estimate["unit"], **extra}
 
 
 def check_table(path: Path | str) -> None:

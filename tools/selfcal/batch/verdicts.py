@@ -168,10 +168,10 @@ def _judged(limit: Limit, axis: Mapping[str, Any] | None, duration_s: float) -> 
         return Verdict(limit, UNJUDGED, "the recording does not have the axis")
     if "error" in axis:
         return Verdict(limit, UNJUDGED, axis["error"])
-    known = axis if "hypotheses" in axis else axis.get("posterior")
-    if known is None:
+    posterior = axis if "hypotheses" in axis else axis.get("posterior")
+    if posterior is None:
         return Verdict(limit, UNJUDGED, "there is no posterior")
-    estimate = _estimate(limit.parameter, known)
+    estimate = _estimate(limit.parameter, posterior)
     if isinstance(estimate, str):
         return Verdict(limit, UNJUDGED, estimate)
     factor = 1.0 if limit.parameter in RATIOS else units.factor(estimate["unit"], limit.unit)
@@ -201,7 +201,7 @@ def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
     having = [law for law in probability if parameter in axis["parameters"][law]]
     if not having:
         return f"no law of the model has {parameter}"
-    law = best if best in having else max(having, key=lambda one: probability[one])
+    law = best if best in having else max(having, key=lambda law: probability[law])
     if law != best and not constant and probability[law] < 0.05:
         there = ", ".join(name for name in axis["parameters"][best] if name != "N")
         return f"its drift is {best}, which has no {parameter}: limit {there}"
@@ -209,14 +209,14 @@ def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
 
 
 def _rest_s(
-    limit: Limit, estimate: Mapping[str, Any], known: tuple[float, float, float], duration_s: float
+    limit: Limit, estimate: Mapping[str, Any], interval: tuple[float, float, float], duration_s: float
 ) -> float | None:
     """Rest beyond `duration_s` after which the verdict is there with the probability CHANCE, s; None: none does that.
 
     The posterior's variance falls as the inverse of the length, in the logarithm of all but a bias. Its median then
     moves by what the variance loses.
     """
-    median, q05, q95 = known
+    median, q05, q95 = interval
     if not estimate["sharpens"]:
         return None
     if not estimate["identified"]:

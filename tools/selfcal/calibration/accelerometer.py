@@ -22,15 +22,15 @@ from selfcal.calibration.tumble_fit import FALSE_ALARM, Fit, Problem, fit
 BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
 #: sd of the square of the scale, s^2/m: 0.5 mg at 1 g. Data sheets' 0.1 to 0.5 % of a range of 2 to 16 g are 0.1 to 1.
 SQUARE_SD = 5e-5
-#: Where the parameters are.
+#: Places of the parameters.
 BIAS, SCALE, ANGLE, GRAVITY, THERMAL = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 2))
-#: sd of a parameter that the logs do not have.
+#: sd of a parameter that the logs do not have: not 0, so that the prior has an inverse.
 NONE = 1e-12
 #: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
 REACH = 10.0
-#: Rests without which there is no answer.
+#: Fewest rests that give an answer.
 FEWEST = 3
 
 
@@ -122,24 +122,24 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
             "six positions or more"
         )
     mean, prior = _prior(tumble, place)
-    own, known = tumble.fitted(ACCEL, lambda known: _problem(known, place), mean, mean, prior)
-    found = Accelerometer(replace(own, outside=(GRAVITY,)), known, place)
-    theta = found.fit.theta
+    own, weighed = tumble.fitted(ACCEL, lambda weighed: _problem(weighed, place), mean, mean, prior)
+    accel = Accelerometer(replace(own, outside=(GRAVITY,)), weighed, place)
+    theta = accel.fit.theta
     if (np.abs(theta - mean) > REACH * np.sqrt(np.diag(prior)))[:GRAVITY].any():
-        bias, scale = (", ".join(f"{one:.3g}" for one in theta[part]) for part in (BIAS, SCALE))
+        bias, scale = (", ".join(f"{value:.3g}" for value in theta[part]) for part in (BIAS, SCALE))
         raise UserError(
             f"the accelerometers would have biases of {bias} m/s^2 and scales of {scale}: are the readings in the unit "
             "of their headings, and did the part rest?"
         )
-    return found
+    return accel
 
 
-def causes(found: Accelerometer) -> list[tuple[str, float]]:
+def causes(accel: Accelerometer) -> list[tuple[str, float]]:
     """Causes of residuals beyond their sd, as `Fit.surest` has them: a square, hysteresis, each rest by itself; before
     them rests in which the mount moved."""
-    tumble, one = found.tumble, found.fit
+    tumble = accel.tumble
     a, count = tumble.accel, len(tumble.rests)
-    w = found.force(a, tumble.warmth) @ found.matrix / found.place.gravity**2
+    w = accel.force(a, tumble.warmth) @ accel.matrix / accel.place.gravity**2
     before = np.vstack([np.zeros(3), a[:-1]])
     tried = [
         ("a square of the scale: the axes are not linear", w * a**2),
@@ -151,4 +151,4 @@ def causes(found: Accelerometer) -> list[tuple[str, float]]:
     for k in np.flatnonzero(moved >= FALSE_ALARM).tolist():
         tried.append((f"{where[k]} was none, or its mount was not still", np.eye(count)[:, [k]]))
     sure = np.flatnonzero(moved < FALSE_ALARM).tolist()
-    return [(f"the mount moved within {where[k]}", float(moved[k])) for k in sure] + one.surest(tried)
+    return [(f"the mount moved within {where[k]}", float(moved[k])) for k in sure] + accel.fit.surest(tried)

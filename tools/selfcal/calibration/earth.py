@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from selfcal.base.errors import UserError
 from selfcal.base.units import STANDARD_GRAVITY
 
-#: Earth's rate, rad/s; semi-major axis, m; flattening; gravity at the equator, m/s^2; Somigliana's constant; m.
+#: Earth's rate, rad/s; semi-major axis, m; flattening.
 RATE, MAJOR, FLATTENING = 7.292115e-5, 6378137.0, 1.0 / 298.257223563
-#: Height that is not stated: sd, m.
+#: sd of a height that is not stated, m.
 HEIGHT_SD = 500.0
-#: Heights that are taken, m; gravity that is taken, m/s^2.
+#: Limits of a height, m, and of gravity, m/s^2.
 HEIGHTS, GRAVITIES = (-500.0, 10_000.0), (9.7, 9.9)
 
 
@@ -41,7 +41,7 @@ def gravity_at(latitude_deg: float, height_m: float) -> float:
 
 
 def place(latitude_deg: float | None, height_m: float | None, gravity: float | None) -> Place:
-    """What is known of a place. Raises UserError for numbers that no place on Earth has."""
+    """Gravity and the Earth's rate at a place. Raises UserError for numbers that no place on Earth has."""
     if latitude_deg is not None and not -90.0 <= latitude_deg <= 90.0:
         raise UserError(f"--latitude {latitude_deg:g}: takes degrees from -90 to 90, north is positive")
     if height_m is not None and latitude_deg is None:
@@ -63,6 +63,6 @@ def place(latitude_deg: float | None, height_m: float | None, gravity: float | N
         return Place(STANDARD_GRAVITY, 0.015, *of_earth, "standard: neither --latitude nor --gravity is given")
     height_sd = 0.0 if height_m is not None else HEIGHT_SD
     value = gravity_at(latitude_deg, height_m or 0.0)
-    at = f"{height_m:g} m" if height_m is not None else f"the sea's level, {HEIGHT_SD:g} m more or less: no --height"
+    near = f"{height_m:g} m" if height_m is not None else f"the sea's level, {HEIGHT_SD:g} m more or less: no --height"
     # Anomalies of some 30 mGal, and the free-air gradient, 1/s^2.
-    return Place(value, math.hypot(3e-4, 3.086e-6 * height_sd), *of_earth, f"WGS-84 at {latitude_deg:g} deg, {at}")
+    return Place(value, math.hypot(3e-4, 3.086e-6 * height_sd), *of_earth, f"WGS-84 at {latitude_deg:g} deg, {near}")

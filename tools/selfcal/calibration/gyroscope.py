@@ -23,21 +23,20 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
-from selfcal.calibration.accelerometer import NONE, Accelerometer, forces, means_covariance, shaped
+from selfcal.calibration.accelerometer import ANGLE_SD, NONE, SCALE_SD, Accelerometer, forces, means_covariance, shaped
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import GYRO, Tumble, Turn
 from selfcal.calibration.tumble_fit import Fit, Problem
 
-#: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); scale; angle, rad; temperature
-#: coefficient, rad/s/degC (0.05 deg/s/degC).
+#: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); temperature coefficient,
+#: rad/s/degC (0.05 deg/s/degC). Scale and angles have the accelerometers'.
 BIAS_SD, G_SD, THERMAL_SD = math.radians(10.0), math.radians(0.1), math.radians(0.05)
-SCALE_SD, ANGLE_SD = 0.02, 0.02
-#: The accelerometers' parameters.
+#: Number of the accelerometers' parameters.
 OF_ACCEL = accelerometer.THERMAL.stop
-#: Windows of a turn that show signs and units, s. A gyro's factor may be off by WRONG. Share of the most turned axis,
-#: or of a turn, from which on it is judged. Information below which there is none.
+#: Windows of a turn that show signs and units, s; largest error of a gyro's factor; least share of the most turned
+#: axis, or of a turn, that is judged; information that is added to every entry of the factors.
 WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
-#: Where the parameters are, behind the accelerometers'.
+#: Places of the parameters, behind the accelerometers'.
 BIAS, G, SCALE, ANGLE, THERMAL = (slice(a, b) for a, b in ((0, 3), (3, 12), (12, 15), (15, 21), (22, 25)))
 VERTICAL, LEVEL = 21, 25
 #: Row and column of each angle.
@@ -70,11 +69,11 @@ def cross(v: Array) -> Array:
 
 def products_to_end(R: Array) -> Array:
     """R[k] R[k + 1] ... R[n - 1] of each k [n, 3, 3], by doubling."""
-    found, step = R.copy(), 1
-    while step < len(found):
-        found[:-step] = found[:-step] @ found[step:]
+    products, step = R.copy(), 1
+    while step < len(products):
+        products[:-step] = products[:-step] @ products[step:]
         step *= 2
-    return found
+    return products
 
 
 def turned(rate: Array, dt: float) -> tuple[Array, Array]:
@@ -86,10 +85,10 @@ def turned(rate: Array, dt: float) -> tuple[Array, Array]:
 
 
 def fault_of(accel: Accelerometer) -> str:
-    """What the turns say is wrong with signs, axes or units of the gyros; "" for nothing. Gravity's direction u moves
+    """Faults of signs, axes or units of the gyros by the turns; "" without a fault. Gravity's direction u moves
     by u x w, which is linear in the rates: M [3, 3] of w = M y needs no start. An axis of few turns is not judged."""
     rests, moves, angles, middles = accel.tumble.rests, [], [], []
-    for turn in (one for one in accel.tumble.turns if not one.reason):
+    for turn in (turn for turn in accel.tumble.turns if not turn.reason):
         size = max(2, round(WINDOW_S / turn.dt))
         first = np.arange(0, len(turn.accel) - size, size)
         f = accel.force(turn.accel, np.zeros(len(turn.accel)))
@@ -101,32 +100,32 @@ def fault_of(accel: Accelerometer) -> str:
         middles.append(u[first + size // 2])
     if not moves:
         return ""
-    moved, angle, u = (np.concatenate(one) for one in (moves, angles, middles))
-    turned, seen = np.linalg.norm(np.cross(u, moved), axis=0), np.linalg.norm(angle, axis=0)
-    columns = (cross(u)[:, :, :, None] * (angle / np.maximum(seen, 1e-12))[:, None, None, :]).reshape(-1, 9)
+    moved, angle, u = (np.concatenate(part) for part in (moves, angles, middles))
+    turned, measured = np.linalg.norm(np.cross(u, moved), axis=0), np.linalg.norm(angle, axis=0)
+    columns = (cross(u)[:, :, :, None] * (angle / np.maximum(measured, 1e-12))[:, None, None, :]).reshape(-1, 9)
     inverse = np.linalg.inv(columns.T @ columns + FAINT * np.eye(9))
-    found = inverse @ columns.T @ moved.ravel()
-    sd = np.sqrt(np.mean((moved.ravel() - columns @ found) ** 2) * np.diag(inverse)).reshape(3, 3)
+    factors = inverse @ columns.T @ moved.ravel()
+    sd = np.sqrt(np.mean((moved.ravel() - columns @ factors) ** 2) * np.diag(inverse)).reshape(3, 3)
     said = dict[str, list[str]]()
     for k in np.flatnonzero(turned > SHOWN * turned.max()).tolist():
-        at = int(np.abs(found.reshape(3, 3)[k]).argmax())
-        share, value = (float(found[3 * k + at] / max(one, 1e-12)) for one in (turned[k], seen[at]))
-        if at == k and abs(value - 1.0) < WRONG + 4.0 * float(sd[k, at] / max(seen[at], 1e-12)):
+        axis = int(np.abs(factors.reshape(3, 3)[k]).argmax())
+        share, value = (float(factors[3 * k + axis] / max(length, 1e-12)) for length in (turned[k], measured[axis]))
+        if axis == k and abs(value - 1.0) < WRONG + 4.0 * float(sd[k, axis] / max(measured[axis], 1e-12)):
             continue
-        words = [f"has the turns about {'xyz'[k]}"] * (at != k) + ["is of the other sign"] * (value < 0.0)
+        words = [f"has the turns about {'xyz'[k]}"] * (axis != k) + ["is of the other sign"] * (value < 0.0)
         if not 1.0 - WRONG < abs(value) < 1.0 + WRONG:
             # Units that are taken for each other.
             units = [
-                one
-                for one, size in (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
+                unit
+                for unit, size in (("deg/s", math.radians(1.0)), ("rad/s", math.degrees(1.0)))
                 if abs(math.log(abs(value) / size)) < WRONG
             ]
             words.append(
                 f"reads as if its unit were {units[0]}" if units else f"reads {1 / abs(value):.2g} times the rate"
             )
         if abs(share) < SHOWN:
-            at, words = k, ["does not show its turns"]
-        said.setdefault(" and ".join(words), []).append(GYRO[at])
+            axis, words = k, ["does not show its turns"]
+        said.setdefault(" and ".join(words), []).append(GYRO[axis])
     return "; ".join(f"{'each of ' * (len(who) > 1)}{', '.join(who)} {words}" for words, who in said.items())
 
 
@@ -147,13 +146,13 @@ def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
     start = mean.copy()
     start[OF_ACCEL:][BIAS] = problem.y.mean(axis=0)
     keep = None if held is None else np.concatenate([np.zeros(OF_ACCEL, bool), held])
-    found, _ = accel.tumble.fitted(GYRO, problem.under, start, mean, prior, keep)
-    return Gyroscope(found, OF_ACCEL, problem.turns)
+    fit, _ = accel.tumble.fitted(GYRO, problem.under, start, mean, prior, keep)
+    return Gyroscope(fit, OF_ACCEL, problem.turns)
 
 
 @dataclass(frozen=True)
 class _Directions:
-    """Of the rests: directions `u` [n, 3], forces `f` [n, 3] in g, and the derivatives of `u` to the accelerometers'
+    """Rests: directions `u` [n, 3], forces `f` [n, 3] in g, and the derivatives of `u` to the accelerometers'
     parameters [n, 3, k] and to their readings [n, 3, 3]. `matrix`: T K of the accelerometers."""
 
     u: Array
@@ -179,15 +178,15 @@ class _Problem:
         self.accel, self.tumble = accel, accel.tumble
         rests = self.tumble.rests
         self.count, self.temp = len(rests), float(self.tumble.temp.mean())
-        self.turns = tuple(one for one in self.tumble.turns if not one.reason)
+        self.turns = tuple(turn for turn in self.tumble.turns if not turn.reason)
         self.behind = {turn.first + 1: k for k, turn in enumerate(self.turns)}  # turn that leads to a rest
         self.chain = np.cumsum([k not in self.behind for k in range(self.count)]) - 1
-        self.y = np.nan_to_num([one.gyro for one in rests])  # one that is not recorded weighs nothing
+        self.y = np.nan_to_num([rest.gyro for rest in rests])  # one that is not recorded weighs nothing
         self.white = np.array([self.tumble.noise[name].white for name in GYRO])
         self.of_rests = [self.white / rest.seconds + rest.rounded[3:] for rest in rests]
         self.of_accel_means = [means_covariance(self.tumble, k, float(accel.fit.theta[k])) for k in range(3)]
-        self.begin_s = np.concatenate([self.tumble.begin_s, [rests[one.first].end_s for one in self.turns]])
-        self.end_s = np.concatenate([self.tumble.end_s, [rests[one.first + 1].begin_s for one in self.turns]])
+        self.begin_s = np.concatenate([self.tumble.begin_s, [rests[turn.first].end_s for turn in self.turns]])
+        self.end_s = np.concatenate([self.tumble.end_s, [rests[turn.first + 1].begin_s for turn in self.turns]])
         self.last: tuple[Array, tuple[Array, ...]] | None = None
 
     def under(self, tumble: Tumble) -> Problem:
@@ -205,7 +204,7 @@ class _Problem:
     def _laid(self, theta: Array) -> tuple[Array, Array, Array, Array]:
         """Residuals, their derivatives, their covariance without the gyros' drift, and how that drift enters them."""
         count, own, warm = self.count, theta[OF_ACCEL:], self.tumble.warmth
-        at = _Directions.of(theta, self.tumble)
+        directions = _Directions.of(theta, self.tumble)
         size = 3 * count + 2 * len(self.turns)
         r, J = np.zeros(size), np.zeros((size, theta.size))
         # Noise enters by the means of the gyros over rests and turns, by those of the accelerometers, and within turns.
@@ -218,24 +217,24 @@ class _Problem:
             if k in self.behind:
                 n = self.behind[k]
                 rows = slice(3 * count + 2 * n, 3 * count + 2 * n + 2)
-                way = _Way(self.turns[n], own, theta, at, self.temp)
+                way = _Way(self.turns[n], own, theta, directions, self.temp)
                 level = way.Q.T @ level
                 r[rows] = way.residual - way.slope @ level @ theta[of_level] * way.seconds
-                J[rows, :OF_ACCEL] = way.basis @ (way.Q.T @ at.to_accel[k - 1] - at.to_accel[k])
+                J[rows, :OF_ACCEL] = way.basis @ (way.Q.T @ directions.to_accel[k - 1] - directions.to_accel[k])
                 J[rows, OF_ACCEL : OF_ACCEL + LEVEL] = way.derivatives
                 J[rows, of_level] = -way.slope @ level * way.seconds
                 by_gyro[rows, count + n] = way.to_bias
-                by_accel[rows, k - 1] = way.basis @ way.Q.T @ at.to_reading[k - 1]
-                by_accel[rows, k] = -way.basis @ at.to_reading[k]
+                by_accel[rows, k - 1] = way.basis @ way.Q.T @ directions.to_reading[k - 1]
+                by_accel[rows, k] = -way.basis @ directions.to_reading[k]
                 R[rows, rows] = way.white(self.white)
             else:
-                level = _across(at.u[k]).T
+                level = _across(directions.u[k]).T
             rows = slice(3 * k, 3 * k + 3)
-            drawn = own[BIAS] + own[THERMAL] * warm[k] + own[G].reshape(3, 3) @ at.f[k]
-            r[rows] = self.y[k] - drawn - earth * at.u[k] - level @ theta[of_level]
+            drawn = own[BIAS] + own[THERMAL] * warm[k] + own[G].reshape(3, 3) @ directions.f[k]
+            r[rows] = self.y[k] - drawn - earth * directions.u[k] - level @ theta[of_level]
             of = J[rows, OF_ACCEL:]
             of[:, BIAS], of[:, THERMAL] = -np.eye(3), -np.eye(3) * warm[k]
-            of[:, G], of[:, VERTICAL] = -np.kron(np.eye(3), at.f[k]), -at.u[k]
+            of[:, G], of[:, VERTICAL] = -np.kron(np.eye(3), directions.f[k]), -directions.u[k]
             J[rows, of_level] = -level
             by_gyro[rows, k] = np.eye(3)
             R[rows, rows] = np.diag(self.of_rests[k])
@@ -248,55 +247,53 @@ class _Way:
     """A turn: its rotation `Q`, the residual [2] of the direction behind it in a `basis` [2, 3] across that direction,
     the `slope` [2, 3] of the residual to a rotation of the end, and its derivatives to the gyros' own parameters."""
 
-    def __init__(self, turn: Turn, own: Array, theta: Array, at: _Directions, temp: float) -> None:
+    def __init__(self, turn: Turn, own: Array, theta: Array, directions: _Directions, temp: float) -> None:
         warm = float(np.nan_to_num(turn.temp - temp))
         offset = theta[accelerometer.BIAS] + warm * theta[accelerometer.THERMAL]
-        force = (turn.accel - offset) @ at.matrix.T / STANDARD_GRAVITY
+        force = (turn.accel - offset) @ directions.matrix.T / STANDARD_GRAVITY
         clean = turn.gyro - own[BIAS] - own[THERMAL] * warm - force @ own[G].reshape(3, 3).T
         self.matrix, self.dt, self.unsure = gyro_matrix(own), turn.dt, turn.unsure
         self.Q, back = turned(clean @ self.matrix.T, turn.dt)
         weight = np.full(len(clean), turn.dt)
         weight[[0, -1]] *= 0.5
         self.seconds = float(weight.sum())
-        predicted = self.Q.T @ at.u[turn.first]
-        self.basis = _across(at.u[turn.first + 1])
-        self.residual = self.basis @ (predicted - at.u[turn.first + 1])
+        predicted = self.Q.T @ directions.u[turn.first]
+        self.basis = _across(directions.u[turn.first + 1])
+        self.residual = self.basis @ (predicted - directions.u[turn.first + 1])
         self.slope = self.basis @ cross(predicted)
         self.P = weight[:, None, None] * back  # rotation of the end by the rate at each sample
         self.to_bias = self.slope @ self.P.sum(axis=0) @ self.matrix
-        found = np.zeros((2, LEVEL))
-        found[:, BIAS], found[:, THERMAL] = -self.to_bias, -self.to_bias * warm
-        found[:, G] = -self.slope @ np.einsum("kij,jl,km->ilm", self.P, self.matrix, force).reshape(3, 9)
+        derivatives = np.zeros((2, LEVEL))
+        derivatives[:, BIAS], derivatives[:, THERMAL] = -self.to_bias, -self.to_bias * warm
+        derivatives[:, G] = -self.slope @ np.einsum("kij,jl,km->ilm", self.P, self.matrix, force).reshape(3, 9)
         by_matrix = np.einsum("kij,kl->ijl", self.P, clean)  # to each entry of T K
         T = self.matrix / own[SCALE]
         for j in range(3):
-            found[:, SCALE.start + j] = self.slope @ by_matrix[:, :, j] @ T[:, j]
+            derivatives[:, SCALE.start + j] = self.slope @ by_matrix[:, :, j] @ T[:, j]
         for j, (row, column) in enumerate(PLACES):
-            found[:, ANGLE.start + j] = self.slope @ by_matrix[:, row, column] * own[SCALE][column]
-        self.derivatives = found
+            derivatives[:, ANGLE.start + j] = self.slope @ by_matrix[:, row, column] * own[SCALE][column]
+        self.derivatives = derivatives
 
     def white(self, density: Array) -> Array:
         """Covariance [2, 2] of the residual by white noise within the turn, N^2 of each gyro [3]."""
         noisy = self.slope @ self.P @ self.matrix
-        found: Array = np.einsum("kij,kj,klj->il", noisy, density / self.dt + self.unsure, noisy)
-        return found
+        return np.asarray(np.einsum("kij,kj,klj->il", noisy, density / self.dt + self.unsure, noisy))
 
 
 def _across(u: Array) -> Array:
     """Two directions [2, 3] across a direction [3]."""
-    found: Array = np.linalg.svd(u[None, :])[2][1:]
-    return found
+    return np.asarray(np.linalg.svd(u[None, :])[2][1:])
 
 
 def causes(gyro: Gyroscope, tumble: Tumble) -> list[tuple[str, float]]:
     """Causes of residuals beyond their sd, as `Fit.surest` has them: each rest and each turn by itself."""
-    one, rests = np.eye(gyro.fit.white.size), tumble.rests
+    identity, rests = np.eye(gyro.fit.white.size), tumble.rests
     tried = [
-        (f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", one[:, 3 * k : 3 * k + 3])
+        (f"the gyros turned in the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s", identity[:, 3 * k : 3 * k + 3])
         for k, rest in enumerate(rests)
     ]
     for k, turn in enumerate(gyro.turns):
         first = 3 * len(rests) + 2 * k
         said = f"the turn at {rests[turn.first].at_s[1]:.6g} s does not end where its rates lead"
-        tried.append((said, one[:, first : first + 2]))
+        tried.append((said, identity[:, first : first + 2]))
     return gyro.fit.surest(tried)

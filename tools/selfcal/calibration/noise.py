@@ -24,7 +24,7 @@ from selfcal.model.laws import Law
 
 #: Shortest rest that identifies the law of the part, s.
 LONG_S = 1200.0
-#: Differences of piece means that measure N: fewer leave it to the model.
+#: Fewest differences of piece means that measure N: fewer leave it to the model.
 FEWEST = 30
 
 
@@ -51,7 +51,7 @@ class Noise:
         if not self.wide:
             return self
         terms = zip(shares.tolist(), self.terms, strict=True)
-        return replace(self, terms=tuple(Term(share * one.square, one.alpha) for share, one in terms))
+        return replace(self, terms=tuple(Term(share * term.square, term.alpha) for share, term in terms))
 
 
 def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Array:
@@ -59,12 +59,12 @@ def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Arr
     length, middle = end_s - begin_s, 0.5 * (begin_s + end_s)
     back, apart = reference_s - middle, np.abs(middle[:, None] - middle[None, :])
     same = np.eye(length.size, dtype=bool)
-    found = np.zeros((length.size, length.size))
+    covariance = np.zeros((length.size, length.size))
     for term in noise.terms:
         if term.alpha == 0.0:
             walk = np.minimum(back[:, None], back[None, :])
             walk[same] = reference_s - end_s + length / 3.0
-            found += term.square * walk
+            covariance += term.square * walk
             continue
         x = term.alpha * length
         mean = np.where(x > 1e-6, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0)
@@ -74,8 +74,8 @@ def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Arr
         between = np.exp(-term.alpha * gap) * mean[:, None] * mean[None, :]
         between[same] = own
         to_end = np.exp(-term.alpha * (back - half)) * mean
-        found += term.square * (between - to_end[:, None] - to_end[None, :] + 1.0)
-    return found
+        covariance += term.square * (between - to_end[:, None] - to_end[None, :] + 1.0)
+    return covariance
 
 
 def mean_square(prior: Prior) -> float:
@@ -93,7 +93,7 @@ def of_laws(
 ) -> tuple[Term, ...]:
     """Terms of a mixture of laws. `values`: by law and parameter the mean square and the median. An oscillation counts
     as a Gauss-Markov drift of its period."""
-    total, found = sum(probability.values()), []
+    total, terms = sum(probability.values()), []
     for name, share in probability.items():
         law, own = laws[name], values[name]
         if len(law.parameters) < 2 or not share > 0.0:
@@ -103,8 +103,8 @@ def of_laws(
         for term in law.terms:
             size = share / total * square * (term.deviation * (second if term.by_ratio else 1.0)) ** 2
             bandwidth = term.bandwidth * (1.0 if term.stated else second)
-            found.append(Term(size) if term.kind == "walk" else Term(size, bandwidth))
-    return tuple(found)
+            terms.append(Term(size) if term.kind == "walk" else Term(size, bandwidth))
+    return tuple(terms)
 
 
 def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
@@ -123,13 +123,13 @@ def of_model(model: Model, axis: str, unit: str, N: float | None) -> Noise:
 
 
 def of_rest(recording: Recording, axis: str, model: Model, unit: str) -> Noise | None:
-    """What `identify` finds of an axis in a long rest, in `unit`; None where it has no answer."""
+    """The noise of an axis by `identify` of a long rest, in `unit`; None where it has no answer."""
     try:
-        found = identify_axis(recording, axis, model, "library", None)
+        identified = identify_axis(recording, axis, model, "library", None)
     except UserError:
         return None
-    size = factor(found.unit, unit) ** 2
-    result = found.result
+    size = factor(identified.unit, unit) ** 2
+    result = identified.result
     values = {
         law: {key: (estimate.mean**2 + estimate.sd**2, estimate.median) for key, estimate in own.items()}
         for law, own in result.parameters.items()

@@ -22,13 +22,13 @@ from selfcal.readings.rest import PIECE_S, rest_of
 
 ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
-#: Seconds that are cut off a rest beside a motion: its first and last movement is below the noise of a piece.
+#: Time that is cut off a rest next to a motion, s: its first and last movement is below the noise of a piece.
 SETTLE_S = PIECE_S
 #: Shortest rest that is advised, s, and what the search for motion takes off both ends of one at most, s.
 REST_S, CUT_S = 10.0, 6.0 * PIECE_S
 #: Most rests: the fit is dense.
 MOST = 200
-#: Pieces of a rest: their differences show its drift.
+#: Number of pieces of a rest: their differences show its drift.
 PIECES = 8
 #: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
 #: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
@@ -86,7 +86,7 @@ class Tumble:
         return GYRO[0] in self.noise
 
     def wide(self, names: Sequence[str]) -> int:
-        """Terms of the drift of axes whose prior spans decades; 0: there are none."""
+        """Terms of the drift of axes whose prior spans decades; 0 without such an axis."""
         return max((len(self.noise[name].terms) for name in names if self.noise[name].wide), default=0)
 
     def with_drift(self, names: Sequence[str], shares: Array) -> Tumble:
@@ -101,36 +101,36 @@ class Tumble:
         its terms. Before, each term by itself is as likely, and its deviation uniform. A prior of its logarithm would
         be decided by the least of SHARES, which no log contradicts (Gelman 2006). A rest in which the mount moved is
         no drift's: none counts for more than RESTLESS."""
-        known, count = self, self.wide(names)
+        weighed, count = self, self.wide(names)
         if count:
             middle = self.with_drift(names, np.full(count, SHARES[SHARES.size // 2]))
             start = fit(problem_of(middle), start, mean, prior, held).theta
-            tried = [[self.with_drift(names, share * one) for share in SHARES] for one in np.eye(count)]
-            within = np.array([[one.within(names) for one in row] for row in tried])
+            tried = [[self.with_drift(names, share * term) for share in SHARES] for term in np.eye(count)]
+            within = np.array([[tumble.within(names) for tumble in row] for row in tried])
             likely = np.maximum(within - within.max(axis=(0, 1)), -RESTLESS).sum(axis=2)
-            likely += [[linearized(problem_of(one), start, mean, prior, held).evidence for one in row] for row in tried]
+            problems = [[problem_of(tumble) for tumble in row] for row in tried]
+            likely += [[linearized(p, start, mean, prior, held).evidence for p in row] for row in problems]
             weight = np.sqrt(SHARES) * np.exp(likely - likely.max())
-            known = self.with_drift(names, weight @ SHARES / weight.sum())
-        return fit(problem_of(known), start, mean, prior, held), known
+            weighed = self.with_drift(names, weight @ SHARES / weight.sum())
+        return fit(problem_of(weighed), start, mean, prior, held), weighed
 
     def _pieces(self, names: Sequence[str]) -> Iterator[tuple[int, Array, Array]]:
-        """Of each rest and axis the number of the rest, its pieces [PIECES], and their covariance but for what they
-        share."""
+        """Number, pieces [PIECES] and their covariance, less their common part, of each rest and axis."""
         for k, name in enumerate(ACCEL + GYRO):
-            for n, one in enumerate(self.rests if name in names else ()):
-                edges = np.linspace(one.begin_s, one.end_s, PIECES + 1)
-                C = drift(self.noise[name], edges[:-1], edges[1:], one.end_s)
-                white = self.noise[name].white * PIECES / one.seconds + one.rounded[k]
-                if np.isfinite(one.pieces[:, k]).all():
-                    yield n, one.pieces[:, k], C + white * np.eye(PIECES)
+            for n, rest in enumerate(self.rests if name in names else ()):
+                edges = np.linspace(rest.begin_s, rest.end_s, PIECES + 1)
+                C = drift(self.noise[name], edges[:-1], edges[1:], rest.end_s)
+                white = self.noise[name].white * PIECES / rest.seconds + rest.rounded[k]
+                if np.isfinite(rest.pieces[:, k]).all():
+                    yield n, rest.pieces[:, k], C + white * np.eye(PIECES)
 
     def within(self, names: Sequence[str]) -> Array:
         """ln of the likelihood of the differences between neighbouring pieces of each rest [n], but for a constant."""
-        found, step = np.zeros(len(self.rests)), np.diff(np.eye(PIECES), axis=0)
+        ln_likelihood, step = np.zeros(len(self.rests)), np.diff(np.eye(PIECES), axis=0)
         for n, x, C in self._pieces(names):
             d, R = step @ x, step @ C @ step.T
-            found[n] -= 0.5 * float(d @ np.linalg.solve(R, d) + np.linalg.slogdet(R)[1])
-        return found
+            ln_likelihood[n] -= 0.5 * float(d @ np.linalg.solve(R, d) + np.linalg.slogdet(R)[1])
+        return ln_likelihood
 
     def moved(self, names: Sequence[str]) -> Array:
         """Probability [n] that the halves of each rest are so far apart by chance, times the number of rests."""
@@ -201,8 +201,8 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     gyros = tuple(name for name in GYRO if all(name in recording.columns for recording in recordings))
     axes = ACCEL + gyros
     begins, notes = _begins(recordings)
-    logs = [_log(one, begin_s, axes) for one, begin_s in zip(recordings, begins, strict=True)]
-    if sum(len(one.rests) for one in logs) > MOST:
+    logs = [_log(recording, begin_s, axes) for recording, begin_s in zip(recordings, begins, strict=True)]
+    if sum(len(log.rests) for log in logs) > MOST:
         raise UserError(f"more than {MOST} rests: choose a stretch with --start and --end")
     ranges = {name: _range(model, name) if part_stated else math.inf for name in axes}
     rows_of = [(log, rows) for log in logs for rows in log.rests]
@@ -249,12 +249,12 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
     time = recording.time_s + recording.start_s
     bridged = {name: _over_lost(time, values) for name, values in own.items()}
     columns = {name: replace(recording.columns[name], values=values) for name, values in bridged.items()}
-    found = rest_of(replace(recording, columns=columns), axes)
-    still = found.still or ((float(time[0]), float(time[-1])),)
+    motion = rest_of(replace(recording, columns=columns), axes)
+    still = motion.still or ((float(time[0]), float(time[-1])),)
     rests = []
     for begin_rest, end_rest in still:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
-        end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in found.moved)
+        end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in motion.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
         if end - begin >= 2.0 and behind - first >= PIECES:
             rests.append(slice(first, behind))
@@ -266,7 +266,7 @@ def _long_rest(logs: Sequence[_Log]) -> Recording | None:
     long = [(log, rows) for log in logs for rows in log.rests if log.seconds(rows) >= LONG_S]
     if not long:
         return None
-    log, rows = max(long, key=lambda one: one[0].seconds(one[1]))
+    log, rows = max(long, key=lambda stretch: stretch[0].seconds(stretch[1]))
     kept = np.zeros(log.recording.samples, bool)
     kept[rows] = True
     return log.recording.with_rows(kept)
@@ -275,8 +275,8 @@ def _long_rest(logs: Sequence[_Log]) -> Recording | None:
 def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording | None) -> Noise:
     """White noise and drift of an axis: of a long rest, or of the model about the noise that the rests show. A model of
     the part itself needs no long rest."""
-    if long_rest is not None and (found := of_rest(long_rest, name, model, UNITS[name])) is not None:
-        return found
+    if long_rest is not None and (noise := of_rest(long_rest, name, model, UNITS[name])) is not None:
+        return noise
     pieces = []
     for log in logs:
         size = max(1, round(PIECE_S * log.recording.rate_hz))
@@ -291,13 +291,13 @@ def _begins(recordings: Sequence[Recording]) -> tuple[list[float], list[str]]:
         return [0.0], []
     stamps = [recording.started_s for recording in recordings]
     if all(stamp is not None for stamp in stamps):
-        known = [float(stamp) for stamp in stamps if stamp is not None]
-        ends = [begin + recording.duration_s for begin, recording in zip(known, recordings, strict=True)]
-        if all(end <= begin for end, begin in zip(ends, known[1:], strict=False)):
-            return [begin - known[0] for begin in known], []
+        begins = [float(stamp) for stamp in stamps if stamp is not None]
+        ends = [begin + recording.duration_s for begin, recording in zip(begins, recordings, strict=True)]
+        if all(end <= begin for end, begin in zip(ends, begins[1:], strict=False)):
+            return [begin - begins[0] for begin in begins], []
     lengths = [recording.duration_s + BETWEEN_S for recording in recordings]
     note = f"the logs have no stamps of one clock: taken in the order given, {BETWEEN_S:g} s apart"
-    return [float(one) for one in np.cumsum([0.0, *lengths[:-1]])], [note]
+    return [float(begin) for begin in np.cumsum([0.0, *lengths[:-1]])], [note]
 
 
 def _range(model: Model, name: str) -> float:
@@ -313,8 +313,8 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     cut = np.linspace(rows.start, rows.stop, PIECES + 1).astype(int).tolist()
 
     def means(names: tuple[str, ...], part: slice) -> Array:
-        known = [own[name][part][np.isfinite(own[name][part])] if name in own else np.zeros(0) for name in names]
-        return np.array([one.mean() if one.size else math.nan for one in known])
+        present = [own[name][part][np.isfinite(own[name][part])] if name in own else np.zeros(0) for name in names]
+        return np.array([values.mean() if values.size else math.nan for values in present])
 
     rounded = []
     for name in ACCEL + GYRO:
@@ -366,9 +366,9 @@ def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, 
         whole[place] = part
         if 2 * np.isfinite(whole).sum() < whole.size:
             reasons.append(f"more than half of its samples of {name} are missing")
-        for at, rest in zip((0, -1), ends, strict=True):
-            if math.isnan(whole[at]):
-                whole[at] = (*rest.accel, *rest.gyro)[k]
+        for edge, rest in zip((0, -1), ends, strict=True):
+            if math.isnan(whole[edge]):
+                whole[edge] = (*rest.accel, *rest.gyro)[k]
         values, variance = _bridged(whole)
         columns.append(values)
         unsure.append(variance)
@@ -400,11 +400,11 @@ def _bridged(values: Array) -> tuple[Array, Array]:
 
 
 def _flat(part: Array, values: Array, step: float) -> bool:
-    """Whether readings of a turn [n] stop at the record's extreme: equal there, and the readings beside far off."""
+    """Whether readings of a turn [n] stop at the record's extreme: equal there, and their neighbours far off."""
     for extreme in (float(np.nanmax(values)), float(np.nanmin(values))):
         for first, behind in runs(part == extreme):
             beside = part[[max(first - 1, 0), min(behind, part.size - 1)]]
-            # A turn clips at three readings in a row, three steps of the lattice from the readings beside them.
+            # A turn clips at three readings in a row, three steps of the lattice from their neighbours.
             if behind - first >= 3 and np.abs(beside - extreme).min() > 3.0 * step:
                 return True
     return False

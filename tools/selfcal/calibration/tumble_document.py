@@ -37,7 +37,7 @@ OF_GYRO = (
 def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyroscope | str | None) -> dict[str, Any]:
     """The whole answer, in SI units and degrees. `gyro`: None without gyros, a line where they have no answer."""
     place, tumble = accel.place, accel.tumble
-    notes = [*tumble.notes, *(f"{text}: left out" for text in tumble.left_out), *_told_of_turns(accel)]
+    notes = [*tumble.notes, *(f"{text}: left out" for text in tumble.left_out), *_notes_of_turns(accel)]
     return {
         "schema": SCHEMA,
         "recordings": [recording_entry(recording) for recording in recordings],
@@ -83,22 +83,22 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
     }
 
 
-def _entry(fit: Fit, at: int, unit: str, size: float) -> dict[str, Any]:
+def _entry(fit: Fit, k: int, unit: str, size: float) -> dict[str, Any]:
     """A parameter; no number of one that is not identified."""
-    known = bool(fit.identified[at])
-    value, sd = size * float(fit.theta[at]), size * math.sqrt(float(fit.covariance[at, at]))
+    identified = bool(fit.identified[k])
+    value, sd = size * float(fit.theta[k]), size * math.sqrt(float(fit.covariance[k, k]))
     ends = (value - HALF_90 * sd, value + HALF_90 * sd)
     numbers = {"median": value, "sd": sd, "q05": ends[0], "q95": ends[1]}
-    return {**(numbers if known else dict.fromkeys(numbers)), "unit": unit, "identified": known}
+    return {**(numbers if identified else dict.fromkeys(numbers)), "unit": unit, "identified": identified}
 
 
 def _entries(fit: Fit, start: int, names: Sequence[tuple[str, str, str]]) -> dict[str, dict[str, Any]]:
     """Parameters from `start` on by group and name."""
-    found: dict[str, dict[str, Any]] = {}
+    entries: dict[str, dict[str, Any]] = {}
     for k, (group, name, unit) in enumerate(names):
         size = math.degrees(1.0) if unit.startswith("deg/s") else 1.0
-        found.setdefault(group, {})[name] = _entry(fit, start + k, unit, size)
-    return found
+        entries.setdefault(group, {})[name] = _entry(fit, start + k, unit, size)
+    return entries
 
 
 def _thermal(
@@ -150,7 +150,7 @@ def side_of(up: Array) -> str:
 
 
 def _positions(accel: Accelerometer) -> list[str]:
-    """Further rests by which every parameter would be identified, one after another that tells most."""
+    """Further rests by which every parameter would be identified, the most informative one first."""
     fit, place, own = accel.fit, accel.place, slice(0, len(OF_ACCEL))
     if fit.identified[own].all():
         return []
@@ -160,7 +160,7 @@ def _positions(accel: Accelerometer) -> list[str]:
     noise = white + max(np.diag(accel.fit.root @ accel.fit.root.T).mean(), 0.0)
     covariance, named = fit.widened(), []
     inverse = np.linalg.inv(accel.matrix)
-    candidates = [np.array(c, float) for c in np.ndindex(3, 3, 3) if 1 <= sum(abs(one - 1) for one in c) <= 2]
+    candidates = [np.array(c, float) for c in np.ndindex(3, 3, 3) if 1 <= sum(abs(digit - 1) for digit in c) <= 2]
     for _ in range(4):
         best, gained = None, 0.0
         weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
@@ -186,32 +186,32 @@ def _positions(accel: Accelerometer) -> list[str]:
 
 def _turns(gyro: Gyroscope, tumble: Tumble) -> list[str]:
     """Further rests and turns by which every parameter would be identified."""
-    known = gyro.fit.identified[gyro.of_accel :]
-    if absent := [name for name, one in tumble.noise.items() if not one.words]:
+    identified = gyro.fit.identified[gyro.of_accel :]
+    if absent := [name for name, noise in tumble.noise.items() if not noise.words]:
         return [f"a log with {', '.join(absent)} as well"]
     named = []
-    if not known[gyroscope.G].all():
+    if not identified[gyroscope.G].all():
         named.append("rests with other sides up: four or more, not all in one plane")
     for k, axis in enumerate(AXES):
-        own = [known[gyroscope.ANGLE][n] for n, (_, column) in enumerate(gyroscope.PLACES) if column == k]
-        if not (known[gyroscope.SCALE][k] and all(own)):
+        own = [identified[gyroscope.ANGLE][n] for n, (_, column) in enumerate(gyroscope.PLACES) if column == k]
+        if not (identified[gyroscope.SCALE][k] and all(own)):
             named.append(f"turns of 60 to 120 deg about {axis}, with {axis} level, from two sides")
     return named
 
 
-def _told_of_turns(accel: Accelerometer) -> list[str]:
-    """Turns that are left out, and those that tell little."""
-    tumble, told = accel.tumble, []
+def _notes_of_turns(accel: Accelerometer) -> list[str]:
+    """Turns that are left out, and turns that show little."""
+    tumble, lines = accel.tumble, []
     f = accel.force(tumble.accel, tumble.warmth)
     u = f / np.linalg.norm(f, axis=1)[:, None]
     for turn in tumble.turns:
         where = f"turn of {tumble.rests[turn.first].at_s[1]:.6g} to {tumble.rests[turn.first + 1].at_s[0]:.6g} s"
         if turn.reason:
-            told.append(f"{where}: {turn.reason}: left out")
+            lines.append(f"{where}: {turn.reason}: left out")
             continue
         way = float(np.linalg.norm(turn.gyro - tumble.rests[turn.first].gyro, axis=1).sum()) * turn.dt
         apart = math.acos(float(np.clip(u[turn.first] @ u[turn.first + 1], -1.0, 1.0)))
-        # A turn of more than 30 deg that ends within 15 deg of where it began tells little.
+        # A turn of more than 30 deg that ends within 15 deg of where it began shows little.
         if way > math.radians(30.0) and apart < math.radians(15.0):
-            told.append(f"{where}: {math.degrees(way):.0f} deg, and the same side is up: it tells little")
-    return told
+            lines.append(f"{where}: {math.degrees(way):.0f} deg, and the same side is up: it tells little")
+    return lines

@@ -83,14 +83,14 @@ def _whole(
         lines.append(f"and f by up to {1e3 * np.linalg.norm(off, axis=1).max():.3g} mg")
     if gyro is None:
         return Whole(bias, matrix, None, tuple(lines))
-    known = gyro.fit.identified[gyro.of_accel :]
+    identified = gyro.fit.identified[gyro.of_accel :]
     lost = _unknown(document, "gyroscope", ("bias", "scale", "misalignment", "g_sensitivity"))
     if diagonal:
-        largest = math.degrees(np.abs(gyro.theta[gyroscope.G]).max()) if known[gyroscope.G].all() else math.nan
+        largest = math.degrees(np.abs(gyro.theta[gyroscope.G]).max()) if identified[gyroscope.G].all() else math.nan
         lines.append(f"gyros: their bias alone; the largest g-sensitivity left out is {largest:.2g} deg/s/g")
     elif lost:
         lines.append(f"gyros, not identified and left at 0: {', '.join(lost)}")
-    own_held = ~known
+    own_held = ~identified
     own_held[gyroscope.VERTICAL] = own_held[gyroscope.THERMAL] = own_held[gyroscope.LEVEL :] = False
     own = gyroscope.calibrate(accel, own_held).theta if own_held.any() else gyro.theta
     return Whole(bias, matrix, (own[gyroscope.BIAS], gyro_matrix(own), own[gyroscope.G].reshape(3, 3)), tuple(lines))

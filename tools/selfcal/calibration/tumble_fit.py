@@ -16,16 +16,17 @@ from selfcal.base.grid import Array, Mask
 #: Residuals [m], their derivatives [m, n] and their covariance [m, m] at parameters [n].
 Problem = Callable[[Array], tuple[Array, Array, Array]]
 
-#: Iterations and halvings of a step at most. A step below 0.3 posterior sd is taken as it is. The last step is below
+#: Most iterations, and most halvings of a step. A step below 0.3 posterior sd is taken as it is. The last step is below
 #: 1e-4 posterior sd.
 ITERATIONS, HALVINGS = 50, 8
 UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
 NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
-#: A parameter is identified if the data leave this share of its prior variance at most, with priors so much wider.
+#: Largest share of its prior variance that the data leave an identified parameter, and the factor by which priors are
+#: wider then.
 IDENTIFIED, WIDER = 0.2, 8.0
-#: Probability, a calibration, that residuals of a right model are called too large, and that a cause is named.
+#: Probability that a right model's residuals are called too large, and that a cause is named, a calibration each.
 FALSE_ALARM = 0.005
-#: Residuals beyond the parameters that a check takes at least.
+#: Fewest residuals beyond the parameters that are checked.
 FREE_LEAST = 0.5
 
 
@@ -33,9 +34,9 @@ FREE_LEAST = 0.5
 class Fit:
     """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
     `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
-    makes them so: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step` [n]:
-    to the least sum of squares by these derivatives, which takes `gain` off it. `outside`: places of parameters of the
-    surroundings, whose prior is no part's."""
+    scales them: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step`
+    [n]: to the least sum of squares by these derivatives, which takes `gain` off it. `outside`: places of parameters of
+    the surroundings, whose prior is no part's."""
 
     theta: Array
     covariance: Array
@@ -56,10 +57,10 @@ class Fit:
     def _informed(self, least: float) -> tuple[Array, Array]:
         """The prior's factor [n, n], and the information in its units, with `least` of the prior's own of the part."""
         factor = np.asarray(np.linalg.cholesky(self.prior), float)
-        seen = self.columns @ factor
+        scaled = self.columns @ factor
         share = np.full(len(factor), least)
         share[list(self.outside)] = 1.0
-        return factor, seen.T @ seen + np.diag(share)
+        return factor, scaled.T @ scaled + np.diag(share)
 
     @property
     def evidence(self) -> float:
@@ -93,21 +94,21 @@ class Fit:
         return math.sqrt(float(self.white @ self.white) / self.free) if self.free > FREE_LEAST else math.nan
 
     def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
-        """Of causes, each in words and by its columns [m, k] of the residuals, those that explain more than chance, the
-        surest first; with their probability by chance, corrected for the number of causes."""
+        """Causes that explain more than chance, each in words and by its columns [m, k] of the residuals, the surest
+        first; with their probability by chance, corrected for the number of causes."""
         if not math.isfinite(self.excess):
             return []
         more = solve_triangular(self.root, np.hstack([columns for _, columns in tried]), lower=True)
         apart = more - self.columns @ (self.covariance @ (self.columns.T @ more))
-        found, first = [], 0
+        ranked, first = [], 0
         for said, columns in tried:
             own = slice(first, first + columns.shape[1])
             first = own.stop
             normal, pull = more[:, own].T @ apart[:, own], apart[:, own].T @ self.white
             explained = float(pull @ np.linalg.pinv(normal, 1e-9, hermitian=True) @ pull)
             count = max(int(np.linalg.matrix_rank(normal, hermitian=True)), 1)
-            found.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
-        return [(said, min(1.0, p)) for p, _, said in sorted(found) if p < FALSE_ALARM]
+            ranked.append((float(chi2.sf(explained, count)) * len(tried), -explained, said))
+        return [(said, min(1.0, p)) for p, _, said in sorted(ranked) if p < FALSE_ALARM]
 
 
 def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
@@ -139,17 +140,17 @@ def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | 
     """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
     stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
     Raises UserError where none settles."""
-    found = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
+    current = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
     for _ in range(ITERATIONS):
-        step, sd = found.step, np.sqrt(np.diag(found.covariance))
+        step, sd = current.step, np.sqrt(np.diag(current.covariance))
         far = float(np.max(np.abs(step[sd > 0.0]) / sd[sd > 0.0]))
-        following = linearized(problem, found.theta + step, mean, prior, held)
+        following = linearized(problem, current.theta + step, mean, prior, held)
         for _ in range(HALVINGS if far > 0.3 else 0):
-            if following.squares < found.squares:
+            if following.squares < current.squares:
                 break
             step = 0.5 * step
-            following = linearized(problem, found.theta + step, mean, prior, held)
-        found = following
+            following = linearized(problem, current.theta + step, mean, prior, held)
+        current = following
         if far < 1e-4:
-            return found
+            return current
     raise UserError(UNSETTLED)

@@ -34,13 +34,13 @@ FLATS = ((0, 0, 1), (0, 1, 0), (1, 0, 0), (0, 0, -1), (0, -1, 0), (-1, 0, 0))
 EDGES = ((1, 1, 0), (1, -1, 0), (1, 0, 1), (-1, 0, 1), (0, 1, 1), (0, 1, -1))
 OPPOSITE = tuple((-x, -y, -z) for x, y, z in EDGES)
 CORNERS = ((1, 1, 1), (1, 1, -1), (1, -1, 1), (1, -1, -1), (-1, 1, 1), (-1, 1, -1))
-POSITIONS = {6: FLATS, 12: FLATS + EDGES, 24: FLATS + EDGES + OPPOSITE + CORNERS}
-#: Lengths of a rest that are looked at, s, and the time of a turn between two, s.
+POSITIONS = {len(up): up for up in (FLATS, FLATS + EDGES, FLATS + EDGES + OPPOSITE + CORNERS)}
+#: Lengths of a rest that are tried, s, and the time of a turn between two rests, s.
 LENGTHS_S, TURN_S = (REST_S, 20.0, 30.0, 60.0, 120.0, 300.0, 600.0), 5.0
-#: A hand places the part off by so much, rad, sd of each of two angles. Placements that are drawn, and the share of
+#: sd of each of two angles by which a hand places the part off, rad; number of placements that are drawn; share of
 #: them that have what is planned.
 PLACED, DRAWN, SHARE = math.radians(3.0), 10, 0.9
-#: What may be wished: the sensor, the unit here, and where the sensor's parameters are.
+#: Quantities of a wish: the sensor, the unit here, and the places of the sensor's parameters.
 WISHES = {
     "accelerometer bias": ("accelerometer", "m/s^2", accelerometer.BIAS),
     "scale": ("accelerometer", "ppm", accelerometer.SCALE),
@@ -93,8 +93,8 @@ def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
         # A drift that is not known: from the top of three decades to their middle.
         noise[name] = replace(own.scaled(np.full(len(own.terms), 0.014)), wide=False)
     random = np.random.default_rng(count)
-    found = [_of_placement(noise, _placed(random, POSITIONS[count]), length_s) for _ in range(DRAWN)]
-    return {name: sorted(one[name] for one in found)[math.ceil(SHARE * DRAWN) - 1] for name in WISHES}
+    placements = [_of_placement(noise, _placed(random, POSITIONS[count]), length_s) for _ in range(DRAWN)]
+    return {name: sorted(placement[name] for placement in placements)[math.ceil(SHARE * DRAWN) - 1] for name in WISHES}
 
 
 def _placed(random: np.random.Generator, positions: Sequence[tuple[int, int, int]]) -> Array:
@@ -117,13 +117,13 @@ def _of_placement(noise: dict[str, Noise], readings: Array, length_s: float) -> 
     )
     accel = accelerometer.calibrate(Tumble(rests, (), noise), Place(STANDARD_GRAVITY, 0.0, 0.0, 0.0, 0.0, ""))
     gyro = gyroscope.calibrate(accel)
-    found = {}
+    widest = {}
     for name, (sensor, _, where) in WISHES.items():
         fit, start = (accel.fit, 0) if sensor == "accelerometer" else (gyro.fit, gyro.of_accel)
         own = slice(start + where.start, start + where.stop)
         sd = float(np.sqrt(np.diag(fit.covariance)[own]).max())
-        found[name] = HALF_90 * sd if fit.identified[own].all() else math.inf
-    return found
+        widest[name] = HALF_90 * sd if fit.identified[own].all() else math.inf
+    return widest
 
 
 def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
@@ -132,8 +132,8 @@ def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
     rows = []
     for count in POSITIONS:
         for length_s in LENGTHS_S:
-            found = reached(model, count, length_s)
-            missed = [one.text for one in wishes if found[one.name] > one.most]
+            widest = reached(model, count, length_s)
+            missed = [wish.text for wish in wishes if widest[wish.name] > wish.most]
             if not missed:
                 break
         total = count * length_s + (count - 1) * TURN_S
@@ -142,9 +142,9 @@ def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
                 "rests": count,
                 "rest_s": None if missed else length_s,
                 "total_s": None if missed else total,
-                "reached": {name: value if math.isfinite(value) else None for name, value in found.items()},
+                "reached": {name: value if math.isfinite(value) else None for name, value in widest.items()},
                 "missed": missed,
-                "not_identified": [name for name, value in found.items() if not math.isfinite(value)],
+                "not_identified": [name for name, value in widest.items() if not math.isfinite(value)],
             }
         )
     return {
@@ -163,13 +163,13 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     line("; ".join(document["wishes"]))
     line(f"{SHARE:.0%} of placements by hand, off by {document['placed_deg']:g} deg (sd), reach it with:")
     met = [row for row in document["rows"] if row["rest_s"] is not None]
-    for one in document["rows"]:
-        lost = f"; not identified: {', '.join(one['not_identified'])}" if one["not_identified"] else ""
-        if one["rest_s"] is None:
-            line(f"  {one['rests']} rests: no length up to {LENGTHS_S[-1]:g} s has {', '.join(one['missed'])}{lost}")
+    for row in document["rows"]:
+        lost = f"; not identified: {', '.join(row['not_identified'])}" if row["not_identified"] else ""
+        if row["rest_s"] is None:
+            line(f"  {row['rests']} rests: no length up to {LENGTHS_S[-1]:g} s has {', '.join(row['missed'])}{lost}")
             continue
-        line(f"  {one['rests']} rests of {one['rest_s']:g} s: {one['total_s'] / 60.0:.1f} minutes{lost}")
+        line(f"  {row['rests']} rests of {row['rest_s']:g} s: {row['total_s'] / 60.0:.1f} minutes{lost}")
     if met:
-        best = min(met, key=lambda one: float(one["total_s"]))
+        best = min(met, key=lambda row: float(row["total_s"]))
         line(f"rest it {best['rest_s']:g} s in each of {best['rests']} positions")
     line("scale and angles of the gyros come from the turns, and are not planned")

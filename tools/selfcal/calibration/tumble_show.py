@@ -17,7 +17,7 @@ from selfcal.base.output import console_of, plotter, print_line, save_picture
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration.tumble_document import side_of
 
-#: By group of parameters, in data sheets' units: word, unit, factor, and what is taken off before.
+#: Data sheets' terms by group of parameters: word, unit, factor, and the number that is subtracted before.
 SHEET = {
     ("accelerometer", "bias"): ("bias", "ug", 1e6 / STANDARD_GRAVITY, 0.0),
     ("accelerometer", "scale"): ("scale - 1", "ppm", 1e6, 1.0),
@@ -41,44 +41,44 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     gravity = document["gravity"]
     line(f"gravity {gravity['value']:.6g} m/s^2 ({gravity['source']}); scales take its error, which no rest shows")
     for sensor in ("accelerometer", "gyroscope"):
-        found = document[sensor]
-        if found is None:
+        answer = document[sensor]
+        if answer is None:
             line("gyroscope: the logs have no gx, gy, gz")
             continue
-        if "error" in found:
-            line(f"gyroscope: {found['error']}")
+        if "error" in answer:
+            line(f"gyroscope: {answer['error']}")
             continue
         drift = dict.fromkeys(entry["drift"] for name, entry in document["noise"].items() if name[0] == sensor[0])
         line("")
         line(f"{sensor}; drift of the bias: {'; '.join(drift)}")
         if sensor == "gyroscope" and not document["earth_rate_known"]:
             line("the Earth's rate is in the intervals of bias and g-sensitivity: --latitude would take it off")
-        if "bias_at_degC" in found:
-            line(f"bias at {found['bias_at_degC']:.4g} degC")
+        if "bias_at_degC" in answer:
+            line(f"bias at {answer['bias_at_degC']:.4g} degC")
         table = Table(box=box.SIMPLE_HEAD)
         for heading in ("", "", "median", "5 %", "95 %", "unit"):
             table.add_column(heading, no_wrap=True, justify="right" if heading in ("median", "5 %", "95 %") else "left")
-        for group in (key for of, key in SHEET if of == sensor and key in found):
+        for group in (key for of, key in SHEET if of == sensor and key in answer):
             word, unit, size, zero = SHEET[sensor, group]
-            for name, entry in found[group].items():
+            for name, entry in answer[group].items():
                 if entry["identified"]:
                     digits = max(0, 1 - math.floor(math.log10(max(size * entry["sd"], 1e-12))))
-                    cells = [f"{size * (entry[at] - zero):.{digits}f}" for at in ("median", "q05", "q95")]
+                    cells = [f"{size * (entry[key] - zero):.{digits}f}" for key in ("median", "q05", "q95")]
                     table.add_row(word, name, *cells, unit)
                 else:
                     table.add_row(word, name, "not identified", "", "", unit)
         console.print(table)
-        if found["would_mend"]:
-            line(f"what is not identified takes: {'; '.join(found['would_mend'])}")
-        if found["adequate"] is None:
+        if answer["would_mend"]:
+            line(f"what is not identified takes: {'; '.join(answer['would_mend'])}")
+        if answer["adequate"] is None:
             line("residuals: no rest is left over to check the model with")
         else:
-            said = "as the noise has it" if found["adequate"] else "NOT adequate"
-            size = found["residual_ratio"]
+            said = "as the noise has it" if answer["adequate"] else "NOT adequate"
+            size = answer["residual_ratio"]
             line("residuals: " + (f"{size:.2f} of their sd, " if size is not None else "") + said)
-        if found["adequate"] is False and not found["findings"]:
+        if answer["adequate"] is False and not answer["findings"]:
             line("  no single rest or turn, no square and no hysteresis explains it")
-        for entry in found["findings"][:3]:
+        for entry in answer["findings"][:3]:
             line(f"  {entry['cause']} (by chance {entry['p']:.1g})")
     for text in document["notes"]:
         line(f"note: {text}")
@@ -89,11 +89,11 @@ def plot(document: Mapping[str, Any], path: Path | str) -> None:
     figure, axes = plotter().subplots(figsize=(8.0, 4.2), layout="constrained")
     rests = document["rests"]
     micro = 1e6 / STANDARD_GRAVITY
-    at = np.arange(len(rests))
-    residual, sd = (micro * np.array([one[key] for one in rests]) for key in ("residual", "sd"))
+    places = np.arange(len(rests))
+    residual, sd = (micro * np.array([rest[key] for rest in rests]) for key in ("residual", "sd"))
     axes.axhline(0.0, color="0.6", linewidth=0.8)
-    axes.errorbar(at, residual, 1.645 * sd, fmt="o", markersize=4, capsize=3, linewidth=1)
-    axes.set_xticks(at, [side_of(np.array(rest["up"])) for rest in rests], rotation=60, fontsize=8)
+    axes.errorbar(places, residual, 1.645 * sd, fmt="o", markersize=4, capsize=3, linewidth=1)
+    axes.set_xticks(places, [side_of(np.array(rest["up"])) for rest in rests], rotation=60, fontsize=8)
     axes.set_xlabel("side that is up, rest by rest")
     axes.set_ylabel("|f| - g, ug")
     axes.set_title(

@@ -15,6 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from selfcal import _library32
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
@@ -39,28 +40,29 @@ DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 PARTS = DEFAULT.parent / "parts"
 DEFAULT_PART = "adis16405"
 
-#: Prior limits of what no law of the file has, so that it need not state them: as in the default model, by whether they
-#: are times the limits of N.
+#: Prior limits of parameters that no law of the file has: as in the default model at 1 Hz; and whether they multiply
+#: the limits of N.
 ABOUT_N = {"K": (0.02, 0.04, True), "sigma_m": (0.5, 1.0, True), "alpha": (2e-4, 0.2, False)}
-#: Nodes a grid dimension may have: a quintic spline needs six; SELFCAL_GRID_MAX.
-NODES = (6, 24)
-#: Times the least N that a bias prior may be wide: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
+#: Least nodes of a grid dimension, as a quintic spline needs them; and the limits of a dimension.
+LEAST_NODES = 6
+NODES = (LEAST_NODES, _library32.GRID_MAX)
+#: Largest sd of a bias prior over the least N: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
 WIDEST_BIAS = 1e8
-#: Characters of a name or another text.
+#: Most characters of a name or another text.
 LONGEST_TEXT = 200
-#: Axes of a model, and taps of the sensor's filter: more than any part has.
+#: Most axes of a model, and most taps of the sensor's filter: more than any part has.
 MOST_AXES, MOST_TAPS = 64, 1024
-#: The largest number of any kind: its square is still a float.
+#: Largest number of any kind: its square is still a float.
 LARGEST = 1e18
-#: The smallest but 0: below what any prior may reach.
+#: Smallest number but 0: below what any prior may reach.
 SMALLEST = 1e-20
-#: ln of what a prior may reach, as a float: LN_LIMIT in lib/bank.c.
+#: Largest ln of a parameter that a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
 #: sd from the middle of a log-normal prior to its limits: SELFCAL_LOG_NORMAL in lib/selfcal_tables.h.
 LOG_NORMAL_REACH = 4.0
-#: sd of a log-normal prior: below, the limits of large logarithms are equal floats.
+#: Limits of the sd of a log-normal prior: below, the limits of large logarithms are equal floats.
 LOG_NORMAL_SD = (1e-4, 5.0)
-#: Kinds of regressors, and what an entry of each has beside name, kind, sd and probability.
+#: Kinds of regressors, and the keys of an entry of each apart from name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
     "column": ("column", "unit", "reference", "window_s", "input", "form", "lag_s", "width", "knots"),
@@ -70,14 +72,14 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "turn_on": ("tau_s",),
     "pulse": ("start_s", "end_s"),
 }
-#: Knots of a curve.
+#: Most knots of a curve.
 MOST_KNOTS = 200
-#: Hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
+#: Most hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
-#: What a term of a law may state beside its kind and deviation.
+#: Keys that a term of a law may state apart from its kind and deviation.
 KEYS_OF_TERM = {"walk": (), "markov": ("bandwidth", "correlation_time_s"), "oscillation": ("period_s", "damping")}
-#: Columns of a bank's regressors together: SELFCAL_REGRESSORS_MAX; and those that a model file may state.
-MOST_COLUMNS, MOST_STATED = 6, 36
+#: Most columns of a bank's regressors together, and most that a model file may state.
+MOST_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
 
 
 @dataclass(frozen=True)
@@ -246,7 +248,7 @@ class GridNodes:
 class HiddenInput:
     """One quantity that nobody recorded and that moves several axes, a Gauss-Markov process: its standard deviation,
     its bandwidth `alpha`, 1/s, what a unit of it does to each axis, in the axis' unit, and the correlation of the white
-    noise of pairs of axes beside it (`gx-gy`). The bank of one axis knows nothing of it: its law is the axis' total."""
+    noise of pairs of axes (`gx-gy`). The bank of one axis knows nothing of it: its law is the axis' total."""
 
     deviation: float
     alpha: float
@@ -338,10 +340,10 @@ def file_of(model: Path | str | None) -> Path:
         return path
     known = parts()
     named = {re.sub(r"[^a-z0-9]", "", name): path for name, path in known.items()}
-    found = named.get(re.sub(r"[^a-z0-9]", "", path.name.lower()))
-    if found is None:
+    file = named.get(re.sub(r"[^a-z0-9]", "", path.name.lower()))
+    if file is None:
         raise UserError(f"there is no part '{short(path.name)}' (there are {', '.join(known)}), and no such model file")
-    return found
+    return file
 
 
 class _Loader(yaml.SafeLoader):
@@ -488,8 +490,8 @@ class _Reader:
     def text(self, tree: Mapping[str, Any], key: str, where: str) -> str:
         value = self.entry(tree, key, where)
         text = str(value)  # `unit: 1` is a number to YAML
-        known = isinstance(value, str | int | float) and not isinstance(value, bool)
-        if not known or not text.isprintable() or len(text) > LONGEST_TEXT or "*/" in text:
+        plain = isinstance(value, str | int | float) and not isinstance(value, bool)
+        if not plain or not text.isprintable() or len(text) > LONGEST_TEXT or "*/" in text:
             what = f"one line of text, {LONGEST_TEXT} characters at most, without '*/': the tables have it as a comment"
             raise self.fail(f"{where}.{key}" if where else key, f"must be {what}, not {shown(value)}")
         return text
@@ -633,30 +635,30 @@ class _Reader:
         """The curve of a form: free."""
         if not isinstance(tree, list) or not 2 <= len(tree) <= MOST_KNOTS:
             raise self.fail(where, f"must be a list of 2 to {MOST_KNOTS} pairs [channel, height]")
-        found: list[tuple[float, float]] = []
-        for at, pair in enumerate(tree):
+        knots: list[tuple[float, float]] = []
+        for i, pair in enumerate(tree):
             if not isinstance(pair, list) or len(pair) != 2:
-                raise self.fail(f"{where}[{at}]", f"must be a pair [channel, height], not {shown(pair)}")
-            place, height = (self.number(x, f"{where}[{at}]", low=-math.inf, strict=False) for x in pair)
-            if found and not place > found[-1][0]:
-                raise self.fail(f"{where}[{at}]", "the channel's values must rise")
-            found.append((place, height))
-        return tuple(found)
+                raise self.fail(f"{where}[{i}]", f"must be a pair [channel, height], not {shown(pair)}")
+            channel, height = (self.number(x, f"{where}[{i}]", low=-math.inf, strict=False) for x in pair)
+            if knots and not channel > knots[-1][0]:
+                raise self.fail(f"{where}[{i}]", "the channel's values must rise")
+            knots.append((channel, height))
+        return tuple(knots)
 
     def regressors(self, tree: Any, groups: tuple[Group, ...]) -> tuple[Regressor, ...]:
         if not isinstance(tree, list):
             raise self.fail("regressors", "must be a list")
         if len(tree) > MOST_STATED:
             raise self.fail("regressors", f"{len(tree)} are more than {MOST_STATED}")
-        found = tuple(self.regressor(entry, f"regressors[{i}]", groups) for i, entry in enumerate(tree))
-        names = [regressor.name for regressor in found]
+        regressors = tuple(self.regressor(entry, f"regressors[{i}]", groups) for i, entry in enumerate(tree))
+        names = [regressor.name for regressor in regressors]
         for name in names:
             if names.count(name) > 1:
                 raise self.fail("regressors", f"'{name}' appears twice")
-        columns = sum(len(regressor.columns) for regressor in found)
+        columns = sum(len(regressor.columns) for regressor in regressors)
         if columns > MOST_STATED:
             raise self.fail("regressors", f"{columns} columns are more than {MOST_STATED} (periodic: two each)")
-        return found
+        return regressors
 
     def gate(self, tree: Any, groups: tuple[Group, ...]) -> Gate:
         names = ("window_s", "false_alarm", "hold", "settle", "memory", "N")
@@ -691,7 +693,7 @@ class _Reader:
 
     def nodes(self, tree: Any, where: str, laws: Mapping[str, Law]) -> GridNodes:
         fields = self.only(tree, tuple(dict.fromkeys((*NAMED, *laws))), where)
-        found: dict[str, tuple[int, ...]] = {}
+        of_laws: dict[str, tuple[int, ...]] = {}
         for name, law in laws.items():
             what = [f"{key} nodes" for key in ("rho", *law.parameters[2:])] if law.terms else []
             if not what:
@@ -701,8 +703,8 @@ class _Reader:
             if len(counts) != len(what) or isinstance(given, list) != (len(what) > 1):
                 shape = f"[{', '.join(what)}]" if len(what) > 1 else f"a number of {what[0]}"
                 raise self.fail(f"{where}.{name}", f"must be {shape}")
-            found[name] = tuple(self.count(count, f"{where}.{name}", *NODES) for count in counts)
-        return GridNodes(found)
+            of_laws[name] = tuple(self.count(count, f"{where}.{name}", *NODES) for count in counts)
+        return GridNodes(of_laws)
 
     def term(self, tree: Any, where: str) -> Term:
         fields = {"kind": tree} if isinstance(tree, str) else tree
@@ -796,7 +798,7 @@ class _Reader:
                 raise self.fail("simulate.axes", f"the model has no axis {shown(name)} (it has {', '.join(axes)})")
         known = ("hypothesis", "bias", *PLACES)
         known_laws = dict.fromkeys((*NAMED, *laws))
-        truths = {name: dict(self.only(one or {}, known, f"simulate.axes.{name}")) for name, one in stated.items()}
+        truths = {name: dict(self.only(truth or {}, known, f"simulate.axes.{name}")) for name, truth in stated.items()}
         for name, truth in truths.items():
             where = f"simulate.axes.{name}"
             law = truth.get("hypothesis", "constant")
@@ -824,10 +826,10 @@ class _Reader:
             if not isinstance(entries, dict):
                 raise self.fail(f"hidden_input.{key}", "must be a mapping")
             for name in entries:
-                if not all(one in axes for one in str(name).split("-")):
+                if not all(axis in axes for axis in str(name).split("-")):
                     raise self.fail(f"hidden_input.{key}", f"the model has no axis {shown(name)}")
             numbers.append(
-                {name: self.number(one, f"hidden_input.{key}.{name}", low=low) for name, one in entries.items()}
+                {name: self.number(value, f"hidden_input.{key}.{name}", low=low) for name, value in entries.items()}
             )
         return HiddenInput(deviation, alpha, *numbers)
 
@@ -872,7 +874,7 @@ class _Reader:
             nodes={name: self.nodes(fields, f"nodes.{name}", laws) for name, fields in targets.items()},
             simulate=self.simulate(tree.get("simulate") or {}, axes, laws),
             regressors=kept,
-            beyond=tuple(one for one in regressors if one not in kept),
+            beyond=tuple(regressor for regressor in regressors if regressor not in kept),
             half_life_s=self.number(tree.get("half_life_s", 0.0), "half_life_s", strict=False),
             gate=self.gate(tree["gate"], groups) if tree.get("gate") else None,
             hidden_input=self.hidden_input(tree["hidden_input"], axes) if tree.get("hidden_input") else None,

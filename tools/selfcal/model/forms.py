@@ -15,11 +15,11 @@ from selfcal.base.grid import Array
 
 #: Forms, the simplest first.
 FORMS = ("static", "lag", "rate", "square", "cube", "play", "free")
-#: The entry that has a form's number.
+#: Entry with a form's number.
 NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width"}
 #: A curve: values of the channel, rising, and heights. Between two the line through both holds, beyond the ends these.
 Knots = tuple[tuple[float, float], ...]
-#: The power of the channel's unit.
+#: Power of the channel's unit, by form.
 POWER = {"square": 2, "cube": 3}
 #: `selfcal_column_kind_t`: names in C, by number.
 COLUMN_KINDS = (
@@ -39,7 +39,7 @@ COLUMN_KINDS = (
 KIND = {name: number for number, name in enumerate(COLUMN_KINDS)}
 #: Kind, channel, number and second number of a column: `selfcal_source_t`.
 Source = tuple[int, int, float, float]
-#: What of the channel acts: its value, or the variance of its noise.
+#: Inputs: the value of the channel, or the variance of its noise.
 INPUTS = ("value", "variance")
 
 
@@ -59,7 +59,7 @@ def made(
 
 
 def source_of(form: str, channel: int, number: float, about: float, mean_s: float) -> Source:
-    """What the library makes of a form: `selfcal_source_t`. A play's is the channel: the library has none."""
+    """`selfcal_source_t` of a form. A play has the channel's: the library has no play."""
     if form == "lag":
         return KIND["LAG"], channel, number, mean_s
     if form == "rate":
@@ -98,17 +98,17 @@ def slope(values: Array, window_s: float, interval_s: float) -> Array:
     if window_s <= interval_s:
         return np.asarray(np.gradient(values, interval_s))
     last, whole = values.size - 1, round(window_s / interval_s)
-    at = np.clip(np.arange(values.size) + whole // 2, min(whole, last), last)
-    return formed(values, "rate", window_s, 0.0, interval_s)[at]
+    rows = np.clip(np.arange(values.size) + whole // 2, min(whole, last), last)
+    return formed(values, "rate", window_s, 0.0, interval_s)[rows]
 
 
 def played(values: Array, width: float) -> Array:
-    """What follows at half of `width` at most, and moves only if it must."""
+    """Follower of `values` at half of `width` at most, which moves only if it must."""
     out = np.empty(values.size)
-    at, half = float(values[0]), 0.5 * width
+    position, half = float(values[0]), 0.5 * width
     for i, value in enumerate(values.tolist()):
-        at = min(max(at, value - half), value + half)
-        out[i] = at
+        position = min(max(position, value - half), value + half)
+        out[i] = position
     return out
 
 

@@ -14,9 +14,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-#: Terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
+#: Most terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
 MOST_TERMS = 3
-#: What a deviation and a bandwidth may multiply: FACTOR_MIN, FACTOR_MAX in lib/bank_states.c.
+#: Limits of the factors of a deviation and a bandwidth: FACTOR_MIN, FACTOR_MAX in lib/bank_states.c.
 FACTORS = (1e-3, 1e3)
 #: Parameters of every group's priors, in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
@@ -31,9 +31,9 @@ FORGOTTEN = 20.0
 
 #: Kinds of `selfcal_term_kind_t`. An oscillation is followed by its damping.
 KINDS = ("walk", "markov", "oscillation", "damping")
-#: Bank intervals in a period at least, damping ratios, and intervals that a period lasts at most over 2 pi (SWING_MAX,
-#: DAMPING_MIN, DAMPING_MAX, TIME_MAX in lib/bank_states.c).
-SWING_LEAST, DAMPING_LIMITS, SWING_MOST = 8.0, (1e-3, 0.7), 1e6
+#: Least bank intervals in a period of an oscillation, and limits of its damping ratio (SWING_MAX, DAMPING_MIN and
+#: DAMPING_MAX in lib/bank_states.c).
+SWING_LEAST, DAMPING_LIMITS = 8.0, (1e-3, 0.7)
 #: (kind, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
 LawTuple = tuple[list[tuple[int, float, float, bool, bool]], bool]
 
@@ -74,7 +74,7 @@ class Law:
 
     @property
     def read(self) -> tuple[float, ...]:
-        """What a reading takes of each state of the drift: an oscillation has a second one, of which it takes none."""
+        """Weight of each state of the drift in a reading: 0 of the second state of an oscillation."""
         return tuple(share for t in self.terms for share in ((1.0, 0.0) if t.kind == "oscillation" else (1.0,)))
 
     @property
@@ -115,7 +115,7 @@ class Law:
 
     @staticmethod
     def bandwidth(term: Term) -> float:
-        """As lib/selfcal_tables.h has it: 0 of a walk."""
+        """Bandwidth of a term in lib/selfcal_tables.h: 0 of a walk."""
         return 0.0 if term.kind == "walk" else term.bandwidth
 
     def node(self, parameters: Mapping[str, float]) -> tuple[float, float]:
@@ -136,7 +136,7 @@ class Law:
 def averaged(x: float, block: int) -> tuple[float, float]:
     """Means of a Gauss-Markov drift over `block` readings, `x` its bandwidth times the interval of a mean.
 
-    They are a first-order process beside white noise of a negative variance. Returns the process's variance and what
+    They are a first-order process with white noise of a negative variance. Returns the process's variance and what
     the white noise lacks, both over the drift's own (lib/DESIGN.md, "Block means of the drift"). Of a walk of step
     variance q per interval the white noise lacks (1 - 1 / block^2) q / 6.
     """
@@ -161,7 +161,7 @@ def swing(period_s: float, damping: float, time_s: float) -> NDArray[np.float64]
 
 
 def lost_of(x: float, block: int) -> float:
-    """What lost readings add to the white noise of a mean of `block` readings, beyond its share, over r - 1.
+    """White noise that lost readings add to a mean of `block` readings, beyond its share, over r - 1.
 
     r is the block over the readings left, and `x` is as in averaged(). The number is relative to the variance of the
     first-order process; at x = 0, of a walk, to its step variance. No more of the drift's rest is missing, and the

@@ -45,25 +45,26 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
     sources = [source for regressor in regressors for source in sources_of(regressor, channels)]
     columns = made(sources, 1.0 / recording.rate_hz, rows, missing, recording.powered)
-    place = 0
-    for one in regressors:
-        if one.form == "play":
-            columns[:, place] = as_float(played(columns[:, place], one.width))
-        elif one.form == "free":
-            columns[:, place] = as_float(curved(columns[:, place], one.knots))
-        place += len(one.columns)
+    first = 0
+    for regressor in regressors:
+        if regressor.form == "play":
+            columns[:, first] = as_float(played(columns[:, first], regressor.width))
+        elif regressor.form == "free":
+            columns[:, first] = as_float(curved(columns[:, first], regressor.knots))
+        first += len(regressor.columns)
     return columns
 
 
 def from_time(regressors: Sequence[Regressor], start_s: float) -> tuple[Regressor, ...]:
     """The regressors for a clock that begins at `start_s` of the one that their times are of."""
 
-    def moved(one: Regressor) -> Regressor:
-        if one.kind == "step":
-            return replace(one, time_s=max(0.0, one.time_s - start_s))
-        if one.kind == "pulse":
-            return replace(one, start_s=max(0.0, one.start_s - start_s), end_s=max(1e-6, one.end_s - start_s))
-        return one
+    def moved(regressor: Regressor) -> Regressor:
+        if regressor.kind == "step":
+            return replace(regressor, time_s=max(0.0, regressor.time_s - start_s))
+        if regressor.kind == "pulse":
+            begin_s, end_s = max(0.0, regressor.start_s - start_s), max(1e-6, regressor.end_s - start_s)
+            return replace(regressor, start_s=begin_s, end_s=end_s)
+        return regressor
 
     return tuple(moved(regressor) for regressor in regressors)
 
@@ -81,29 +82,30 @@ def check_channels(regressors: Sequence[Regressor], recording: Recording) -> Non
 
 def channels_of(regressors: Sequence[Regressor]) -> list[tuple[str, str, str]]:
     """Name, unit and input of every recorded channel that the regressors take, each once."""
-    return list(dict.fromkeys(_channel(one) for kind in ("column", "rate") for one in regressors if one.kind == kind))
+    recorded = [regressor for kind in ("column", "rate") for regressor in regressors if regressor.kind == kind]
+    return list(dict.fromkeys(map(_channel, recorded)))
 
 
-def _channel(one: Regressor) -> tuple[str, str, str]:
-    return one.column, one.channel_unit, one.input
+def _channel(regressor: Regressor) -> tuple[str, str, str]:
+    return regressor.column, regressor.channel_unit, regressor.input
 
 
-def sources_of(one: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
+def sources_of(regressor: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
     """`selfcal_source_t` of each column of a regressor."""
-    if one.kind == "time":
+    if regressor.kind == "time":
         return [(KIND["TIME"], 0, 0.0, 0.0)]
-    if one.kind == "step":
-        return [(KIND["STEP"], 0, one.time_s, 0.0)]
-    if one.kind == "turn_on":
-        return [(KIND["TURN_ON"], 0, one.tau_s, 0.0)]
-    if one.kind == "pulse":
-        return [(KIND["PULSE"], 0, one.start_s, one.end_s)]
-    if one.kind == "periodic":
-        return [(KIND[name], 0, one.frequency_hz, 0.0) for name in ("SINE", "COSINE")]
-    channel = channels.index(_channel(one))
-    if one.kind == "rate":
-        return [(KIND["RATE"], channel, one.window_s, 0.0)]
-    return [source_of(one.form, channel, one.number, one.reference, one.mean_s)]
+    if regressor.kind == "step":
+        return [(KIND["STEP"], 0, regressor.time_s, 0.0)]
+    if regressor.kind == "turn_on":
+        return [(KIND["TURN_ON"], 0, regressor.tau_s, 0.0)]
+    if regressor.kind == "pulse":
+        return [(KIND["PULSE"], 0, regressor.start_s, regressor.end_s)]
+    if regressor.kind == "periodic":
+        return [(KIND[name], 0, regressor.frequency_hz, 0.0) for name in ("SINE", "COSINE")]
+    channel = channels.index(_channel(regressor))
+    if regressor.kind == "rate":
+        return [(KIND["RATE"], channel, regressor.window_s, 0.0)]
+    return [source_of(regressor.form, channel, regressor.number, regressor.reference, regressor.mean_s)]
 
 
 def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
@@ -115,7 +117,8 @@ def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float6
 
 def offered(model: Model, axis: str) -> Choice:
     """The regressors that an axis has: those with a prior for its group. An axis is no regressor of itself."""
-    return tuple(one for one in model.regressors if model.group_of(axis).name in one.sd and one.column != axis)
+    others = (regressor for regressor in model.regressors if regressor.column != axis)
+    return tuple(regressor for regressor in others if model.group_of(axis).name in regressor.sd)
 
 
 def choices_of(regressors: Choice) -> list[Choice]:
@@ -126,7 +129,7 @@ def choices_of(regressors: Choice) -> list[Choice]:
 def mask_of(regressors: Choice, choice: Choice) -> int:
     """A bit for every column in use, in the order of `regressors`."""
     names = [column for regressor in regressors for column in regressor.columns]
-    return sum(1 << names.index(column) for one in choice for column in one.columns)
+    return sum(1 << names.index(column) for regressor in choice for column in regressor.columns)
 
 
 def coefficient_unit(unit: str, regressor: str) -> str:
@@ -139,4 +142,5 @@ def coefficient_unit(unit: str, regressor: str) -> str:
 
 def ln_prior(regressors: Choice, choice: Choice) -> float:
     """ln of the prior probability that of `regressors` those of the `choice` are in use, and no other."""
-    return sum(math.log(one.probability if one in choice else 1.0 - one.probability) for one in regressors)
+    used = ((regressor.probability, regressor in choice) for regressor in regressors)
+    return sum(math.log(p if is_used else 1.0 - p) for p, is_used in used)

@@ -34,7 +34,7 @@ TURN_ON = {"deg/s": 3.0, "m/s^2": 0.05 * STANDARD_GRAVITY}
 #: mg.
 SHEET_N = {"deg/s": 2.0 / 60.0, "m/s^2": 0.2 / 60.0}
 SHEET_STABILITY = {"deg/s": 0.007, "m/s^2": 0.2e-3 * STANDARD_GRAVITY}
-#: s over which a filter designer lets the bias walk by its stability.
+#: Time in which a filter designer lets the bias walk by its stability, s.
 SHEET_TIME_S = 100.0
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -16,12 +17,13 @@ from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
 from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior, Regressor
-from selfcal.model.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, SWING_MOST, Law
+from selfcal.model.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, Law
 from selfcal.model.regressors import channels_of, sources_of
 
-#: Samples a bank interval: the float sums of one block lose digits with more.
+#: Most samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
-#: Bank intervals of a stated correlation time, at most: TIME_MAX in bank_states.c.
+#: Most bank intervals of a stated correlation time, and of an oscillation's period over 2 pi: TIME_MAX in
+#: lib/bank_states.c.
 TIME_MAX = 1e6
 
 
@@ -33,7 +35,7 @@ class PriorLaw(IntEnum):
     LOG_NORMAL = 2
 
     def __repr__(self) -> str:
-        """As when there were two: a model's checksum stays."""
+        """The text of the first checksums, which knew two laws: a model's checksum stays."""
         return ("False", "True", "log_normal")[self]
 
 
@@ -90,7 +92,7 @@ class RegressorTable:
 
     `source`: kind, number and second number (`selfcal_source_t`), and the channel's name and unit, "" without one.
     `ln_odds` [axes]: prior odds that the regressor is in use; 0 for a second column of it. `coefficient_mean` [axes]:
-    none is 0."""
+    empty for 0."""
 
     name: str
     unit: str
@@ -157,7 +159,7 @@ class Tables:
 
     @property
     def channels(self) -> tuple[tuple[str, str], ...]:
-        """Name and unit of what the regressors take beside the readings of these axes."""
+        """Name and unit of what the regressors take apart from the readings of these axes."""
         axes = {(axis.name, axis.unit) for axis in self.axes}
         taken = dict.fromkeys(column.source[3:] for column in self.regressors if column.source[3])
         return tuple(channel for channel in taken if channel not in axes)
@@ -266,18 +268,7 @@ def make_tables(
             )
             for name, probability in model.hypotheses.items()
         ),
-        regressors=tuple(
-            RegressorTable(
-                column,
-                one.unit,
-                one.offset,
-                tuple((0.0 if one.column == name else one.sd.get(model.group_of(name).name, 0.0)) for name in names),
-                _source(one, place),
-                len(names) * ((math.log(one.probability / (1.0 - one.probability)) if place == 0 else 0.0),),
-            )
-            for one in model.regressors
-            for place, column in enumerate(one.columns)
-        ),
+        regressors=tuple(_regressor_tables(model, names)),
         half_life_s=model.half_life_s,
         handling=model.handling,
     )
@@ -297,6 +288,17 @@ def _axis_table(name: str, group: Group) -> AxisTable:
     )
 
 
+def _regressor_tables(model: Model, names: Sequence[str]) -> Iterator[RegressorTable]:
+    for regressor in model.regressors:
+        sd = tuple(
+            0.0 if regressor.column == name else regressor.sd.get(model.group_of(name).name, 0.0) for name in names
+        )
+        ln_odds = math.log(regressor.probability / (1.0 - regressor.probability))
+        for place, column in enumerate(regressor.columns):
+            odds = len(names) * (ln_odds if place == 0 else 0.0,)
+            yield RegressorTable(column, regressor.unit, regressor.offset, sd, _source(regressor, place), odds)
+
+
 def _check_times(model: Model, dt: float) -> None:
     """Raise UserError for a time of the model that bank intervals of `dt` s are too long or too short for."""
 
@@ -313,7 +315,7 @@ def _check_times(model: Model, dt: float) -> None:
         where = f"hypotheses.{name}: "
         for term in law.terms:
             if term.kind == "oscillation":
-                most_s = 2.0 * math.pi * SWING_MOST * dt
+                most_s = 2.0 * math.pi * TIME_MAX * dt
                 check(f"{where}period_s", 2.0 * math.pi / term.bandwidth, SWING_LEAST * dt, most_s)
         for term in law.terms:
             if term.stated and term.kind == "markov":

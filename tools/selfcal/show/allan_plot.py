@@ -30,7 +30,7 @@ def figure_of(document: Mapping[str, Any], *, datasheet: bool = False) -> Any:
     Black: the overlapping Allan deviation of the recording's samples with its 90 % interval, of its bank's means where
     the answer was not made for a picture. In blue: the most
     probable law at its medians, the band of its posterior (5 to 95 %), and, pale, where the recording may lie.
-    Averaging times outside are red. Raises UserError where there is none.
+    Averaging times outside are red. Raises UserError for an answer without an Allan deviation.
     """
     pyplot = plotter()
     from matplotlib.lines import Line2D
@@ -94,8 +94,8 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
     )
     panel.set_xscale("log")
     panel.set_yscale("log")
-    seen = np.concatenate([curve, scaled(allan, "model")])
-    panel.set_ylim(0.4 * seen.min(), 1.5 * seen.max())
+    heights = np.concatenate([curve, scaled(allan, "model")])
+    panel.set_ylim(0.4 * heights.min(), 1.5 * heights.max())
     if samples["tau_s"][0] < 0.99 * tau[0]:
         left = samples["tau_s"][0] / 1.5
         panel.axvspan(left, tau[0] / 2**0.5, color="0.92", zorder=0)

@@ -21,9 +21,9 @@ WIDTH, HEIGHT = 340, 220
 LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Size of a picture of strips, room for their names, and the height of each.
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
-#: Points of a curve at most.
+#: Most points of a curve.
 POINTS = 400
-#: Rows of a table behind a picture at most.
+#: Most rows of a table behind a picture.
 ROWS = 25
 #: Approximate number of ticks of an axis.
 TICKS = 5

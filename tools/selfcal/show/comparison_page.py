@@ -77,8 +77,8 @@ def told_of(document: Mapping[str, Any]) -> list[Told]:
             if change["what"] == "changed":
                 numbers.append((name, change))
             else:
-                place = tuple(change[key] for key in ("from", "to", "quantity", "what"))
-                causes.setdefault(place, []).append((name, change))
+                kind = tuple(change[key] for key in ("from", "to", "quantity", "what"))
+                causes.setdefault(kind, []).append((name, change))
     numbers.sort(key=lambda row: -abs(row[1]["distance_sd"]))
     return [Told(rows) for rows in causes.values()] + [Told([row]) for row in numbers]
 
@@ -118,11 +118,11 @@ def _axis(
 def _deviations(name: str, curves: Mapping[str, Mapping[str, Any]], names: Mapping[str, str]) -> Markup:
     """The Allan deviations of an axis on one scale; nothing where their units differ."""
     panels = []
-    for log, known in curves.items():
-        tau, measured, low, high = (np.array(known[key]) for key in ("tau_s", "recording", "model_q05", "model_q95"))
+    for log, stated in curves.items():
+        tau, measured, low, high = (np.array(stated[key]) for key in ("tau_s", "recording", "model_q05", "model_q95"))
         title = names[log] if len(names[log]) <= 22 else f"{names[log][:21]}…"
         curve, band = Curve("recording", tau, measured), Band("law, 5 to 95 %", tau, low, high)
-        unit = f"deviation, {typeset(known['unit'])}"
+        unit = f"deviation, {typeset(stated['unit'])}"
         if tau.size > 1:
             panels.append(Panel(title, "averaging time, s", unit, [curve], [band], log_x=True, log_y=True))
     if len({panel.y_label for panel in panels}) != 1:

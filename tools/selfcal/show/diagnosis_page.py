@@ -29,7 +29,7 @@ from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outsi
 from selfcal.show.findings import before_after, notes
 from selfcal.show.template import number, render, spaced
 
-#: Bytes of the line in place of a picture.
+#: Length of the line in place of a picture, bytes.
 LINE = 140
 #: Name of the Allan figure, and the share of its points outside the band from which on the curve leaves it. Each point
 #: of a fitting record is outside the range of 20 with a probability of 2/21, neighbours together: 1 of 400 fitting
@@ -149,17 +149,17 @@ class _Axis:
     @property
     def numbers(self) -> list[str]:
         """N, K and B without the findings and with them."""
-        known = [self.entry["numbers"][name] for name in ("N", "K", "B")]
-        return [f"{before_after(entry).replace('->', '→')} {units.typeset(str(entry['unit']))}" for entry in known]
+        numbers = [self.entry["numbers"][name] for name in ("N", "K", "B")]
+        return [f"{before_after(entry).replace('->', '→')} {units.typeset(str(entry['unit']))}" for entry in numbers]
 
     @property
     def law(self) -> tuple[str, str, Mapping[str, Entry]]:
         """The likeliest law, its probability and its parameters; those of the fit where no report was made."""
-        known = self.entry.get("posterior")
-        if not known or not known.get("hypotheses"):
+        posterior = self.entry.get("posterior")
+        if not posterior or not posterior.get("hypotheses"):
             return _fitted(self.diagnosed, str(self.entry["unit"]))
-        law, share = max(known["hypotheses"].items(), key=lambda item: item[1] or 0.0)
-        return law, number(float(share), 3), known["parameters"].get(law, {})
+        law, share = max(posterior["hypotheses"].items(), key=lambda item: item[1] or 0.0)
+        return law, number(float(share), 3), posterior["parameters"].get(law, {})
 
     @property
     def statistics(self) -> list[tuple[Statistic, Statistic | None]]:

@@ -32,7 +32,7 @@ FORMS = {
     "allan_variance_ros": "allan_variance_ros.yaml",
     "openvins": "openvins.yaml",
 }
-#: Probability of the overbound where none is asked for.
+#: Probability of the overbound without an option.
 OVERBOUND = 0.95
 #: Step of PX4's filter by default (EKF2_PREDICT_US), s.
 PREDICT_S = 0.01

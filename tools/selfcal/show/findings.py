@@ -18,14 +18,14 @@ from selfcal.base.output import console_of, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
 
-#: Characters of a line without a terminal.
+#: Width of a line without a terminal, characters.
 WIDTH = 114
 
 
 def show(
     document: Mapping[str, Any], *, to_stderr: bool = False, details: bool = False, console: Console | None = None
 ) -> None:
-    """What a person reads first. `details`: each finding of each axis, with its evidence and gain, below."""
+    """Print the events and the numbers. `details`: each finding of each axis, with its evidence and gain, below."""
     recording, findings = document["recording"], document["findings"]
     if console is None:
         console = console_of(to_stderr=to_stderr)
@@ -76,9 +76,9 @@ def notes(shown: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[str, An
     """Lines on the table of numbers: what moves the other way in the list of findings, and the axes that are noisier
     than their siblings."""
     axes = {name: axis for name, axis in axes.items() if "numbers" in axis}
-    known = {name: axis["numbers"]["N"] for name, axis in axes.items()}
-    known = {name: N for name, N in known.items() if "q05" in N["after"]}
-    lines = noisier({name: {**N["after"], "unit": N["unit"]} for name, N in known.items()})
+    noise = {name: axis["numbers"]["N"] for name, axis in axes.items()}
+    noise = {name: N for name, N in noise.items() if "q05" in N["after"]}
+    lines = noisier({name: {**N["after"], "unit": N["unit"]} for name, N in noise.items()})
     return [*filter(None, [words.contrary(shown, axes)]), *lines]
 
 
@@ -108,8 +108,8 @@ def before_after(number: Mapping[str, Any]) -> str:
     text = "–" if not after["identified"] else f"{after['median']:.3g}"
     if "q05" in after:
         half = 0.5 * (after["q95"] - after["q05"])
-        known = f"{words.rounded(after['median'], 10.0 * half)} ± {half:.1g}"
-        text = known if after["identified"] else f"< {after['q95']:.2g}"
+        value = f"{words.rounded(after['median'], 10.0 * half)} ± {half:.1g}"
+        text = value if after["identified"] else f"< {after['q95']:.2g}"
     before = f"{number['before']:.3g}" if number["before"] > 0.0 and math.isfinite(number["before"]) else "–"
     return f"{before} -> {text}"
 

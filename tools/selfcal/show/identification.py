@@ -184,9 +184,9 @@ def _times(intervals: Sequence[Sequence[float]]) -> str:
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
     """The table without the intervals of its last `left_out` columns."""
     brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
-    known = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
-    drift = "K or sigma_m" if "B" not in known else "K, sigma_m or B"
-    second = "1/alpha, s" + (", or ratio" if known & set(RATIOS) else "")
+    names = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
+    drift = "K or sigma_m" if "B" not in names else "K, sigma_m or B"
+    second = "1/alpha, s" + (", or ratio" if names & set(RATIOS) else "")
     caption = f"medians [5 %, 95 %]{'' if datasheet else ' in the units of the recording'}; "
     caption += "~: this record does not identify it" + ("; a wider window shows all intervals" if left_out else "")
     headings = ("law", "P", "N", drift, second)
@@ -278,22 +278,22 @@ def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
         for check, outcome in axis["checks"].items():
             if outcome["passed"] is not passed or check.startswith(STATISTICS) or passed > ("intervals" in outcome):
                 continue
-            for one in [{**outcome, "intervals": [each]} for each in outcome.get("intervals", ())] or [outcome]:
-                known = next((event for event in events if event[0] == check and _same(check, event[2][0], one)), None)
-                if known is None:
-                    events.append(known := (check, [], []))
-                known[1].extend([name] if name not in known[1] else [])
-                known[2].append(one)
-    found: dict[Any, _Event] = {}
+            for part in [{**outcome, "intervals": [each]} for each in outcome.get("intervals", ())] or [outcome]:
+                same = next((event for event in events if event[0] == check and _same(check, event[2][0], part)), None)
+                if same is None:
+                    events.append(same := (check, [], []))
+                same[1].extend([name] if name not in same[1] else [])
+                same[2].append(part)
+    merged: dict[Any, _Event] = {}
     for k, (check, names, outcomes) in enumerate(events):
-        event = found.setdefault((check, *names) if "intervals" in outcomes[0] else k, (check, names, []))
+        event = merged.setdefault((check, *names) if "intervals" in outcomes[0] else k, (check, names, []))
         if "intervals" not in outcomes[0]:
             event[2].extend(outcomes)
             continue
-        begins, ends = zip(*(one["intervals"][0] for one in outcomes), strict=True)
+        begins, ends = zip(*(outcome["intervals"][0] for outcome in outcomes), strict=True)
         before = event[2][0]["intervals"] if event[2] else []
         event[2][:] = [{**outcomes[0], "intervals": [*before, [min(begins), max(ends)]]}]
-    return list(found.values())
+    return list(merged.values())
 
 
 def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
@@ -349,11 +349,11 @@ def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 
 def _ahead(axes: Mapping[str, Any]) -> list[str]:
     """What the module's calibration is worth some time after a report, of `replay`."""
-    known = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
+    ahead_of = {name: axis["ahead"] for name, axis in axes.items() if axis.get("ahead")}
     return [
         f"corrected output {ahead['horizon_s']:g} s after a report: {name}: rms error {ahead['rmse']:.3g} "
         f"{ahead['unit']} ({ahead['reports']} reports, means of {ahead['mean_s']:g} s)"
-        for name, ahead in known.items()
+        for name, ahead in ahead_of.items()
     ]
 
 

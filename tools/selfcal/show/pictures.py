@@ -22,7 +22,7 @@ from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope
 
-#: Simulated records of a band.
+#: Number of simulated records of a band.
 RECORDS = 20
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
@@ -126,7 +126,7 @@ def _figure(item: Compared, pairs: _Pairs) -> Figure:
 
 
 def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> Compared | Figure:
-    """The picture of the statistic that shows it."""
+    """The picture of the statistic that shows the finding."""
     name, state = finding.look.shown_by, finding.before
     if "allan" in name:
         return _allan(state, state, factor, unit)
@@ -419,10 +419,10 @@ def _missing(finding: Finding, record: Record) -> Figure:
 
 def _effect(finding: Finding) -> Array:
     """Sum of the finding's columns in a reading [n], in the inner unit."""
-    known = {column.name for column in finding.before.regressors}
+    before = {column.name for column in finding.before.regressors}
     effect = np.zeros(finding.after.y.size)
     for k, column in enumerate(finding.after.regressors):
-        if column.name not in known:
+        if column.name not in before:
             effect = effect + float(finding.after.best.c[1 + k]) * column.values
     return effect
 
@@ -488,11 +488,11 @@ def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
     effect = _effect(finding)
     if not np.ptp(effect) > 0.0:
         return
-    known = 1 + len(finding.before.regressors)
+    count = 1 + len(finding.before.regressors)
     marks = np.unique(np.linspace(0, effect.size - 1, min(effect.size, POINTS // 2)).astype(int))
 
     def path(state: State) -> Summary:
-        series = replace(state.series, columns=state.series.columns[:known]).beside(effect)
+        series = replace(state.series, columns=state.series.columns[:count]).beside(effect)
         white = np.nan_to_num(run(series, state.best.terms, state.best.theta, innovations=True)[1])
         z, others = white[:, -1], white[:, 1:-1]
         z = z - others @ np.linalg.lstsq(others, z, rcond=None)[0]

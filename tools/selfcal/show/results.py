@@ -367,8 +367,8 @@ class Diagnosis(Document):
                 of = {**head, "cause": finding["cause"], "of": finding.get("of"), "material": event.get("material")}
                 of |= {key: finding.get(key) for key in ("evidence_gain_nats", "net_nats")}
                 for key, value in finding["estimate"].items() or [("", "")]:
-                    told = "value" if isinstance(value, str | list | tuple) else "median"
-                    yield {**of, "key": key, **(value if isinstance(value, Mapping) else {told: value})}
+                    field = "value" if isinstance(value, str | list | tuple) else "median"
+                    yield {**of, "key": key, **(value if isinstance(value, Mapping) else {field: value})}
 
 
 class Comparison(Document):

@@ -16,7 +16,7 @@ from selfcal.base.errors import printable
 from selfcal.base.units import typeset
 from selfcal.diagnosis import words
 
-#: Letters of a name or a reason that are shown.
+#: Most letters of a name or a reason that are shown.
 LONGEST = 200
 
 

@@ -59,10 +59,10 @@ def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence
 
 
 def of_report(report: AxisReport, model: Model) -> Known:
-    """What a module's report says of its axis: a column is in use where that is the likelier."""
-    known = report.coefficients(names_of(model))
+    """The state of an axis by a module's report: a column is in use where that is the likelier."""
+    stated = report.coefficients(names_of(model))
     sent = [
-        known.get(column, (0.0, 0.0, 0.0)) for regressor in offered(model, report.axis) for column in regressor.columns
+        stated.get(column, (0.0, 0.0, 0.0)) for regressor in offered(model, report.axis) for column in regressor.columns
     ]
     coefficients = np.array([mean if probability > 0.5 else 0.0 for mean, _, probability in sent], np.float64)
     return Known(report.time_s, report.value("bias_mean"), coefficients)

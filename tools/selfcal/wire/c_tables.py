@@ -9,24 +9,17 @@ from typing import Any
 
 import numpy as np
 
+from selfcal import _library32
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import whole
 from selfcal.base.templates import of_code
 from selfcal.base.units import factor
 from selfcal.logs.recording import SIDE_CHANNELS
-from selfcal.model.file import NOT_HANDLED, Model
+from selfcal.model.file import LEAST_NODES, NOT_HANDLED, Model
 from selfcal.model.forms import COLUMN_KINDS
 from selfcal.model.laws import KINDS
 from selfcal.model.tables import AxisTable, PriorRow, Tables, gate_table
 from selfcal.wire.frames import AXES, carries
-
-#: SELFCAL_SAMPLE_MAX in selfcal_parts.h.
-SAMPLE_MAX = 2.0**40
-
-
-#: Nodes of the smallest grid, for a model without one.
-LEAST_GRID = 6
-
 
 #: Sizes by core: fineness of report integrals; lines of a spectrum (a Cortex-M0 has RAM for 20, enough for 5000 bank
 #: samples); pushes between two steps of the nodes (a batch takes 4 sample periods at 819.2 Hz and 48 MHz there).
@@ -73,7 +66,7 @@ def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
     if model.hidden_input is not None:
         yield f"{model.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"
     measured = {name for name, axis in model.simulate.get("axes", {}).items() if "hypothesis" in axis}
-    if measured and (others := [one.name for one in tables.axes if one.name not in measured]):
+    if measured and (others := [axis.name for axis in tables.axes if axis.name not in measured]):
         yield f"{model.path}: wide priors, without a result in the file: {', '.join(others)}"
     if model.gate is not None and gate_table(model, tables) is None:
         yield f"{model.path}: `gate` is left out: a bank interval is one sample, and it wants two or more"
@@ -123,13 +116,13 @@ def check_forms(model: Model) -> None:
 def sizes(tables: Tables, target: str) -> dict[str, int]:
     """The library's sizes for these tables on a core, by their macros without SELFCAL_ (lib/selfcal.h)."""
     grids = [grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid]
-    grid = max(grids, default=LEAST_GRID)
+    grid = max(grids, default=LEAST_NODES)
     nodes = max(grid, *(h.nodes for h in tables.hypotheses))
     return {
         "AXES_MAX": len(tables.axes),
         "HYPOTHESES_MAX": len(tables.hypotheses),
         "GRID_MAX": grid,
-        "ALPHA_MAX": max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=LEAST_GRID),
+        "ALPHA_MAX": max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=LEAST_NODES),
         "HYPOTHESIS_NODES_MAX": nodes,
         "NODES_MAX": max(nodes, tables.nodes),
         "REGRESSORS_MAX": max(1, len(tables.regressors)),
@@ -201,7 +194,7 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
     Bank samples less the first reach 2 range; so do differences, which pass for noise of 2 range / sqrt(2) within the
     prior's limits.
     """
-    span = 2.0 * min(axis.range or SAMPLE_MAX, SAMPLE_MAX)
+    span = 2.0 * min(axis.range or math.inf, _library32.SAMPLE_MAX)
     least, most = (math.exp(limits[0]) / math.sqrt(dt_s) for limits in (axis.ln_min, axis.ln_max))
     sigma = max(least, min(most, span / math.sqrt(2.0)))
     # SELFCAL_FIXED_LIMIT in selfcal_parts.h, and SIGMA_BITS in bank_kernel_fixed.c.

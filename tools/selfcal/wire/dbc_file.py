@@ -14,6 +14,7 @@ from pathlib import Path
 from selfcal.base.errors import UserError, remark
 from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
+from selfcal.model.file import MOST_COLUMNS, MOST_HYPOTHESES
 
 PATTERN = Path(__file__).parent / "frames.dbc"
 
@@ -21,13 +22,13 @@ PATTERN = Path(__file__).parent / "frames.dbc"
 AXIS_UNITS = {"gx": "deg/s", "gy": "deg/s", "gz": "deg/s", "ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}
 #: Identifier of node 0's first message, identifiers of a node, and nodes of a bus.
 BASE, NODE_IDS, NODES = 0x200, 128, 12
-#: Hypotheses, parameters of a hypothesis, and regressor columns that telemetry has room for.
-HYPOTHESES, PLACES, COLUMNS = 8, 3, 6
-#: Names of the places where no model gives better ones.
+#: Hypotheses and regressor columns that telemetry has room for: as many as a model.
+HYPOTHESES, COLUMNS = MOST_HYPOTHESES, MOST_COLUMNS
+#: Names of the places of a hypothesis' parameters where no model gives better ones.
 PLACE_NAMES = ("N", "p1", "p2")
 #: Signal of an axis's judgement whose words are those of every `reason_gx` to `reason_az`, too.
 REASON = "reason"
-#: Letters of a name in a DBC file, at most.
+#: Most letters of a name in a DBC file.
 LONGEST = 32
 
 
@@ -242,9 +243,9 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
 
     def first_with(signal: Signal) -> bool:
         """Whether this is the first signal of its name with its comment."""
-        known = len(said)
+        before = len(said)
         said.update([(signal.name, signal.comment)] if signal.comment else [])
-        return len(said) > known
+        return len(said) > before
 
     values = {"head": head, "messages": messages, "whole": whole, "sender": sender, "first_with": first_with}
     return of_code(Path(__file__).parent / "templates").get_template("module.dbc.jinja").render(values)

@@ -21,6 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+from selfcal import _library32
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, install
 from selfcal.model.file import Model
@@ -36,11 +37,7 @@ VERSION = 4
 AXES = tuple(AXIS_UNITS)
 STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "ANSWER", "TUMBLE"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
-IDENTIFIED, OFF_GRID = 1, 8  # bits of the flags, as in lib/selfcal.h
-
-
-COUNTER = 64  # the counter is modulo this
-JUMP_MAX = 32  # the counter may go ahead this far: beyond it, forward and backward are alike
+COUNTER = 64  # the counter is modulo this; beyond half of it forward and backward are alike
 FOREIGN_STATUSES = 2  # whole statuses in a row with another version, of a module that stated this version before
 RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is no stranger's from then
 
@@ -121,7 +118,7 @@ def tumble_text(values: Mapping[str, float]) -> str:
     phase, result, side = (choices(TUMBLE, name).get(int(values.get(name, 0)), "?").replace("_", " ") for name in names)
     if phase == "off":
         return "" if result == "none" else f"no calibration, {result}: send tumble start"
-    sides = re.sub("(minus )?([xyz]) ", lambda found: f"{'-' if found[1] else '+'}{found[2]} ", side)
+    sides = re.sub("(minus )?([xyz]) ", lambda match: f"{'-' if match[1] else '+'}{match[2]} ", side)
     todo = "hold still" if phase == "hold" else "send tumble stop" if sides == "none" else f"now {sides}"
     return f"{values.get('rests', 0):.0f} of {values.get('wanted', 0):.0f}: {todo}"
 
@@ -211,7 +208,9 @@ class AxisReport:
         def estimate(k: int, place: str) -> Estimate:
             numbers = {statistic: v[f"h{k}_{place}_{statistic}"] for statistic in STATISTICS}
             flags = int(v[f"h{k}_{place}_flags"])
-            return Estimate(**numbers, identified=bool(flags & IDENTIFIED), off_grid=bool(flags & OFF_GRID))
+            return Estimate(
+                **numbers, identified=bool(flags & _library32.IDENTIFIED), off_grid=bool(flags & _library32.OFF_GRID)
+            )
 
         def evidence(k: int) -> float:
             difference = v[f"h{k}_ln_evidence_diff"]
@@ -323,8 +322,8 @@ class _Kind:
     part: int
 
 
-#: Places in a report: opening, hypotheses, coefficients, adequacy, end.
-_COEFFICIENTS, _ADEQUACY, _END = HYPOTHESES + 1, HYPOTHESES + 2, HYPOTHESES + 3
+#: Parts of a report in their order, by what follows the axis in a message's name. The end follows them.
+_PARTS = ("", *(f"h{k}" for k in range(HYPOTHESES)), "coefficients", "adequacy")
 #: Item of an axis message that closes a report.
 _END_ITEM = 43
 
@@ -335,14 +334,11 @@ def _kinds() -> dict[int, _Kind]:
     kinds = {}
     for message in load_dbc().messages:
         axis, _, rest = message.name.lower().partition("_")
-        hypothesis = int(rest[1:]) if rest.startswith("h") else None
-        part = {"": 0, "coefficients": _COEFFICIENTS, "adequacy": _ADEQUACY}.get(rest)
         if message.name in (STATUS, CORRECTED, ANSWER, TUMBLE):
             kinds[message.frame_id - BASE] = _Kind(message, "", "", 0)
-        elif hypothesis is not None:
-            kinds[message.frame_id - BASE] = _Kind(message, axis, f"h{hypothesis}_", 1 + hypothesis)
-        elif axis in AXES and part is not None:
-            kinds[message.frame_id - BASE] = _Kind(message, axis, "", part)
+        elif axis in AXES and rest in _PARTS:
+            prefix = f"{rest}_" if rest.startswith("h") else ""
+            kinds[message.frame_id - BASE] = _Kind(message, axis, prefix, _PARTS.index(rest))
     return kinds
 
 
@@ -506,7 +502,7 @@ class Decoder:
             self._left_sent = last
             return
         returned = self._left_sent is not None and sent >= self._left_sent and ahead > 2 * good + COUNTER
-        self._twins += returned or (ahead > 0 and good > 1.5 * ahead + JUMP_MAX)
+        self._twins += returned or (ahead > 0 and good > 1.5 * ahead + COUNTER // 2)
 
     def flush(self) -> list[AxisReport]:
         """Close the report under way, incomplete, for the end of a stream."""
@@ -521,7 +517,7 @@ class Decoder:
         jump = COUNTER if self._counter is None else (counter - self._counter) % COUNTER
         if self._counter is None:
             self._sent = 1
-        elif 1 <= jump <= JUMP_MAX:
+        elif 1 <= jump <= COUNTER // 2:
             self._sent += jump
         else:
             if not self._run or counter != (self._run[-1] + 1) % COUNTER:
@@ -594,17 +590,17 @@ def _ahead(second: int, known: int, modulus: int) -> int:
 @lru_cache(maxsize=1)
 def _starts() -> tuple[int, ...]:
     """Place of the first frame of each part of a report."""
-    items = dict.fromkeys(range(_END + 1), 1)
+    items = dict.fromkeys(range(len(_PARTS) + 1), 1)
     for kind in _kinds().values():
         if kind.axis == AXES[0]:
             ids = [signal.multiplexer_ids[0] for signal in kind.message.signals if signal.multiplexer_ids]
             items[kind.part] = 1 + max(id_ for id_ in ids if id_ != _END_ITEM)
-    return tuple(sum(items[before] for before in range(part)) for part in range(_END + 1))
+    return tuple(sum(items[before] for before in range(part)) for part in items)
 
 
 def _order(kind: _Kind, item: int) -> int:
     """Place of a frame among all that a report may have. Two places differ by the most frames between them."""
-    return _starts()[_END] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
+    return _starts()[-1] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
 
 
 def _values(kind: _Kind, data: bytes) -> dict[str, float] | None:
@@ -707,7 +703,7 @@ class Streams:
         return Statistics(**total)
 
 
-#: Bytes of a serial line without an end that are kept: a frame's line has 22.
+#: Most bytes of a serial line without an end that are kept: a frame's line has 22.
 LINE_MAX = 4096
 
 
@@ -879,13 +875,13 @@ def serial_ports() -> str:
 
 def _can_devices() -> str:
     """The machine's CAN devices, in words. ARPHRD_CAN of linux/if_arp.h is 280."""
-    found = []
+    names = []
     for device in sorted(Path("/sys/class/net").glob("*")):
         try:
-            found += [device.name] if (device / "type").read_text().strip() == "280" else []
+            names += [device.name] if (device / "type").read_text().strip() == "280" else []
         except OSError:
             continue
-    return f"there are {', '.join(found)}" if found else "this machine has none"
+    return f"there are {', '.join(names)}" if names else "this machine has none"
 
 
 def _reason(interface: str, channel: str, error: BaseException) -> str:

@@ -20,7 +20,7 @@ from jinja2 import Template
 from selfcal.base.errors import UserError
 from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
-from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, PLACES, REASON, dbc
+from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, dbc
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
@@ -175,7 +175,8 @@ def header(database: Database) -> str:
         "later_of": lambda message: any(LATER.match(field.name) for field in fields(message)),
         "choices_of": _choices,
         "COMMON": COMMON,
-        **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES, "PLACES": PLACES},
+        **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES},
+        "PLACES": len(PLACE_NAMES),
         "STATISTICS": STATISTICS,
     }
     return _template("selfcal_frames.h.jinja").render(values)

@@ -31,8 +31,8 @@ class KnownModels:
 
     def names(self, status: Mapping[str, float]) -> Names:
         """Names of the model that a module with this status runs; BY_PLACE until the model is known."""
-        known = tuple(status.get(key, math.nan) for key in ("model_id", "bank_interval", "bank_block"))
-        return BY_PLACE if any(math.isnan(value) for value in known) else self._named(*known)
+        numbers = tuple(status.get(key, math.nan) for key in ("model_id", "bank_interval", "bank_block"))
+        return BY_PLACE if any(math.isnan(value) for value in numbers) else self._named(*numbers)
 
     def advice(self, status: Mapping[str, float]) -> str:
         """The remedy for names that are places; empty if the model is known."""

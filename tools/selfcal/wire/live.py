@@ -18,11 +18,11 @@ from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.text import Text
 
+from selfcal import _library32
 from selfcal.base.units import parameter_unit, typeset
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import (
     AXES,
-    OFF_GRID,
     REASONS,
     AxisReport,
     Decoder,
@@ -316,8 +316,8 @@ class View:
             return wrong
         if contact is not None and contact.lost and not module.decoder.finished:
             return "contact lost: check cable and power"
-        told = {name: status_text(name, status[name]) for name in TROUBLE if name in status}
-        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if told.get(name) == text), "")
+        texts = {name: status_text(name, status[name]) for name in TROUBLE if name in status}
+        trouble = next((f"{name} {text}" for name, text in TROUBLE.items() if texts.get(name) == text), "")
         if trouble:
             return f"{trouble}: see port/README.md"
         if said := tumble_text(module.decoder.tumble):
@@ -356,8 +356,8 @@ class View:
     def _sufficiency(last: Mapping[str, tuple[AxisReport, deque[float]]]) -> list[Text]:
         """The law that the record is too short for."""
         judgements = [report.adequacy for report, _ in last.values()]
-        known = [judged.temperature_moved for judged in judgements if judged and judged.temperature_moved is not None]
-        moved = max(known, default=TEMPERATURE_NEEDED)
+        moves = [judged.temperature_moved for judged in judgements if judged and judged.temperature_moved is not None]
+        moved = max(moves, default=TEMPERATURE_NEEDED)
         if moved >= TEMPERATURE_NEEDED:
             return []
         said = f"temperature has moved {moved:.1f} of the {TEMPERATURE_NEEDED:g} degC that a temperature law needs"
@@ -469,7 +469,7 @@ def counted(s: Statistics) -> str:
 
 
 def frame_counts(streams: Streams | Decoder, source: Source) -> str:
-    """One line that says what became of all frames."""
+    """A line on the fate of all frames."""
     return f"{counted(streams.statistics)}, {source.malformed} malformed"
 
 
@@ -483,12 +483,12 @@ def most_probable(report: AxisReport, names: Names = BY_PLACE) -> int | None:
     greater. If the report lacks their number, a model's `names` have it."""
     count = report.hypotheses or (len(names.hypotheses) if names.known else None)
     signals = {k: f"h{k}_probability" for k in range(told_of(report))}
-    known = {k: report.values[signal] for k, signal in signals.items() if signal in report.values}
-    if not known or len(known) != count:
+    probabilities = {k: report.values[signal] for k, signal in signals.items() if signal in report.values}
+    if not probabilities or len(probabilities) != count:
         return None
-    if len({math.isnan(probability) for probability in known.values()}) > 1:
+    if len({math.isnan(probability) for probability in probabilities.values()}) > 1:
         return None  # all of them NaN is a report outside the priors: the view says that
-    return max(known, key=lambda k: known[k])
+    return max(probabilities, key=lambda k: probabilities[k])
 
 
 def _bar_cells(hypotheses: int, width: int) -> int:
@@ -563,10 +563,10 @@ def _bar(report: AxisReport, k: int, cells: int) -> str:
 def _spark(trend: Sequence[float], sd: float, cells: int) -> str:
     """The last biases, the newest at the right. The height spans what they span, two of their sd at least."""
     shown = list(trend)[-cells:]
-    known = [value for value in shown if math.isfinite(value)]
-    if not known:
+    finite = [value for value in shown if math.isfinite(value)]
+    if not finite:
         return " " * cells
-    low, high = min(known), max(known)
+    low, high = min(finite), max(finite)
     least = 2.0 * sd if math.isfinite(sd) else 0.0
     middle, span = (low + high) / 2.0, max(high - low, least) or 1.0
     heights = (
@@ -595,7 +595,9 @@ def _parameters(report: AxisReport, names: Names, *, named: bool = False) -> lis
         label = "1/alpha" if inverse else parameter
         unit = "s" if inverse else typeset(parameter_unit(parameter, axis_unit(report.axis)))
         said.append(f"{label} {middle} [{low}, {high}] {unit if unit != '1' else ''}".rstrip())
-    if any(int(report.values.get(f"h{k}_{place}_flags", 0)) & OFF_GRID for place in PLACE_NAMES[: len(given)]):
+    if any(
+        int(report.values.get(f"h{k}_{place}_flags", 0)) & _library32.OFF_GRID for place in PLACE_NAMES[: len(given)]
+    ):
         said.append("grid of nodes too coarse")
     if named or not names.known:
         name = names.hypotheses[k] if k < len(names.hypotheses) else BY_PLACE.hypotheses[k]

@@ -229,8 +229,8 @@ def write_rows(recording: Recording, model: Model, axes: Sequence[str], path: Pa
     rows["missing"] = recording.missing_before
     for index, (name, unit) in enumerate(wanted):
         there = name in recording.columns and same_kind(recording.columns[name].unit, unit)
-        known = there or (name, unit) not in SIDE
-        rows["value"][:, index] = as_float(recording.in_unit(name, unit)) if known else np.nan
+        recorded = there or (name, unit) not in SIDE
+        rows["value"][:, index] = as_float(recording.in_unit(name, unit)) if recorded else np.nan
     header = np.array(
         [(MAGIC, len(axes), len(channels) + len(SIDE), recording.rate_hz, recording.samples, recording.powered)],
         dtype="S8, <u4, <u4, <f8, <u8, <u8",
@@ -464,8 +464,8 @@ def document_of(
         if "error" not in axis:
             judgement = history[name][-1].adequacy
             axis["module_says"] = asdict(judgement) if judgement is not None else None
-            known = [] if gate else [of_report(report, model) for report in history[name]]
-            axis["ahead"] = None if gate else error_ahead(recording, model, name, known)
+            stated = [] if gate else [of_report(report, model) for report in history[name]]
+            axis["ahead"] = None if gate else error_ahead(recording, model, name, stated)
             axis["outliers_kept_out"] = int(history[name][-1].values.get("outliers", 0))
             if judgement is not None and judgement.change is not None and judgement.state != "inadequate":
                 note(f"{name}: the module says {judgement.change}; the checks here look at the record as one")

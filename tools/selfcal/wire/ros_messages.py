@@ -27,13 +27,13 @@ def diagnostics(report: Mapping[str, Any], at_s: float) -> dict[str, Any]:
     judged, laws = report.get("adequacy", {}), report["laws"]
     likeliest = _likeliest(report)
     # Levels as diagnostic_msgs has them: 0 OK, 1 WARN, 3 STALE.
-    level, told = 0, "calibrated"
+    level, words = 0, "calibrated"
     if not report["complete"] or likeliest is None:
-        level, told = 3, "the report is not complete"
+        level, words = 3, "the report is not complete"
     elif judged.get("state") == "inadequate":
-        level, told = 1, f"not adequate: {judged['suspicion']}"
+        level, words = 1, f"not adequate: {judged['suspicion']}"
     elif judged.get("state") == "not_judged":
-        told = "calibrated, not judged"
+        words = "calibrated, not judged"
     values = {"unit": report["unit"], "law": likeliest or "", "bias": _pair(report["bias"])}
     values |= {
         key: _pair(estimate) for key, estimate in (laws.get(likeliest) or {}).items() if isinstance(estimate, Mapping)
@@ -41,7 +41,7 @@ def diagnostics(report: Mapping[str, Any], at_s: float) -> dict[str, Any]:
     status = {
         "level": level,
         "name": f"selfcal: {report['axis']}",
-        "message": told,
+        "message": words,
         "hardware_id": f"node{report['node']}",
         "values": [{"key": key, "value": value} for key, value in values.items()],
     }
@@ -58,15 +58,15 @@ def imu(reports: Mapping[str, Mapping[str, Any]], rate_hz: float, at_s: float) -
         "orientation_covariance": [-1.0, *[0.0] * 8],
     }
     for letter, (field, unit) in _SENSORS.items():
-        known = [_known(reports.get(f"{letter}{axis}"), unit) for axis in "xyz"]
+        of_axes = [_known(reports.get(f"{letter}{axis}"), unit) for axis in "xyz"]
         covariance = [0.0] * 9
-        for k, numbers in enumerate(known):
+        for k, numbers in enumerate(of_axes):
             if numbers is not None:
                 covariance[4 * k] = numbers[1] ** 2 * rate_hz + numbers[2] ** 2
         message[field] = {
-            axis: 0.0 if numbers is None else numbers[0] for axis, numbers in zip("xyz", known, strict=True)
+            axis: 0.0 if numbers is None else numbers[0] for axis, numbers in zip("xyz", of_axes, strict=True)
         }
-        message[f"{field}_covariance"] = [-1.0, *[0.0] * 8] if None in known else covariance
+        message[f"{field}_covariance"] = [-1.0, *[0.0] * 8] if None in of_axes else covariance
     return message
 
 
@@ -83,12 +83,12 @@ def _known(report: Mapping[str, Any] | None, unit: str) -> tuple[float, float, f
 
 
 def _likeliest(report: Mapping[str, Any]) -> str | None:
-    known = {
+    probability = {
         law: estimate["probability"]
         for law, estimate in report["laws"].items()
         if estimate.get("probability") is not None
     }
-    return max(known, key=lambda law: known[law], default=None)
+    return max(probability, key=lambda law: probability[law], default=None)
 
 
 def _pair(estimate: Mapping[str, Any]) -> str:

@@ -66,15 +66,15 @@ def content(report: AxisReport, names: Names) -> dict[str, Any]:
         entry["averages"] = int(v["count"])
     laws: dict[str, Any] = {}
     for k in range(report.hypotheses or told_of(report)):
-        known = k < len(names.hypotheses)
+        named = k < len(names.hypotheses)
         law: dict[str, Any] = {}
         if f"h{k}_probability" in v:
             law["probability"] = v[f"h{k}_probability"]
-        for place, parameter in zip(PLACE_NAMES, names.parameters[k] if known else PLACE_NAMES, strict=False):
+        for place, parameter in zip(PLACE_NAMES, names.parameters[k] if named else PLACE_NAMES, strict=False):
             statistics = {key: v[f"h{k}_{place}_{key}"] for key in STATISTICS if f"h{k}_{place}_{key}" in v}
             if statistics:
                 law[parameter] = {**statistics, "unit": parameter_unit(parameter, unit)}
-        laws[names.hypotheses[k] if known else f"h{k}"] = law
+        laws[names.hypotheses[k] if named else f"h{k}"] = law
     entry["laws"] = laws
     if report.adequacy is not None:
         entry["adequacy"] = {"state": report.adequacy.state, "suspicion": report.adequacy.suspicion}
@@ -160,11 +160,11 @@ class _Ros(_Lines):
         """The status of the axis, and the node's Imu."""
         of_node = self._known.setdefault(report["node"], {})
         of_node[report["axis"]] = report
-        for topic_of, kind, told in (
+        for topic_of, kind, message in (
             ("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", diagnostics(report, at_s)),
             (f"/selfcal/node{report['node']}/imu", "sensor_msgs/msg/Imu", imu(of_node, self._rate_hz, at_s)),
         ):
-            yield json.dumps({"topic": topic_of, "type": kind, "msg": told}, allow_nan=False)
+            yield json.dumps({"topic": topic_of, "type": kind, "msg": message}, allow_nan=False)
 
 
 class _Foxglove:
