@@ -159,10 +159,17 @@ def test_a_finding_reads_as_it_is_said() -> None:
     settling = {"cause": "turn_on", "axes": {"gz": {"estimate": {}}}, "estimate": {}}
     assert words.what(settling) == "turn-on transient on gz"
     assert words.small([settling]).startswith("1 small finding (turn-on transient on gz)")
-    once = "happened once: no other time can confirm it"
-    for cause, told in (("tilt", once), ("flicker", "not confirmed on held-out time")):
-        assert words.effects({"cause": cause, "changes": {}, "confirmed": False}).startswith(told)
-        assert not words.effects({"cause": cause, "changes": {}, "confirmed": True})
+    of_time, always = {"time_s": interval(70.0, 1.0, "s")}, {"channel": "temp"}
+    once, again = "an event: no other time can confirm it", "not confirmed on held-out time"
+    for cause, estimate, told in (
+        ("tilt", of_time, once),
+        ("variance_change", of_time, once),
+        ("variance_change", always, again),
+        ("flicker", {}, again),
+    ):
+        finding = {"cause": cause, "estimate": estimate, "changes": {}}
+        assert words.effects({**finding, "confirmed": False}) == told
+        assert words.effects({**finding, "confirmed": True}) == ""
 
 
 @pytest.mark.parametrize(
@@ -183,17 +190,19 @@ def test_a_line_is_advised_by_its_frequency(hz: float, samples: int, temperature
 
 
 def test_numbers_that_move_the_other_way_are_told() -> None:
-    """Without the line alone B is 30 % too large, and all findings together raise it. K falls both ways."""
+    """Without the line alone B is 30 % too large. All findings together raise it on gx, and lower it on az."""
 
     def axis(before: float, after: float) -> dict[str, Any]:
         same = {"before": 1.0, "after": {"median": 1.0, "identified": True}}
         moved = {"before": before, "after": {"median": after, "identified": True}}
         return {"numbers": {"N": same, "K": {**moved, "before": 3.0 * after}, "B": moved}}
 
-    changes = {name: {"N": 1.0, "K": 2.0, "B": 1.3, "material": ["K", "B"]} for name in ("gx", "az")}
+    changes = {name: {"N": 1.0, "K": 2.0, "B": 1.3, "material": ["N", "B"]} for name in ("gx", "az")}
     axes = {"gx": axis(0.7, 0.9), "az": axis(0.8, 0.6)}
     assert words.contrary([{"changes": changes}], axes).startswith("B of gx: ")
     assert words.contrary([{"changes": changes}], {"az": axes["az"]}) == ""
+    changes["gx"]["material"] = ["K", "B"]  # B follows from K: the list does not say it
+    assert words.contrary([{"changes": changes}], axes) == ""
 
 
 @pytest.mark.parametrize(("sd", "applied"), [(0.02, True), (0.06, False)])

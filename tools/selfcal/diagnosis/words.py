@@ -250,8 +250,8 @@ def effects(finding: Mapping[str, Any]) -> str:
         told.append(f"bias error {horizon} s ahead {100.0 * most:.0f} % larger")
     seen = []
     if finding["confirmed"] is False:
-        once = finding["cause"] in CAUSES and CAUSES[finding["cause"]].score.once
-        seen = ["happened once: no other time can confirm it" if once else "not confirmed on held-out time"]
+        event = {"time_s", "intervals"} & finding["estimate"].keys() and CAUSES[finding["cause"]].score.once
+        seen = ["an event: no other time can confirm it" if event else "not confirmed on held-out time"]
     if finding.get("confirmed_on") is not None:
         seen.append("holds on the second recording" if finding["confirmed_on"] else "not seen on the second recording")
     return "; ".join([*([", ".join(told)] if told else []), *seen])
@@ -263,8 +263,11 @@ def contrary(findings: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[s
     for name, (axis, one) in itertools.product(("N", "K", "B"), axes.items()):
         number = one["numbers"][name]
         rise = number["after"]["median"] - number["before"] if number["after"]["identified"] else 0.0
-        own = [finding["changes"].get(axis) for finding in findings]
-        large = [change[name] > 1.0 for change in own if change and name in change["material"] and change[name]]
+        own = [finding["changes"][axis] for finding in findings if axis in finding["changes"]]
+        own = [
+            change for change in own if name in change["material"] and (name != "B" or "K" not in change["material"])
+        ]
+        large = [change[name] > 1.0 for change in own if change[name]]
         if (rise > 0.0 and True in large) or (rise < 0.0 and False in large):
             told.setdefault(name, []).append(axis)
     each = ", ".join(f"{name} of {' '.join(names)}" for name, names in told.items())
