@@ -190,14 +190,19 @@ def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
 
 
 def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
-    """The readings of an axis of an evened and thinned recording. Looked at once, unless that takes much memory."""
+    """The readings of an axis of an evened and thinned recording. Looked at once, unless that takes much memory: ranges
+    that hold all of them, or none, change nothing."""
     if recording.samples > KEPT_MOST:
         return _readings_of(recording, axis, group)
-    key = (axis, group.unit, group.range, group.stuck_limit)
-    if key not in recording.seen:
-        recording.seen[key] = _readings_of(recording, axis, group)
-    found: Readings = recording.seen[key]
-    return found
+    looks: list[tuple[float, Readings]]
+    looks = recording.seen.setdefault((axis, group.unit, group.stuck_limit), [])
+    for known, found in looks:
+        values = (recording.in_unit(axis, group.unit), found.values)
+        most = max(float(np.max(np.abs(_known(each)), initial=0.0)) for each in values)
+        if known == group.range or all(most <= one or not one > 0.0 for one in (known, group.range)):
+            return found
+    looks.append((group.range, _readings_of(recording, axis, group)))
+    return looks[-1][1]
 
 
 def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
