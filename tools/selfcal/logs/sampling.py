@@ -51,6 +51,8 @@ _WANDER, _PIECE_OF_GRID, _EARLY = 3e-5, 100, 3
 #: Grids proposed, harmonics of their lines, the band of a line in rates of the stamps, and the least ln of its power
 #: over that around it.
 _LINES, _HARMONICS, _BAND, _LINE = 8, 6, (0.9, 4.0), 3.0
+#: Rows that show the phase of the first.
+_NEAR_FIRST = 512
 #: Steps of one interval on a grid at least, of all; and steps of less than half of one where each strays, at most.
 _ONES, _TOO_SHORT = 0.05, 0.01
 #: Rows of a record whose stamps make no line: all grids in this band are tried, in rates of the stamps.
@@ -63,9 +65,9 @@ _STEPS, _PIECES = 20, 500
 _PRICE_OF_PART = 40.0
 #: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
 _CHANGE = 0.015
-#: Steps between stretches of samples, in usual steps; samples of a stretch at least; where stretches are short, their
-#: share of the time and the share of the steps that are about the usual one, at least.
-_ASLEEP, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 20, 0.05, 0.6
+#: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
+#: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
+_ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
 #: A gap between steps of any length, in the step beyond which half of the time is.
 _GAP = 12.0
 #: Errors about their line that are far off, in the median one.
@@ -240,14 +242,13 @@ def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
     """bool[n - 1]: the steps between stretches of samples, whatever they last. Bursts of a bus are as short, and less
     even."""
     usual = _usual(steps)
-    late = steps > _ASLEEP * usual
     # Samples that come at once after a step make up for it.
-    long = late & (np.append(steps[1:], usual) > 0.5 * usual)
+    long = (steps > _ASLEEP * usual) & (np.append(steps[1:], usual) > 0.5 * usual)
     count = int(np.count_nonzero(long))
-    seldom = 10 * count * _AWAKE < steps.size
+    if not 0 < count * _AWAKE < steps.size or np.median(steps[long]) < _ALONE * steps[~long].max():
+        return np.zeros_like(long)
     even = np.mean(np.abs(steps - usual) < 0.5 * usual) > _EVEN and usual * steps.size > _AWAKE_SHARE * time[-1]
-    alone = 2 * count > np.count_nonzero(late if seldom else steps > _ASLEEP / _PARTS * usual)
-    return long if alone and count * _AWAKE < steps.size and (seldom or even) else np.zeros_like(long)
+    return long if even or 10 * count * _AWAKE < steps.size else np.zeros_like(long)
 
 
 # -------------------------------------------------------------------------------------------------- what a law costs
@@ -322,7 +323,7 @@ def _counted(stamps: _Stamps, _: float) -> _Fit:
     ]
     dt = _slope(index, time, [cut for cut, seconds in zip(cuts, lost, strict=True) if seconds])
     missing[cuts] = np.maximum(0, np.rint(np.array(lost) / dt)).astype(np.int64)
-    kept = steps[~(gap | stamps.asleep)]
+    kept = steps[~stamps.asleep]
     nats = _ln_values(kept, stamps.cell) + 3.0 * math.log(index.size) if kept.size else 0.0
     return stamps.put_back(_Fit(dt, missing, nats))
 
@@ -381,25 +382,31 @@ def _exactly(stamps: _Stamps, dt: float) -> _Fit | None:
 def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
     """Of samples that are stamped within so large a share of a lattice step. None where they are not."""
     best, index, asleep = None, np.arange(stamps.time.size), np.append(False, stamps.asleep)
-    for _ in range(4):
-        missing, odd = _decode(stamps.time, dt, share * stamps.lattice)
+    slack, first = share * stamps.lattice, (0.0, share * stamps.lattice)
+    for again in range(5):
+        missing, odd = _decode(stamps.time, dt, slack, first)
         if odd > 0.05 * index.size + 3:
             break
         place = index + np.cumsum(missing)
-        dt = _slope(place, stamps.time)
-        nats = stamps.fit(dt, np.where(asleep, 0, missing), stamps.time - place * dt).nats
-        fit = _Fit(dt, missing, nats)
-        if best is not None and fit.nats >= best.nats:
+        # A sample lost at once leaves the first place open; later ones tell the phase.
+        phase = float(np.median((stamps.time - place * dt)[:_NEAR_FIRST])) + 0.5 * slack
+        first = (phase - 0.1 * slack, phase + 0.1 * slack)
+        fitted = _slope(place, stamps.time)
+        nats = stamps.fit(fitted, np.where(asleep, 0, missing), stamps.time - place * fitted).nats
+        if best is None or nats < best.nats:
+            best = _Fit(fitted, missing, nats)
+        elif again > 1:
             break
-        best = fit
+        dt = fitted if again else dt
     return best
 
 
-def _decode(time: Floats, dt: float, slack: float) -> tuple[Places, int]:
-    """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be."""
+def _decode(time: Floats, dt: float, slack: float, first: tuple[float, float]) -> tuple[Places, int]:
+    """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be, of
+    the `first` one given."""
     missing = np.zeros(time.size, np.int64)
     stamps = time.tolist()
-    lo, hi, odd = stamps[0], stamps[0] + slack, 0
+    lo, hi, odd = *first, 0
     down, up = dt * (1.0 - _WANDER), dt * (1.0 + _WANDER)
     for row in range(1, len(stamps)):
         stamp = stamps[row]
