@@ -1,160 +1,468 @@
-"""Sampling rate and missing samples from time stamps.
+"""Interval and missing samples from time stamps, by one likelihood.
 
-Stamps that are fine beside the sampling interval show it: it is the median step, and a missing sample a step of two.
-Stamps of 1 ms at 819.2 Hz do not: steps of 1 and 2 ms alternate, and a missing sample looks much like its neighbours.
-What such stamps do obey is that sample k was stamped within one lattice step of k dt. A sequential decoder follows the
-times that are still possible under a supposed dt: where none is left a sample is missing. Of all dt the one that needs
-the fewest missing samples is taken; where others need hardly more, the stamps cannot tell and that is said.
-Stamps at random times, or in the bursts of a bus, lie on no grid. They have a mean rate, and gaps where these are long.
+Sample n was taken at n dt and stamped a little later; some samples have no stamp. Stamps may be rounded to a lattice.
+A law says which n each stamp has; it costs the nats that write the stamps by it: the errors to one cell by the best
+histogram, the missing samples, its numbers. The cheapest law is taken. The laws:
+
+- an even grid, whose phase is followed where stamps jitter (`_phased`), or kept within the lattice (`_decoded`);
+- steps of whole intervals that stray from each other, as those of a timer that is set anew (`_stepped`);
+- steps of any length, none of which is missing: random times, bursts of a bus, batches stamped by a nominal step. Their
+  count alone is steady (`_counted`).
+
+Grids are proposed by lines in the spectrum of the stamps. dt is the slope of the stamps against their n, always.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
+from scipy.ndimage import grey_closing, uniform_filter1d
+from scipy.optimize import isotonic_regression
 from scipy.special import betaln
 
 #: Intervals of a record at most.
 _LONGEST = 2.0**53
-#: Steps in one window of the first estimate.
-_WINDOW = 64
-#: Lattice step over interval from which stamps are coarse; below it a step of one interval is never taken for two.
-_COARSE = 0.25
-#: Rows that decide on dt, the shares of missing samples and of a too long first estimate, the step of dt.
-_HEAD, _LOST, _LONG, _STEP = 3000, 0.25, 0.05, 1e-4
-#: Change of rate within a record that the decoder follows.
-_WANDER = 3e-5
-#: Lattice steps between a sample and its stamp: less than one where the interval is a multiple, or a simple fraction,
-#: of the lattice; more where stamps come late.
-_SLACKS = np.array([0.02, 1.0, 1.5]) * 1.0001
-#: Missing samples a row that a slack must save: none up to a lattice step; beyond, a stamp could be any of 1.5 (0.4 nat
-#: a row, where a missing sample costs some 3), and such a slack would swallow gaps.
-_PRICE = np.array([0.0, 0.0, 0.15])
-#: A stamp that fits nowhere weighs as many missing samples.
-_ODD = 10
+#: Rows that decide on the law.
+_HEAD = 4000
+#: Places of a histogram in one of its cells.
+_PARTS = 5
+#: Lattice over mean step from which stamps are coarse, and the smallest cell of errors over the mean step.
+_COARSE, _FINEST = 0.25, 1e-3
+#: Nats of another interval than a lattice that is no tick of a clock, and of one that is not the stated one at most;
+#: the relative sd of that one.
+_COINCIDENCE, _STATED, _STATED_SD = 400.0, 20.0, 0.005
+#: Nats of a line that random times show by chance, and of one in a row at most: rows of batches make lines as well.
+_NO_CHANCE, _LINE_MOST = 25.0, 0.1
+#: Another dt that costs so few nats more is as good; and may cost less by the whole record.
+_AS_GOOD, _CLOSE = 10.0, 25.0
+#: Ticks of clocks are 10^-k s, 2^-k s, and this, s.
+_JIFFY = 0.004
+#: Change of rate within a record that the decoder follows; rows over which a grid's phase is followed, and at which
+#: a row or several between late ones are early.
+_WANDER, _PIECE_OF_GRID, _EARLY = 3e-5, 100, 3
+#: Grids proposed, harmonics of their lines, the band of a line in rates of the stamps, and the least ln of its power
+#: over that around it.
+_LINES, _HARMONICS, _BAND, _LINE = 8, 6, (0.9, 4.0), 3.0
+#: Rows that show the phase of the first.
+_NEAR_FIRST = 512
+#: Steps of one interval on a grid at least, of all; and steps of less than half of one where each strays, at most.
+_ONES, _TOO_SHORT = 0.05, 0.01
+#: Rows of a record whose stamps make no line: all grids in this band are tried, in rates of the stamps.
+_FEW, _BAND_OF_FEW = 64, (0.95, 1.4)
+#: Rows of the head that show whether a part of a record lost samples.
+_STRETCH = 4000
 #: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
 _STEPS, _PIECES = 20, 500
 #: A part of one rate must save so many squares of the scatter between neighbouring pieces.
 _PRICE_OF_PART = 40.0
 #: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
 _CHANGE = 0.015
-#: Without a grid a step of so many mean ones is a gap.
-_GAP = 20.0
-#: Rows of a stretch, half turns in it that are tried to either side, stretches at most, and the least mean square
-#: length: jitter of 0.2 dt. Independent steps that spread by 0.15 dt and more stay below it.
-_STRETCH, _TRIED, _STRETCHES, _COHERENT = 4000, 32, 25, 0.2
-#: Rows over which a grid's phase is followed.
-_PIECE_OF_GRID = 100
-#: Places in one interval whose spectrum is taken, and places of it at most.
-_FINE, _OTHER_PLACES = 64, 1 << 22
-#: A grid behind jitter: the slowest and the fastest line, turns in the mean step, but for grids with little jitter; and
-#: the largest of random times over the power of their noise, e^-10 among a few thousand, which bins about it show.
-_LINE_FIRST, _LINE_LAST, _LINE_CHANCE, _LINE_ABOUT = 0.9, 4.0, 25.0, 64
-#: A grid that loses samples: rows that show it, lattice steps looked at, and the power of a line over that around it
-#: beyond the largest of as many by chance. The slowest waves are the losses' own.
-_ROWS_LEAST, _PLACES, _LINE, _SLOWEST = 500, 1 << 20, 20.0, 16
-#: Steps of one lattice step that such a grid has at least, and their share over that of independent losses.
-_ONES, _ONES_SHARE = 20, 0.7
-#: Another dt with this many missing samples more or fewer is as good.
-_AS_GOOD = 5
+#: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
+#: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
+_ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
+#: A gap between steps of any length, in the step beyond which half of the time is.
+_GAP = 12.0
+#: Errors about their line that are far off, in the median one.
+_FAR = 6.0
+#: The share of the gaps that keep to a rhythm, and gaps in a period of losses at most.
+_RHYTHM, _OF_PATTERN = 0.9, 4
+#: Mean steps, times the samples of a batch, by which stamps of batches that overlap may stray from a steady count.
+_STRAY = 5.0
 
-#: Steps between stretches of samples, in usual steps; samples of a stretch and gaps of a rhythm at least; the share of
-#: the gaps that keep to a rhythm, and gaps in a period of losses at most.
-_ASLEEP, _AWAKE, _RHYTHM, _OF_PATTERN = 20.0, 20, 0.9, 4
-#: Stamps come in bursts where so many steps are shorter than this share of the mean one.
-_SHORT_STEPS, _BURST = 0.3, 0.45
-#: Mean steps, times the samples of a burst, by which stamps may stray from a steady count; bursts' distances beyond
-#: which there is a gap.
-_STRAY, _BURST_GAP = 5.0, 8.0
-
-Found = tuple[float, NDArray[np.int64]]
+Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
 
 
 class Ambiguous(ValueError):
     """The stamps do not tell the rate; the text says why."""
 
 
-def sampling(time: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
+@dataclass(frozen=True)
+class _Fit:
+    """The interval of a law, s, the samples missing before each stamp, int64[n], and the nats that write the stamps.
+    `rival`: another interval that is as good, 0 for none."""
+
+    dt: float
+    missing: Places
+    nats: float
+    rival: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Stamps:
+    """Stamps float64[n], s, and the steps [n - 1] between stretches, whatever they last. `cell`: what errors are
+    written to, s; `lattice`: what the stamps are rounded to, 0 for none; `typical`: the mean step, s."""
+
+    time: Floats
+    asleep: NDArray[np.bool_]
+    lattice: float
+    typical: float
+
+    @cached_property
+    def steps(self) -> Floats:
+        """Between neighbours, [n - 1]."""
+        return np.diff(self.time)
+
+    @property
+    def cell(self) -> float:
+        """What errors are written to, s."""
+        return max(self.lattice, _FINEST * self.typical)
+
+    @property
+    def coarse(self) -> bool:
+        """Whether the lattice hides single steps."""
+        return self.lattice > _COARSE * self.typical
+
+    @cached_property
+    def slept(self) -> Floats:
+        """Beyond one usual step, so far, [n], s."""
+        extra = np.where(self.asleep, self.steps - _usual(self.steps), 0.0) if self.asleep.any() else self.steps * 0.0
+        return np.concatenate(([0.0], np.cumsum(extra)))
+
+    @cached_property
+    def awake(self) -> Floats:
+        """The stamps without sleeps, [n], s."""
+        return self.time - self.slept
+
+    def multiple(self, dt: float) -> bool:
+        """Whether an interval is a multiple of the lattice."""
+        times = dt / self.lattice if self.lattice else 0.5
+        return abs(times - max(1, round(times))) < 1e-6
+
+    def whole(self, dt: float) -> bool:
+        """Whether an interval is a multiple of the lattice, or the lattice one of it."""
+        return self.multiple(dt) or abs(self.lattice / dt - max(1, round(self.lattice / dt))) < 1e-6
+
+    def fit(self, dt: float, missing: Places, errors: Floats, patterned: bool = True) -> _Fit:
+        """A law of the interval about `dt` with its errors, s, [n] or [n - 1], and the samples missing while awake."""
+        n = self.time.size
+        nats = _ln_losses((missing[1:] + 1)[~self.asleep], patterned) + _ln_values(errors, self.cell)
+        if not self.whole(dt):
+            nats += 3.0 * math.log(n) - 2.0 * math.log(math.pi)  # the lines of n pixels: about n^3 / pi^2
+        return self.put_back(_Fit(dt, missing, nats))
+
+    def put_back(self, fit: _Fit) -> _Fit:
+        """With the samples that are missing in the sleeps: no sleep moves the grid by more than half an interval."""
+        if not self.asleep.any():
+            return fit
+        slept = np.rint(self.slept / fit.dt).astype(np.int64)
+        missing: Places = fit.missing + np.concatenate((slept[:1], np.diff(slept)))
+        return _Fit(_slope(np.arange(missing.size) + np.cumsum(missing), self.time), missing, fit.nats)
+
+
+def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, Places]:
     """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing but where
     batches of one length overlap).
 
-    `noise_s`: their rounding noise. `rate`: the stated rate (Hz) if there is one. Raises Ambiguous. Coarse stamps of a
-    record with gaps take about a second and 10^6 rows another; all others are fast.
+    `noise_s`: their rounding noise. `rate`: the stated rate (Hz) if there is one, which is a prior. Raises Ambiguous.
+    A second at most but for coarse stamps: 10^6 rows take another second.
     """
     steps = np.diff(time)
-    asleep = _asleep(time, steps)
-    if asleep.any():
-        closed = np.where(asleep, _usual(steps), steps)
-        dt, missing = sampling(np.concatenate(([0.0], np.cumsum(closed))), noise_s, rate)
-        # No sleep moves the grid of all stretches from the stamps by more than half an interval.
-        place = np.cumsum(missing) + np.arange(time.size)
-        rows = np.flatnonzero(asleep) + 1
-        slept = np.rint(time[rows] / dt).astype(np.int64) - place[rows]
-        missing[rows] += np.diff(slept, prepend=0)
-        return _slope(np.cumsum(missing) + np.arange(time.size), time), missing
-    counted = _by_count(time, steps, rate)
-    if (steps < 0.0).any() and counted is None:
-        raise Ambiguous("the stamps fall, and their count is not steady")
-    if counted is not None and (steps != 0.0).all():
-        return counted
-    return _on_even_grid(time, steps, noise_s, rate)
-
-
-def _on_even_grid(time: NDArray[np.float64], steps: NDArray[np.float64], noise_s: float, rate: float | None) -> Found:
-    """Interval and missing_before[n] of samples that were taken one by one. Raises Ambiguous."""
     changes = rate_changes(time) if rate is None else []
     if changes:
         dt = min(min(one.before_s, one.after_s) for one in changes)
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
-    window = max(1, min(_WINDOW, steps.size // 4))
-    typical = float(np.median(time[window:] - time[:-window], overwrite_input=True)) / window
-    lattice = common_step(steps, max(4.0 * noise_s, 1e-9 * typical))
-    if lattice > _COARSE * typical:
-        try:
-            return _coarse(time, lattice, typical, rate)
-        except Ambiguous:
-            if rate is None:
-                raise
-            return 1.0 / rate, _decode(time, 1.0 / rate, lattice)[0]
-    if lattice > 0.0 and _lossy(np.rint(steps / lattice)):
-        return _on_every_step(time, lattice)
+    stamps = _stamps(time, noise_s)
+    if (steps < 0.0).any():
+        found = _counted(stamps, stamps.typical)
+        stray = time - np.arange(time.size) * found.dt
+        if np.ptp(stray) > _STRAY * found.dt * time.size / np.count_nonzero(steps < 0.0):
+            raise Ambiguous("the stamps fall, and their count is not steady")
+    else:
+        found = _likeliest(stamps, rate)
+        if found.rival and rate is None:
+            what = f"{1.0 / found.dt:.4g} from {1.0 / found.rival:.4g} Hz"
+            raise Ambiguous(f"stamps of {stamps.lattice:.3g} s are too coarse to tell {what}")
+    return found.dt, found.missing
+
+
+def _stamps(time: Floats, noise_s: float) -> _Stamps:
+    """Stamps with what one look shows of them. Raises Ambiguous."""
+    steps = np.diff(time)
     usual = _usual(steps)
-    if _in_batches(steps, usual):
-        return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
-    dt = _shortest(steps)
-    if not _even(time, dt):
-        dt = _line(time, typical, lattice)
-    return _on_grid(time, dt) if dt > 0.0 else _mean_grid(steps)
+    if not time[-1] < _LONGEST * usual:
+        raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {usual:.3g} s")
+    asleep = _asleep(time, steps)
+    pieces = np.linspace(0, steps.size, max(1, min(_AWAKE, steps.size // _AWAKE)) + 1).astype(int)
+    awake = np.concatenate(([0.0], np.cumsum(np.where(asleep, usual, steps))))
+    typical = float(np.median(np.diff(awake[pieces]) / np.diff(pieces))) or float(awake[-1]) / steps.size
+    return _Stamps(time, asleep, common_step(steps, max(4.0 * noise_s, 1e-9 * typical)), typical)
 
 
-def _asleep(time: NDArray[np.float64], steps: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """bool[n - 1]: the steps between stretches of an even grid, whatever they last; none for other stamps."""
+def _likeliest(stamps: _Stamps, rate: float | None) -> _Fit:
+    """The law of the fewest nats: of the head of the stamps, and of close calls by all of them."""
+    laws: list[tuple[_Law, float]] = [(_counted, stamps.typical)]
+    head = replace(stamps, time=stamps.time[:_HEAD], asleep=stamps.asleep[: _HEAD - 1])
+    for dt in _proposed(head, rate):
+        laws += [(_stepped, dt), (_phased, dt)]
+        laws += [(_within, dt), (_exactly, dt)] if stamps.coarse else []
+    if stamps.coarse:
+        laws.append((_within, _slope(np.arange(head.time.size), head.time)))
+        if head.time.size < _FEW:
+            low, high = (one / stamps.typical for one in _BAND_OF_FEW)
+            laws += [(_within, 1.0 / hertz) for hertz in np.arange(low, high, 0.5 / stamps.time[-1]).tolist()]
+    fits = [(nats, law, one) for law, dt in laws for nats, one in _tried(law, head, dt, rate)]
+    least, _, best = min(fits, key=lambda fit: fit[0])
+    if stamps.coarse and best.missing.any() and not stamps.whole(best.dt):
+        same = 1e-3 + 4.0 * stamps.lattice / (head.time.size * best.dt)  # dt so far apart are the same to these rows
+        others = (one.dt for nats, _, one in fits if nats < least + _AS_GOOD and abs(one.dt / best.dt - 1.0) > same)
+        best = replace(best, rival=next(others, 0.0))
+    if stamps.time.size <= _HEAD or best.rival:
+        return best
+    near = {(law, one.dt) for nats, law, one in fits if nats < least + _CLOSE}
+    near.add((_within if stamps.coarse else _phased, best.dt))
+    found = [fit for law, dt in near for fit in _tried(law, stamps, dt, rate)]
+    return min(found, key=lambda fit: fit[0], default=(0.0, _counted(stamps, stamps.typical)))[1]
+
+
+def _tried(law: _Law, stamps: _Stamps, dt: float, rate: float | None) -> list[tuple[float, _Fit]]:
+    """What stamps cost by a law, in nats with its price beforehand, and the fit; or nothing."""
+    found, q = law(stamps, dt), stamps.lattice
+    if found is None:
+        return []
+    nats = found.nats
+    if rate is not None:
+        nats += min(_STATED, 0.5 * (math.log(found.dt * rate) / _STATED_SD) ** 2)
+    elif stamps.coarse and law is not _counted and not stamps.whole(found.dt):
+        # A lattice that is no tick of a clock is the interval.
+        tick = any(abs(one - round(one)) < 1e-6 for one in (math.log10(q), math.log2(q))) or abs(q - _JIFFY) < 1e-9
+        nats += 0.0 if tick else _COINCIDENCE
+    return [(nats, found)]
+
+
+def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
+    """bool[n - 1]: the steps between stretches of samples, whatever they last. Bursts of a bus are as short, and less
+    even."""
     usual = _usual(steps)
     # Samples that come at once after a step make up for it.
     long = (steps > _ASLEEP * usual) & (np.append(steps[1:], usual) > 0.5 * usual)
     count = int(np.count_nonzero(long))
-    if not 0 < count * _AWAKE < steps.size:
+    if not 0 < count * _AWAKE < steps.size or np.median(steps[long]) < _ALONE * steps[~long].max():
         return np.zeros_like(long)
-    closed = np.where(long, usual, steps)
-    shows = np.mean(np.abs(closed - usual) < 1e-3 * usual) > _RHYTHM or _even(np.cumsum(closed), usual)
-    return long if shows else np.zeros_like(long)
+    even = np.mean(np.abs(steps - usual) < 0.5 * usual) > _EVEN and usual * steps.size > _AWAKE_SHARE * time[-1]
+    return long if even or 10 * count * _AWAKE < steps.size else np.zeros_like(long)
 
 
-def _in_batches(steps: NDArray[np.float64], usual: float) -> bool:
-    """Whether steps of another length come in a rhythm and are no whole intervals: a batch is stamped by another
-    interval than its own."""
-    gaps = np.abs(steps - usual) > 0.15 * usual
-    if not in_rhythm(np.flatnonzero(gaps)):
-        return False
-    turns = steps[gaps] / float(steps[~gaps].mean())
-    off = turns - np.rint(turns)
-    return abs(float(off.mean())) > 5.0 * float(off.std()) / math.sqrt(off.size) + 1e-3
+# -------------------------------------------------------------------------------------------------- what a law costs
+
+
+def _ln_values(values: Floats, cell: float) -> float:
+    """Nats that write values [n] to a cell by the best histogram, of cells 2^k wide at any of some places."""
+    part = np.floor(np.sort(values - values.min()) * (_PARTS / cell) + 1e-6)
+    first = np.flatnonzero(np.diff(part, prepend=-1.0))
+    part, times, n = part[first], np.diff(first, append=part.size), part.size
+    best, width, top = math.inf, float(_PARTS), float(part[-1])
+    while True:
+        for shift in (*(np.arange(_PARTS) * width / _PARTS), -(top + 1.0) % width):
+            at = np.floor((part + shift) / width)
+            begin = np.flatnonzero(np.diff(at, prepend=-1.0))
+            counts = np.add.reduceat(times, begin)
+            far = np.count_nonzero(np.diff(at) > 1.0) * math.log(1.0 + top / width)
+            best = min(
+                best,
+                n * math.log(width / _PARTS)
+                + float(counts @ np.log(n / counts))
+                + far
+                + 0.5 * counts.size * math.log(n),
+            )
+        if width > top:
+            return best
+        width *= 2.0
+
+
+def _ln_losses(steps: Places, patterned: bool) -> float:
+    """Nats that write steps of whole intervals [m]: samples lost one by one, in runs, in runs of any length, or in a
+    pattern of a few gaps, if that can be."""
+    n, lost = steps.size, int(steps.sum()) - steps.size
+    if lost <= 0:
+        return 0.0
+    if np.count_nonzero(steps == 1) < _ONES * n:
+        return math.inf  # a grid of longer intervals
+    gaps = np.flatnonzero(steps > 1)
+    runs = steps[gaps] - 1
+    begin = -float(betaln(gaps.size, n - gaps.size + 1))
+    codes = [-float(betaln(lost, n)) - math.log(3.0), begin - float(betaln(gaps.size, lost - gaps.size + 1))]
+    codes.append(begin + float(np.log(runs * (runs + 1.0)).sum()))
+    for k, same in _periods(steps) if patterned and _OF_PATTERN * np.count_nonzero(steps == 1) > n else []:
+        odd = np.count_nonzero(~same)
+        codes.append((1.5 * (2 * k + odd)) * math.log(n) - (float(betaln(odd, same.size)) if odd else 0.0))
+    return min(codes) + math.log(6.0)
+
+
+# --------------------------------------------------------------------------------------------------------------- laws
+
+#: A law of stamps, from about an interval, s; None where it has none.
+_Law = Callable[[_Stamps, float], _Fit | None]
+
+
+def _counted(stamps: _Stamps, _: float) -> _Fit:
+    """Steps of any length, of which the very long ones alone are gaps, unless samples that come at once make up for
+    them."""
+    time, index = stamps.awake, np.arange(stamps.time.size)
+    steps, missing = np.diff(time), np.zeros(index.size, np.int64)
+    ordered = np.sort(steps)
+    half = float(ordered[np.searchsorted(np.cumsum(ordered), 0.5 * time[-1])])  # longer steps make half of the time
+    gap = steps > _GAP * half
+    cuts: list[int] = (np.flatnonzero(gap) + 1).tolist()
+    parts = np.split(time - index * _slope(index, time, cuts), cuts)
+    # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
+    reach = max(1, round(10.0 * index.size / (np.count_nonzero(steps > stamps.typical) + 1)))
+    lost = [
+        float(after[:reach].min() - before[-reach:].min())
+        if after[: 10 * reach].min() > before[-reach:].min() + stamps.typical
+        else 0.0
+        for before, after in pairwise(parts)
+    ]
+    dt = _slope(index, time, [cut for cut, seconds in zip(cuts, lost, strict=True) if seconds])
+    missing[cuts] = np.maximum(0, np.rint(np.array(lost) / dt)).astype(np.int64)
+    kept = steps[~stamps.asleep]
+    nats = _ln_values(kept, stamps.cell) + 3.0 * math.log(index.size) if kept.size else 0.0
+    return stamps.put_back(_Fit(dt, missing, nats))
+
+
+def _stepped(stamps: _Stamps, dt: float) -> _Fit | None:
+    """Whole intervals that stray from each other."""
+    steps, kept = np.diff(stamps.awake), ~stamps.asleep
+    whole = np.maximum(1.0, np.rint(steps / dt))
+    if np.mean(steps[kept] < 0.5 * dt) > _TOO_SHORT:
+        return None
+    dt = float(steps[kept].sum() / whole[kept].sum())
+    missing = np.concatenate(([0], whole.astype(np.int64) - 1))
+    # Holes between batches come in a pattern, and are no whole intervals: steps and errors depend on each other.
+    return stamps.fit(dt, missing, (steps - whole * dt)[kept], patterned=False)
+
+
+def _phased(stamps: _Stamps, dt: float) -> _Fit | None:
+    """The nearest places of a grid whose phase and rate are followed over pieces of the record.
+
+    A sample may be late, and none after it is then. Those in a row that are early, and late, share their place."""
+    index = np.arange(stamps.time.size)
+    turns = followed_phase(np.ones(index.size), stamps.awake, 1.0 / dt, _PIECE_OF_GRID)[0] - index
+    ahead = np.rint(turns)
+    ahead[1:] = grey_closing(ahead, _EARLY)[1:]
+    ahead = np.minimum.accumulate(ahead[::-1])[::-1]
+    ahead = np.rint(isotonic_regression(np.clip(turns, ahead - 1.0, ahead + 1.0)).x).astype(np.int64)
+    cuts = (np.flatnonzero(stamps.asleep) + 1).tolist()
+    dt = _slope(index + ahead, stamps.awake, cuts, turns - ahead)
+    found = stamps.fit(dt, np.diff(ahead, prepend=ahead[0]), (turns - ahead) * dt)
+    pieces = 0.5 * math.log(_PIECE_OF_GRID) * (index.size // _PIECE_OF_GRID)
+    return replace(found, nats=found.nats + pieces - _ln_line(stamps, dt))
+
+
+def _ln_line(stamps: _Stamps, dt: float) -> float:
+    """Nats by which the stamps have a line at an interval that independent steps like theirs do not make: of those the
+    power is exponential, about the spectrum of a renewal process."""
+    if stamps.coarse:
+        return 0.0
+    power = abs(np.exp(2j * math.pi / dt * stamps.awake).mean()) ** 2 * stamps.time.size
+    turn = complex(np.exp(2j * math.pi / dt * np.diff(stamps.awake)).mean())
+    told = power / max(1.0, (1.0 - abs(turn) ** 2) / max(abs(1.0 - turn) ** 2, 1e-12)) - _NO_CHANCE
+    return float(min(max(0.0, told), _LINE_MOST * stamps.time.size))
+
+
+def _within(stamps: _Stamps, dt: float) -> _Fit | None:
+    """Samples that are stamped within a lattice step, of which the interval is no multiple."""
+    found = _decoded(stamps, dt, 1.0001)
+    return None if found is None or stamps.multiple(found.dt) else found
+
+
+def _exactly(stamps: _Stamps, dt: float) -> _Fit | None:
+    """Samples in whole lattice steps."""
+    return _decoded(stamps, dt, 0.02) if stamps.multiple(dt) else None
+
+
+def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
+    """Of samples that are stamped within so large a share of a lattice step. None where they are not."""
+    best, index, asleep = None, np.arange(stamps.time.size), np.append(False, stamps.asleep)
+    slack, first = share * stamps.lattice, (0.0, share * stamps.lattice)
+    for again in range(5):
+        missing, odd = _decode(stamps.time, dt, slack, first)
+        if odd > 0.05 * index.size + 3:
+            break
+        place = index + np.cumsum(missing)
+        # A sample lost at once leaves the first place open; later ones tell the phase.
+        phase = float(np.median((stamps.time - place * dt)[:_NEAR_FIRST])) + 0.5 * slack
+        first = (phase - 0.1 * slack, phase + 0.1 * slack)
+        fitted = _slope(place, stamps.time)
+        nats = stamps.fit(fitted, np.where(asleep, 0, missing), stamps.time - place * fitted).nats
+        if best is None or nats < best.nats:
+            best = _Fit(fitted, missing, nats)
+        elif again > 1:
+            break
+        dt = fitted if again else dt
+    return best
+
+
+def _decode(time: Floats, dt: float, slack: float, first: tuple[float, float]) -> tuple[Places, int]:
+    """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be, of
+    the `first` one given."""
+    missing = np.zeros(time.size, np.int64)
+    stamps = time.tolist()
+    lo, hi, odd = *first, 0
+    down, up = dt * (1.0 - _WANDER), dt * (1.0 + _WANDER)
+    for row in range(1, len(stamps)):
+        stamp = stamps[row]
+        end = stamp + slack
+        lo += down
+        hi += up
+        if stamp > hi:
+            gap = math.ceil((stamp - hi) / dt)
+            missing[row] = gap
+            lo += gap * dt
+            hi += gap * dt
+        if lo >= end:
+            odd += 1
+            lo, hi = stamp, end
+        lo = max(lo, stamp)
+        hi = min(hi, end)
+    return missing, odd
+
+
+def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
+    """Intervals, s, of which the stamps may have a grid: of short steps, of the lattice, and of lines in the spectrum
+    of the stamps. Lattice and jitter leave a line's harmonics, the lattice folds them."""
+    found: list[float] = [] if rate is None else [1.0 / rate]
+    steps, typical, q = stamps.steps[~stamps.asleep], stamps.typical, stamps.lattice
+    for short in np.quantile(steps[steps > 0.0], [0.02, 0.25]).tolist():
+        dt = short
+        for _ in range(4):
+            dt = float(steps.sum() / np.maximum(1.0, np.rint(steps / dt)).sum())
+        found.append(dt)
+    low, high = _BAND[0] / typical, _BAND[1] / typical
+    if stamps.coarse:
+        high *= 0.5
+        simple = q * np.concatenate([np.arange(1.0, 5.0), 1.0 / np.arange(2.0, 9.0)])
+        found += simple[(simple * low < 1.0) & (simple * high > 1.0) | (simple == q)].tolist()
+    cell = q if stamps.coarse else typical / 64.0
+    time = stamps.time if stamps.coarse else stamps.awake
+    ticks = np.rint(time[time < cell * 2.0**18] / cell).astype(np.int64)
+    taken = np.bincount(ticks) - ticks.size / (int(ticks[-1]) + 1.0)
+    size = 1 << (4 * taken.size).bit_length()
+    power = np.log(np.abs(rfft(taken, size)) ** 2 + 1e-9 * ticks.size**2)
+    power -= uniform_filter1d(power, min(257, 1 + size // 8))
+    power[:8] = 0.0
+    grid = np.arange(low, high, 0.25 / (size * cell))
+    score = np.zeros(grid.size)
+    for harmonic in range(1, _HARMONICS + 1):
+        at = np.rint(harmonic * grid * cell * size).astype(np.int64) % size
+        score += np.maximum(power[np.minimum(at, size - at)] - _LINE, 0.0)
+    for _ in range(_LINES):
+        top = int(score.argmax())
+        if score[top] > 0.0:
+            found.append(1.0 / float(grid[top]))
+        score[max(0, top - 16) : top + 17] = 0.0
+    return found
+
+
+# ------------------------------------------------------------------------------------------ rhythms and changes of rate
 
 
 def in_rhythm(rows: NDArray[np.int64]) -> bool:
@@ -165,12 +473,17 @@ def in_rhythm(rows: NDArray[np.int64]) -> bool:
     return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) >= _RHYTHM)
 
 
-def in_pattern(steps: NDArray[np.float64]) -> bool:
+def in_pattern(steps: NDArray[np.floating[Any]] | Places) -> bool:
     """Whether the steps of more than one interval, of those steps [n - 1], come again in periods of a few."""
+    return any(np.mean(same) >= _RHYTHM for _, same in _periods(steps))
+
+
+def _periods(steps: NDArray[np.floating[Any]] | Places) -> list[tuple[int, NDArray[np.bool_]]]:
+    """By the number of gaps in a period, which of the steps of more than one interval are as a period before."""
     rows = np.flatnonzero(steps > 1.5)
     each = np.stack([np.diff(rows), steps[rows[1:]]]) if rows.size > _AWAKE else np.zeros((2, 0))
     periods = range(1, 1 + min(_OF_PATTERN, each.shape[1] - 1))
-    return any(np.mean((each[:, k:] == each[:, :-k]).all(axis=0)) >= _RHYTHM for k in periods)
+    return [(k, (each[:, k:] == each[:, :-k]).all(axis=0)) for k in periods]
 
 
 def overlapping(time: NDArray[np.float64]) -> bool:
@@ -181,40 +494,14 @@ def overlapping(time: NDArray[np.float64]) -> bool:
     return in_rhythm(rows) and float(np.median(around)) < 6.0 * float(np.median(steps))
 
 
-def _by_count(time: NDArray[np.float64], steps: NDArray[np.float64], rate: float | None) -> Found | None:
-    """Interval and missing_before of samples that arrive in bursts and are stamped on arrival, or in batches whose
-    stamps overlap; None for other stamps.
-
-    Of such stamps only the count over time is steady: it must follow one line, but for gaps between bursts.
-    """
-    if time.size < 3 * _AWAKE:
-        return None
-    at = np.linspace(0, time.size - 1, _AWAKE + 1).astype(int)
-    mean = float(np.median(np.diff(time[at]) / np.diff(at)))  # gaps are in few of the pieces
-    overlap = steps < 0.0
-    starts = np.flatnonzero(overlap if overlap.any() else steps > mean) + 1
-    if (np.mean(steps < _BURST * mean) < _SHORT_STEPS and not overlap.any()) or starts.size < _AWAKE:
-        return None
-    size = time.size / (starts.size + 1)
-    cuts = (np.flatnonzero(steps > _BURST_GAP * float(np.median(np.diff(time[starts])))) + 1).tolist()
-    index = np.arange(time.size)
-    dt = _slope(index, time, cuts) if rate is None else 1.0 / rate
-    parts = np.split(time - index * dt, cuts)
-    stray = [_STRAY * max(size, 2.0) * dt + (0.0 if rate is None else 0.01 * part.size * dt) for part in parts]
-    if any(float(np.ptp(part)) > most for part, most in zip(parts, stray, strict=True)):
-        return None
-    # Arrival is late by a varying time, never early: the earliest of a few bursts are nearest to the clock.
-    reach = max(1, round(10.0 * size))
-    missing = np.zeros(time.size, np.int64)
-    for cut, (before, after) in zip(cuts, pairwise(parts), strict=True):
-        missing[cut] = max(0, round((after[:reach].min() - before[-reach:].min()) / dt))
-    return dt, missing
-
-
-def _slope(index: NDArray[np.int64], time: NDArray[np.float64], cuts: Sequence[int] = ()) -> float:
-    """The slope of `time` against `index` by least squares, with a level of its own after each of the rows `cuts`."""
+def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), off: Floats | None = None) -> float:
+    """The slope of `time` against `index` by least squares, with a level of its own after each of the rows `cuts`. Rows
+    whose errors `off` [n] are far off are left out."""
     part = np.repeat(np.arange(len(cuts) + 1), np.diff([0, *cuts, time.size]))
-    count = np.bincount(part)
+    if off is not None:
+        kept = np.abs(off) <= _FAR * float(np.median(np.abs(off))) + 1e-9
+        part, index, time = part[kept], index[kept], time[kept]
+    count = np.maximum(np.bincount(part), 1)
     x = index - (np.bincount(part, index) / count)[part]
     y = time - (np.bincount(part, time) / count)[part]
     return float(x @ y / (x @ x))
@@ -223,62 +510,6 @@ def _slope(index: NDArray[np.int64], time: NDArray[np.float64], cuts: Sequence[i
 def _usual(steps: NDArray[np.float64]) -> float:
     """The median of the steps that are no repeats."""
     return float(np.median(steps[steps > 0.0], overwrite_input=True))
-
-
-def _shortest(steps: NDArray[np.float64]) -> float:
-    """The interval that makes whole numbers of all steps, of which a quarter or more is a single one."""
-    dt = float(np.quantile(steps, 0.25))
-    for _ in range(4):
-        dt = float(steps.sum() / np.rint(steps / dt).sum())
-    return dt
-
-
-def _even(time: NDArray[np.float64], dt: float) -> bool:
-    """Whether stamps lie on a grid of `dt`, jitter and lost samples or not.
-
-    exp(2 pi i t / dt) of grid times with jitter of the sd s has the mean length exp(-2 (pi s / dt)^2) in any stretch.
-    Of steps that are independent it decays along a stretch. A rate that is slightly off turns it, so a few are tried.
-    """
-    length = min(_STRETCH, time.size)
-    rows = time[: time.size // length * length].reshape(-1, length)
-    rows = rows[:: math.ceil(len(rows) / _STRETCHES)]
-    turns = (rows - rows[:, :1]) / dt
-    off = np.arange(-_TRIED, _TRIED + 1) / (2.0 * max(length, float(np.median(turns[:, -1]))))
-    lengths = [np.abs(np.exp(2j * math.pi * turns * (1.0 + each)).mean(axis=1)) ** 2 for each in off]
-    return bool(np.median(np.max(lengths, axis=0)) > _COHERENT)
-
-
-def thinned_grid(time: NDArray[np.float64], dt: float) -> bool:
-    """Whether stamps lie on a grid of `dt` and on none of two or three times that: it lost samples, however many."""
-    return _even(time, dt) and not _even(time, 2.0 * dt) and not _even(time, 3.0 * dt)
-
-
-def _line(time: NDArray[np.float64], typical: float, lattice: float) -> float:
-    """Interval, s, of a grid that jitter and losses hide from single steps; 0 if the stamps have none.
-
-    A grid is a line in the spectrum of the stamps, jitter of the sd s dt leaves exp(-(2 pi s)^2) of its power. The
-    stamps' own `lattice` is one as well. Of `typical`, the mean step, the grid may keep so many samples."""
-    head = time[:_STRETCH]
-    head = head[head < _OTHER_PLACES / _FINE * typical]
-    stamped = np.bincount(np.rint(head * (_FINE / typical)).astype(np.int64))
-    power = np.abs(rfft(stamped, 2 * stamped.size)) ** 2 / head.size**2
-    turns = np.arange(power.size) * (_FINE / (2.0 * stamped.size))
-    shown = (turns > _LINE_FIRST) & ((turns < _LINE_LAST) | (power > _COHERENT))
-    shown &= turns * lattice < 0.5 * typical
-    if not shown.any():
-        return 0.0
-    at = int(np.argmax(np.where(shown, power, 0.0)))
-    dt = typical / float(turns[at])
-    noise = float(np.median(power[max(0, at - _LINE_ABOUT) : at + _LINE_ABOUT])) / math.log(2.0)
-    return dt if float(power[at]) > _LINE_CHANCE * max(noise, 1.0 / head.size) else 0.0
-
-
-def _mean_grid(steps: NDArray[np.float64]) -> Found:
-    """The mean step without gaps, and the samples missing in those."""
-    dt = float(steps.mean())
-    for _ in range(8):
-        dt = float(steps[steps < _GAP * dt].mean())
-    return dt, np.concatenate(([0], np.where(steps < _GAP * dt, 0, np.rint(steps / dt).astype(np.int64) - 1)))
 
 
 @dataclass(frozen=True)
@@ -407,14 +638,14 @@ def _bend(
 
 
 def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[float], lattice: float) -> bool:
-    """Whether a part is no slower one: it lies on the grid of the fastest part, and on none of its own interval, nor
-    are its stamps rounded to a coarse `lattice`."""
+    """Whether a part is no slower one: its likeliest grid is that of the fastest part. Its stamps are not rounded to a
+    coarse `lattice`."""
     fastest = min(level)
     heads = [(time[one][:_STRETCH], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
     coarse = [lattice > _COARSE * fastest and in_pattern(np.rint(np.diff(head) / lattice)) for head, _ in heads]
     return any(
-        not _even(head, step) and _even(head, fastest)
-        for (head, step), rounded in zip(heads, coarse, strict=True)
+        abs(_likeliest(_stamps(head - head[0], 1e-9 * fastest), None).dt / fastest - 1.0) < 0.05
+        for (head, _), rounded in zip(heads, coarse, strict=True)
         if not rounded
     )
 
@@ -440,22 +671,6 @@ def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
     return float(distinct @ times / (times @ times))
 
 
-# ------------------------------------------------------------------------------------------------------- fine stamps
-
-
-def _on_grid(time: NDArray[np.float64], dt: float) -> Found:
-    """The nearest places of a grid of about `dt` whose phase and rate are followed over pieces of the record.
-
-    A sample may be late, and none after it is then; it is not early."""
-    if not time[-1] < _LONGEST * dt:
-        raise Ambiguous(f"a step of {float(np.diff(time).max()):.3g} s among others of {dt:.3g} s")
-    turns, _ = followed_phase(np.ones(time.size), time, 1.0 / dt, _PIECE_OF_GRID)
-    place = np.rint(turns).astype(np.int64) - np.arange(time.size)
-    missing = np.diff(np.minimum.accumulate(place[::-1])[::-1], prepend=place.min())
-    missing[0] = 0
-    return float(time[-1]) / (time.size - 1 + int(missing.sum())), missing
-
-
 def followed_phase(
     x: NDArray[np.float64], time: NDArray[np.float64], frequency: float, block: int
 ) -> tuple[NDArray[np.float64], float]:
@@ -474,203 +689,3 @@ def followed_phase(
         phase = phase + np.interp(time, middle, turns)
         phase += slope[0] * np.minimum(time - middle[0], 0.0) + slope[-1] * np.maximum(time - middle[-1], 0.0)
     return phase, float(np.abs(np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)).sum())
-
-
-# ----------------------------------------------------------------------------------------------------- coarse stamps
-
-
-def _coarse(time: NDArray[np.float64], lattice: float, typical: float, rate: float | None) -> Found:
-    steps = np.rint(np.diff(time) / lattice)
-    whole = _unbroken(time, lattice)
-    # A lattice that is no tick of a clock, but for this one, is the interval itself.
-    own = rate is None and steps.min() == 1.0 and not _is_tick(lattice)
-    if whole is not None and not (own or (steps.min() >= 1.0 and _rather_lossy(steps, lattice, whole, rate))):
-        return _slope(np.arange(time.size), time), np.zeros(time.size, np.int64)
-    if whole is not None or _lossy(steps):
-        return _on_every_step(time, lattice)
-    low, high = (typical * (1.0 - _LOST), typical * (1.0 + _LONG)) if rate is None else (0.99 / rate, 1.01 / rate)
-    head = time[:_HEAD]
-    grid, scores = _scan(head, lattice, low, high)
-    try:
-        found = _scanned(time, lattice, grid, scores)
-    except Ambiguous:
-        if not own or np.mean(steps > 1.0) > 0.1:
-            raise
-    else:
-        if not own:
-            return found
-    return _on_every_step(time, lattice)
-
-
-def _is_tick(lattice: float) -> bool:
-    """Whether a lattice is a clock's tick, 10^-k or 2^-k s, and not the interval itself."""
-    return min(abs(one - round(one)) for one in (math.log10(lattice), math.log2(lattice))) < 1e-6
-
-
-def _rather_lossy(steps: NDArray[np.float64], lattice: float, whole: float, rate: float | None) -> bool:
-    """Whether a grid of one lattice step that lost samples is likelier than the unbroken one of the interval `whole`.
-
-    Bayes: at an unknown share of losses B(m, n) for m lost ones, and nearly pi^2/n^3 for one line of pixels. A stated
-    rate decides."""
-    if rate is not None:
-        return abs(rate * lattice - 1.0) < abs(rate * whole - 1.0)
-    lost, n = int(steps.sum()) - steps.size, steps.size
-    pixels = 2.0 * math.log(math.pi) - 3.0 * math.log(n)
-    return lost > 0 and float(betaln(lost, n)) - math.log(10.0) > pixels
-
-
-def _lossy(steps: NDArray[np.float64]) -> bool:
-    """Whether whole numbers of lattice steps are those of an even grid of one step that loses samples.
-
-    Random times repeat a stamp half as often as they take neighbouring ones, or keep a distance; a grid does neither.
-    Another rate on the lattice is a line in the spectrum of the steps that have a stamp, however many samples are lost.
-    Losses, one by one or in bursts, make no line. Those in a pattern do; steps of another rate differ by one."""
-    if steps.min() < 1.0:
-        return False
-    spread = max(np.ptp(np.quantile(one, [1.0 - _RHYTHM, _RHYTHM])) for one in (steps, steps[1:] + steps[:-1]))
-    if spread >= 2.0 and steps.min() == 1.0 and in_pattern(steps):
-        return True
-    head = np.cumsum(steps)
-    head = head[: int(np.searchsorted(head, _PLACES))].astype(np.int64)
-    if head.size < _ROWS_LEAST or head[-1] <= head.size:
-        return False
-    ones = int(np.count_nonzero(steps[: head.size] == 1.0))
-    if ones < max(_ONES, _ONES_SHARE * head.size**2 / int(head[-1])):
-        return False
-    taken = np.zeros(int(head[-1]) + 1)
-    taken[head] = 1.0
-    power = np.abs(rfft(taken - taken.mean())[1:]) ** 2
-    band = power[_SLOWEST:]
-    return bool(band.max() <= (math.log(power.size) + _LINE) * float(np.median(band)) / math.log(2.0))
-
-
-def _on_every_step(time: NDArray[np.float64], lattice: float) -> Found:
-    """The even grid of one lattice step."""
-    steps = np.rint(np.diff(time) / lattice).astype(np.int64)
-    return float(time[-1] - time[0]) / int(steps.sum()), np.concatenate(([0], steps - 1))
-
-
-def _scanned(
-    time: NDArray[np.float64], lattice: float, grid: NDArray[np.float64], scores: NDArray[np.float64]
-) -> Found:
-    """The dt of a scan's grid [m] with the best of its scores [m, slacks], if there is but one."""
-    head = time[:_HEAD]
-    each = scores.min(axis=1)
-    repeats = bool((np.diff(head) < 0.5 * lattice).any())  # by an interval that is shorter than the lattice
-    best = int(each.argmin()) if repeats else _on_lattice(grid, each, lattice)
-    reach = 1e-3 + 4.0 * lattice / (head.size * grid[best])  # dt that far apart are the same to these rows
-    same = np.abs(grid / grid[best] - 1.0) < reach
-    rivals = grid[~same & (each < each[best] + _AS_GOOD)]
-    exact = abs(grid[best] / lattice - np.rint(grid[best] / lattice)) < 1e-9
-    if rivals.size and not exact:
-        raise Ambiguous(
-            f"stamps of {lattice:.3g} s are too coarse to tell {1.0 / grid[best]:.4g} from {1.0 / rivals[0]:.4g} Hz"
-        )
-    near = np.flatnonzero(same)
-    for column, slack in enumerate(_SLACKS):
-        fit = scores[near, column]
-        if fit.min() > 1.1 * each[best] + _AS_GOOD:
-            continue
-        first = float(grid[near[int(fit.argmin())]])
-        dt, missing, odd = _settle(time, first, float(slack) * lattice)
-        if odd <= 1e-3 * time.size and abs(dt / first - 1.0) < reach:
-            return dt, missing
-    raise Ambiguous(f"stamps of {lattice:.3g} s make no even grid")
-
-
-def _on_lattice(grid: NDArray[np.float64], each: NDArray[np.float64], lattice: float) -> int:
-    """Index of the best dt; a multiple of the lattice is taken where it is as good: it is what short records hold. Of
-    random losses some dt or other saves a few."""
-    best = int(each.argmin())
-    times = np.rint(grid / lattice)
-    enough = each[best] + 0.5 * math.sqrt(each[best]) + _AS_GOOD
-    exact = np.flatnonzero((times > 0) & (np.abs(grid - times * lattice) < 1e-9 * grid) & (each <= enough))
-    return int(exact[0]) if exact.size else best
-
-
-def _unbroken(time: NDArray[np.float64], lattice: float) -> float | None:
-    """The mean step, if for some dt all stamps lie within a lattice step of an even grid without a gap; else None.
-
-    The span of what is left is a convex function of dt. The mean step is within
-    lattice/duration of the true dt, which the dt of the least span need not be.
-    """
-    index = np.arange(time.size)
-
-    def span(dt: float) -> float:
-        left = index * dt
-        np.subtract(time, left, out=left)
-        return float(left.max() - left.min())
-
-    middle, reach = float(time[-1]) / (time.size - 1), 1.5 * lattice / (time.size - 1)
-    if span(middle) < lattice:
-        return middle
-    low, high = middle - reach, middle + reach
-    for _ in range(40):  # a ternary search
-        third = (high - low) / 3.0
-        low, high = (low, high - third) if span(low + third) < span(high - third) else (low + third, high)
-    return middle if span(0.5 * (low + high)) < lattice * (1.0 + 1e-6) else None
-
-
-def _scan(
-    time: NDArray[np.float64], lattice: float, low: float, high: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """dt [m] from `low` to `high`, and scores [m, slacks]: gaps, and odd stamps _ODD times. The decoder
-    of _decode() for all at once, O(rows * m)."""
-    even = np.exp(np.arange(math.log(low), math.log(high), _STEP))
-    simple = lattice * np.concatenate([np.arange(1.0, 5.0), 1.0 / np.arange(2.0, 9.0)])
-    grid = np.concatenate([even, simple[(simple > low) & (simple < high)]])
-    dt, slack = np.repeat(grid, _SLACKS.size), np.tile(_SLACKS * lattice, grid.size)
-    down, up = dt * (1.0 - 0.5 * _STEP), dt * (1.0 + 0.5 * _STEP)
-    lo = np.full(dt.size, time[0])
-    hi = lo + slack
-    score = np.zeros(dt.size)
-    for stamp in time[1:].tolist():
-        lo += down
-        hi += up
-        late = np.ceil(np.maximum(stamp - hi, 0.0) / dt)
-        score += late > 0.0
-        late *= dt
-        lo += late
-        hi += late
-        end = stamp + slack
-        odd = lo >= end
-        score += _ODD * odd
-        np.copyto(lo, np.where(odd, stamp, np.maximum(lo, stamp)))
-        np.copyto(hi, np.where(odd, end, np.minimum(hi, end)))
-    return grid, score.reshape(-1, _SLACKS.size) + time.size * _PRICE
-
-
-def _decode(time: NDArray[np.float64], dt: float, slack: float) -> tuple[NDArray[np.int64], int]:
-    """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be."""
-    missing = np.zeros(time.size, np.int64)
-    stamps = time.tolist()
-    lo, hi, odd = stamps[0], stamps[0] + slack, 0
-    down, up = dt * (1.0 - _WANDER), dt * (1.0 + _WANDER)
-    for row in range(1, len(stamps)):
-        stamp = stamps[row]
-        end = stamp + slack
-        lo += down
-        hi += up
-        if stamp > hi:
-            gap = math.ceil((stamp - hi) / dt)
-            missing[row] = gap
-            lo += gap * dt
-            hi += gap * dt
-        if lo >= end:
-            odd += 1
-            lo, hi = stamp, end
-        lo = max(lo, stamp)
-        hi = min(hi, end)
-    return missing, odd
-
-
-def _settle(time: NDArray[np.float64], dt: float, slack: float) -> tuple[float, NDArray[np.int64], int]:
-    """dt, missing_before[n] and odd stamps once dt is that of the time against the index with the missing samples."""
-    missing, odd = _decode(time, dt, slack)
-    for _ in range(4):
-        fitted = float(time[-1] - time[0]) / (time.size - 1 + int(missing.sum()))
-        if abs(fitted - dt) < 1e-10 * dt:
-            break
-        dt = fitted
-        missing, odd = _decode(time, dt, slack)
-    return dt, missing, odd

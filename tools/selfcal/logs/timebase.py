@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, sampling, thinned_grid
+from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, sampling
 
 #: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
 #: median of two rows or more.
@@ -122,8 +122,7 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
         _too_long(time, fail)
     time = time - start if start else time
     found, missing = _sampling(path, time, noise_s, rate, fail)
-    lossy = 2 * np.count_nonzero(missing) > missing.size
-    if rate is not None and (not 0.9 < found / rate < 1.1 or (lossy and not thinned_grid(time, 1.0 / rate))):
+    if rate is not None and not 0.9 < found / rate < 1.1:
         raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
     rate = found if rate is None else rate
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
