@@ -17,20 +17,19 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 from scipy.special import ndtr
 
-from selfcal.base.grid import Array, counts_of_pieces, noise_of
+from selfcal.base.grid import MEDIAN_SD, Array, counts_of_pieces, noise_of
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import INNER, ODD, PIECE, ln_of
-from selfcal.readings.lattice import Lattice, lattice_of, step_of
+from selfcal.readings.lattice import Lattice, step_of
 
-#: Noises of a jump at least, jumps at least, the share of them that have one size, and how far off they are, in noises.
-JUMP, JUMPS_LEAST, ALIKE, OFF = 12.0, 5, 0.9, 6.0
-#: Noise of the readings that are a span off, over that of all, at least.
-LIKE_NOISE = 0.3
-#: Share of the readings that bytes of two readings are at most.
-TORN_MOST = 0.25
+#: Readings that a span has changed at least, and the share of them that are one value, at most.
+CHANGED_LEAST, ALIKE = 5, 0.9
+#: Deviations, in noises, from which on a reading is none of the noise. Of the torn ones, how many more lie on one side,
+#: in standard deviations.
+FAR, EITHER_SIDE = 6.0, 4.0
 #: Bits at least of a count that goes round.
 BITS_LEAST = 5
-#: Noises of a reading in the circle of a count from which on each reading has its turn.
+#: Noises of a reading in the circle of a count from which on each reading has its turn. Half of it, and a torn one shows.
 WHOLE = 8.0
 #: Pieces of a record that have a level each, at most.
 PIECES = 100
@@ -74,88 +73,82 @@ class Misread:
     undone: Array | None = None
 
 
-def spans_of(values: Array, rate_hz: float) -> Misread | None:
-    """Readings [n] at `rate_hz` to which whole spans were added; NaN are none of them. O(n)."""
+def spans_of(values: Array) -> Misread | None:
+    """Readings [n] to which whole spans were added; NaN are none of them. O(n) a span that is tried.
+
+    A count that goes round loses its turns: readings lie near a level on the circle of its codes. A torn one is off by
+    the least step of its upper part, to either side as often. On a lattice spans are its powers of two."""
     known = np.flatnonzero(np.isfinite(values))
     y = values[known]
-    if y.size < PIECE:
+    if y.size < PIECE or not np.ptp(y) > 0.0:
         return None
-    found = _spans(y, lattice_of(y, rate_hz)) or _low_bits(y)
-    if found is None or found.undone is None:
-        return found
+    step, size = step_of(y)[0], float(np.ptp(y))
+    jump = float(np.partition(np.abs(np.diff(y)), -CHANGED_LEAST)[-CHANGED_LEAST])
+    whole = step * 2.0 ** math.ceil(math.log2(size / step + 0.5)) if step > 0.0 else size + np.diff(np.unique(y)).min()
+    spans = [whole]
+    if step > 0.0:
+        least = max(step * 2.0**BITS_LEAST, 0.5 * WHOLE * noise_of(y))
+        spans += [span for span in whole * 0.5 ** np.arange(1, 64) if span > least]
+    spans = [span for span in spans if span < 2.0 * jump and span >= step * 2.0**BITS_LEAST]
+    if not spans:
+        return None
+    line = _ln_of_noise(y - uniform_filter1d(y, PIECE, mode="nearest"), size)
+    found = [one for one in (_of_span(y, span, line, span < whole, step > 0.0) for span in spans) if one is not None]
+    best = max(found, key=lambda one: one.nats, default=None)
+    if best is None or best.nats < nats_of("misread") + math.log(len(spans)):
+        return None
+    if best.undone is None:
+        return best
     undone = values.copy()
-    undone[known] = found.undone
-    return replace(found, undone=undone)
+    undone[known] = best.undone
+    return replace(best, undone=undone)
 
 
-def _spans(y: Array, lattice: Lattice | None) -> Misread | None:
-    """The same of readings [n] that are all there, by jumps of one size."""
-    steps = np.diff(y)
-    size = np.abs(steps)
-    # A quarter of the differences of normal noise is below 0.45 of its sd.
-    noise = float(np.quantile(size, 0.25)) / 0.45
-    far = size[size > JUMP * noise]
-    if far.size < JUMPS_LEAST or not noise > 0.0:
-        return None
-    span = float(np.median(far))
-    alike = far[np.abs(far / span - 1.0) < OFF * noise / span]
-    if not alike.size:  # the median lies between two that differ
-        return None
-    span = float(alike.mean())
-    if lattice is not None:
-        span = lattice.step * round(span / lattice.step)
-        noise = max(noise, LIKE_NOISE * lattice.step)
-    off = np.abs(far / span - np.rint(far / span)) * span
-    if span < 2.0 * JUMP * noise or np.mean(off < OFF * noise) < ALIKE:
-        return None
-    turns = np.concatenate([[0], np.cumsum(np.rint(steps / span))])
-    found, often = np.unique(turns, return_counts=True)
-    own = float(found[np.argmax(often)])
-    if float(np.ptp(y)) < span + 2.0 * noise:  # two levels have the whole of their noise on either side
-        span = float(np.ptp(y)) + float(np.diff(np.unique(y)).min())  # both ends are met
-        kind = "unsigned" if float(y.min()) > -noise else "overflow"
-        if kind == "unsigned":  # the true ones are about zero
-            own = -float(np.rint(np.median(y - span * turns) / span)) or 0.0
-    else:
-        # Bytes of two readings, where the upper one changes: whole upper bytes off, on both sides.
-        upper = lattice.step * 2.0 ** round(math.log2(span / lattice.step)) if lattice is not None else math.inf
-        sides = [float(np.mean(turns == own + side)) for side in (-1.0, 1.0)]
-        if abs(upper - span) > OFF * noise or sum(sides) > TORN_MOST or min(sides) < ODD + 0.1 * max(sides):
-            return None
-        kind, span = "torn", upper
-    if float(y[turns != own].std()) < LIKE_NOISE * noise:
-        return None  # a word that the logger shows for lost ones has no noise
-    undone = y - span * (turns - own)
-    nats = far.size * math.log(span / (2.0 * OFF * noise))
-    return Misread(kind, float(np.mean(turns != own)), nats, undone)
+def _ln_of_noise(off: Array, size: float) -> float:
+    """ln likelihood of deviations [n] that are normal, all or but for a share that is even over a `size`."""
+
+    def normal(some: Array) -> float:
+        variance = max(float(np.mean(some**2)), 1e-12 * size**2)
+        return -0.5 * some.size * math.log(2.0 * math.pi * math.e * variance)
+
+    core = np.abs(off) < FAR * float(np.median(np.abs(off))) / MEDIAN_SD
+    share = 1.0 - float(core.mean())
+    if not 0.0 < share < 1.0:
+        return normal(off)
+    mixed = off.size * ((1.0 - share) * math.log1p(-share) + share * math.log(share / size))
+    return max(normal(off), normal(off[core]) + mixed)
 
 
-def _low_bits(y: Array) -> Misread | None:
-    """Readings [n] that are the low bits of a count alone: they fill 2^k codes from end to end, and lie nearer to a
-    level on the circle of these codes than on the line. Of noise that fills the circle no reading is known."""
-    step = step_of(y)[0]
-    bits = math.log2(float(np.ptp(y)) / step + 1.0) if step > 0.0 else 0.0
-    if bits < BITS_LEAST or abs(bits - round(bits)) * 2.0**bits > 0.5:
-        return None
-    span = step * 2.0 ** round(bits)
-    if min(int(np.count_nonzero(np.abs(y - end) < 0.5 * step)) for end in (y.min(), y.max())) < JUMPS_LEAST:
-        return None
+def _of_span(y: Array, span: float, line: float, torn: bool, lattice: bool) -> Misread | None:
+    """The evidence that readings [n] are off by `span`, once if `torn`, else any number of times. `line`: ln likelihood
+    about a level that follows them as they are."""
     turn = 2.0 * math.pi / span
     level = np.unwrap(np.angle(uniform_filter1d(np.exp(1j * turn * y), PIECE, mode="nearest"))) / turn
-    off = y - level
-    off -= span * np.rint(off / span)
-    on_line = float((y - uniform_filter1d(y, PIECE, mode="nearest")).std())
-    nats = y.size * math.log(on_line / max(float(off.std()), LIKE_NOISE * step))
-    if nats < nats_of("misread"):
+    turns = np.rint((level - y) / span)
+    own = float(np.median(turns))
+    turns -= own
+    straight = y - level + own * span
+    if torn:
+        turns = np.clip(turns, -1.0, 1.0)
+    changed, off = turns != 0.0, straight + span * turns
+    count, size, sd = int(np.count_nonzero(changed)), float(np.ptp(y)), float(off.std())
+    if count < CHANGED_LEAST or np.unique(y[changed], return_counts=True)[1].max() > ALIKE * count:
+        return None  # one value is a lost word
+    share = count / y.size
+    nats = _ln_of_noise(off, size) - max(line, _ln_of_noise(straight, size))
+    if torn:
+        if abs(float(turns.sum())) > EITHER_SIDE * math.sqrt(count):
+            return None
+        nats += count * math.log(0.5 * share) + (y.size - count) * math.log1p(-share)
+        return Misread("torn", share, nats, y + span * turns if sd * WHOLE < span else None)
+    if span < 2.0 * WHOLE * sd and not lattice:
         return None
-    turns = np.rint((level + off - y) / span)
-    turns -= float(np.median(turns))
     kind = "overflow" if float(y.min()) < 0.0 else "low_bits"
     middle = float(np.median(y + span * turns))
-    if kind == "low_bits" and min(middle, span - middle) < float(off.std()):  # the true ones are about zero
+    # The true ones are about zero, of a wide count by more of their noises.
+    if kind == "low_bits" and min(middle, span - middle) < max(sd, span / WHOLE**2):
         kind, turns = "unsigned", turns - float(np.rint(middle / span))
-    undone = y + span * turns if float(off.std()) * WHOLE < span else None
-    return Misread(kind, float(np.mean(turns != 0.0)), nats, undone)
+    return Misread(kind, float(np.mean(turns != 0.0)), nats, y + span * turns if sd * WHOLE < span else None)
 
 
 def stuck_bit_of(values: Array, lattice: Lattice | None) -> Misread | None:

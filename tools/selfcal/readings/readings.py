@@ -203,13 +203,13 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
 def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     values = recording.in_unit(axis, group.unit)
     none = np.zeros(values.size, bool)
-    misread = spans_of(values, recording.rate_hz)
+    misread = spans_of(values)
     if misread is not None and misread.undone is not None:
         values = misread.undone
     # Readings beyond the part's range are none: the engines leave them out. Of many it is known that they are beyond.
     inside = within(values, group)
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
-        return Readings(recording, values, values, values, None, none, none)
+        return Readings(recording, values, values, values, None, none, none, misread=misread)
     beyond = float(np.mean(~inside & np.isfinite(values)))
     sound = values if inside.all() else np.where(inside, values, np.nan)
     near = group.range - abs(float(np.median(_known(sound)))) < BEYOND_SD * noise_of(values)
