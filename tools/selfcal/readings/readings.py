@@ -211,6 +211,9 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     uneven = explained = None
     if misread is None and (lattice is None or not lattice.carried):
         explained = misread_of(sound, lattice)
+        held_rows = _stuck(sound, lattice, group.stuck_limit)[0] if explained is not None else none
+        if held_rows.any():  # held readings have more of the codes that were held
+            explained = misread_of(np.where(held_rows, np.nan, sound), lattice)
         if explained is not None and explained.kind in UNEVEN:
             uneven = explained
         elif explained is not None and explained.kind not in ELSEWHERE:
