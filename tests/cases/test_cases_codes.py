@@ -14,7 +14,7 @@ from scipy.stats import binom
 
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import save
-from selfcal.readings.codes import uneven_of
+from selfcal.readings.codes import UNEVEN, codes_of
 from selfcal.readings.held import slower
 from selfcal.readings.lattice import lattice_of
 from selfcal.verbs.diagnose import diagnose
@@ -61,13 +61,13 @@ def test_a_dead_band_is_named_with_its_place_and_share(q: float, width: float) -
     for seed in range(case_records(2, 60)):
         random = np.random.default_rng([61, seed, round(100 * q), round(100 * width)])
         y, share = banded(quiet(random), q * SD, width * SD)
-        found = uneven_of(y, lattice_of(y, 1.0))
-        assert found is not None
+        found = codes_of(y, lattice_of(y, 1.0))
+        assert found is not None and found.kind == "band" and found.undone is not None
         assert found.value is not None and found.width is not None
         assert np.count_nonzero(y == found.value) == np.unique(y, return_counts=True)[1].max()
         assert abs(found.share - share) < 3.0 * found.sd + 0.1 * share
         # The band swallowed noise, which drawn readings have again: to 4 standard deviations of a spread.
-        assert abs(np.diff(found.drawn).std() / math.sqrt(2.0) / math.hypot(SD, q * SD / 3.46) - 1.0) < 0.06
+        assert abs(np.diff(found.undone).std() / math.sqrt(2.0) / math.hypot(SD, q * SD / 3.46) - 1.0) < 0.06
 
 
 @pytest.mark.parametrize("q", [0.15, 0.4, 0.8])
@@ -77,8 +77,8 @@ def test_narrow_codes_are_named_with_the_share_that_they_lose(q: float) -> None:
         read = np.rint(quiet(random) / (q * SD))
         lost = (read % 2 == seed % 2) & (random.random(read.size) < random.uniform(0.25, 0.8))
         y = q * SD * (read + np.where(lost, random.choice([-1.0, 1.0], read.size), 0.0))
-        found = uneven_of(y, lattice_of(y, 1.0))
-        assert found is not None
+        found = codes_of(y, lattice_of(y, 1.0))
+        assert found is not None and found.kind == "uneven"
         assert found.value is None
         # The odd ones are half of the readings to sqrt(n) / 2.
         assert abs(found.share - lost.mean()) < 3.0 * found.sd + 2.0 / math.sqrt(read.size)
@@ -109,7 +109,8 @@ def test_codes_that_are_alike_are_not_named(kind: str) -> None:
         y = rounded(y, q)
         if kind == "lost words":
             y[random.random(y.size) < 0.02] = y[random.integers(y.size)]
-        named += uneven_of(y, lattice_of(y, 1.0)) is not None
+        found = codes_of(y, lattice_of(y, 1.0))
+        named += found is not None and found.kind in UNEVEN
     assert named <= binom.isf(1e-3, count, 1.0 / 200.0)
 
 

@@ -22,6 +22,7 @@ from selfcal.diagnosis.record import of_recording
 from selfcal.logs.recording import Column, Recording
 from selfcal.model.file import Model
 from selfcal.readings.budget import SHARES
+from selfcal.readings.misread import spans_of
 from selfcal.readings.motion import moves_of
 from selfcal.readings.readings import look
 from selfcal.readings.tests import TESTS
@@ -115,6 +116,38 @@ def test_a_map_of_the_readings_is_named_in_both_verbs(read: Callable[[Array, Ran
             ]
 
 
+@pytest.mark.parametrize("share", [0.012, 0.11, 0.28])
+@pytest.mark.parametrize("digits", [None, 4])
+def test_torn_bytes_in_any_share_are_undone(share: float, digits: int | None) -> None:
+    """Noise of 11 codes about the edge of an upper byte, in full or printed with digits that round the lattice. Undone
+    readings have the noise of the true ones, to 4 of its sd."""
+    random = np.random.default_rng([98, round(1000 * share)])
+    code = np.rint(11.0 * random.standard_normal(12_000)).astype(int) + 768
+    upper, late = code >> 8, np.flatnonzero(random.random(code.size) < share)
+    upper[late[1:]] = code[late[1:] - 1] >> 8
+    y = 0.0037 * (upper * 256 + (code & 255))
+    found = spans_of(y if digits is None else np.round(y, digits))
+    assert found is not None and found.kind == "torn" and found.undone is not None
+    assert abs(found.undone.std() / (0.0037 * code.std()) - 1.0) < 4.0 / math.sqrt(2.0 * code.size)
+
+
+@pytest.mark.parametrize("coarse", [1.05, 1.2])
+@pytest.mark.parametrize("kind", ["truncated", "sign_lost", None])
+def test_maps_about_zero_show_on_coarse_lattices(coarse: float, kind: str | None) -> None:
+    """Steps of more than a noise; rounded as they should be they name none."""
+    y = (0.37 + np.random.default_rng([99, round(100 * coarse)]).standard_normal(20_000)) / coarse
+    code = np.trunc(y) if kind == "truncated" else np.abs(np.rint(y)) if kind else np.rint(y)
+    found = look(a_recording(40.0, gx=0.03 * code), "gx", MODEL.group_of("gx")).misread
+    assert (None if found is None else found.kind) == kind
+
+
+def test_two_levels_are_no_count_that_runs_over() -> None:
+    """Both ends of the readings are met, and noise beside each. No noise crosses the seam of a circle of that span."""
+    random = np.random.default_rng(100)
+    y = random.standard_normal(20_000) + 27.0 * (np.cumsum(random.random(20_000) < 0.02) % 2)
+    assert spans_of(y) is None
+
+
 @pytest.mark.parametrize(("bit", "noise"), [(1, 14.0), (3, 14.0), (4, 9.0)])
 @pytest.mark.parametrize("level", [0, 613, 793])
 def test_a_bit_that_never_changes_is_named(bit: int, noise: float, level: int) -> None:
@@ -187,6 +220,7 @@ def test_many_short_holds_are_named(q: float, long: int) -> None:
         y = 0.02 + 0.1 * (q * np.rint(y / q) if q else y)
         found = identify_axis(a_recording(400.0, gx=y), "gx", MODEL, "library", None)
         assert not found.judged.checks["stuck"]["passed"]
+        assert not {"quantization", "misread"} & found.judged.checks.keys()
         N = found.result.parameters["constant"]["N"]
         assert abs(N.mean - 0.1 * math.hypot(1.0, q / math.sqrt(12.0)) / 20.0) < 5.0 * N.sd
         assert abs(found.result.bias_mean - 0.02) < 5.0 * found.result.bias_sd

@@ -89,7 +89,7 @@ def test_a_shock_of_two_sizes_is_read() -> None:
     """Spans of an overflow are all of one size. The median of a shock's steps may lie between two sizes."""
     y = np.random.default_rng(0).standard_normal(4000)
     y[1000:1012] += np.tile([0.0, 100.0, 0.0, 300.0], 3)
-    assert spans_of(y, 50.0) is None
+    assert spans_of(y) is None
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from selfcal.base import units
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
+from selfcal.readings.codes import Misread
 from selfcal.readings.readings import CLOCK_LEAST, Readings
 from selfcal.readings.tests import TESTS
 
@@ -164,6 +165,11 @@ def _distance(estimate: Estimate, prior: Prior) -> float:
     return abs(math.log(estimate.median / prior.median)) / math.sqrt(left)
 
 
+def _of_map(found: Misread) -> dict[str, Any]:
+    also = {"also_possible": list(found.also_possible)} if found.also_possible else {}
+    return {"kind": found.kind, "undone": found.undone is not None, **also}
+
+
 def with_readings(
     judged: Judged, readings: Readings, group: Group, unit: str, dt_s: float, *, as_fed: bool = False
 ) -> Judged:
@@ -173,9 +179,9 @@ def with_readings(
     noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the
     rate of means whose remainders are white.
     The tests of the readings (readings/tests.py), if they name something: the share of readings that it is about.
-    `misread` has its `kind`, `saturation` the `at` of the limit, `outliers` the value `at` which they recur, `stuck`
-    and `motion` their `intervals` in s. `motion` passes where the noise of averages is the same with it, within its own
-    scatter.
+    `misread` has its `kind`, whether it is `undone`, and kinds that are `also_possible`, `saturation` the `at` of the
+    limit, `outliers` the value `at` which they recur, `stuck` and `motion` their `intervals` in s. `motion` passes
+    where the noise of averages is the same with it, within its own scatter.
     `as_fed`: the engine took every reading as it was, in float32. Then the largest change of the sampling rate, and the
     `float_spacing`, steps of float32 in the noise of a reading, count too.
     """
@@ -188,7 +194,7 @@ def with_readings(
         checks["lattice"] = {**outcome, "step": lattice.step * factor, "distinct": lattice.distinct, **white}
     start_s = readings.recording.start_s
     more: dict[str, Callable[[], dict[str, Any]]] = {
-        "misread": lambda: {"kind": readings.misread and readings.misread.kind},
+        "misread": lambda: _of_map(readings.misread) if readings.misread is not None else {},
         "saturation": lambda: {"at": readings.clipped and readings.clipped.limit * factor},
         "outliers": lambda: {"at": readings.recurring and readings.recurring.value * factor},
         "stuck": lambda: {"intervals": [[a + start_s, b + start_s] for a, b in readings.intervals]},

@@ -300,7 +300,7 @@ def _axis_of(
         roughness=grid.means(replace(alone.clock, start_s=recorded.start_s), rough)[0],
         moving=moving,
         unclipped=grid.means(clock, spread(readings.drawn))[0] - level if clipped else None,
-        alike=None if uneven is None else grid.means(clock, spread(uneven.drawn))[0] - level,
+        alike=None if uneven is None or uneven.undone is None else grid.means(clock, spread(uneven.undone))[0] - level,
     )
 
 

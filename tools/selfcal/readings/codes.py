@@ -1,266 +1,373 @@
-"""Rows of a converter that are not alike: some of their readings are read as a neighbour.
+"""Readings as codes: noise on a lattice seen through a map of misreadings, and the map that explains the counts best.
 
-Two kinds are looked for. A dead band shows readings near a value as that value. Of unequal codes every other one is
-narrow and loses a share to both neighbours. Noise is normal about a level that each piece of the record has for itself.
-Rows are judged by the likelihood of their counts in each piece. Readings on no lattice have a dead band alone: the
-codes are then cells about their commonest value.
+A map says as which code each true value is read: a dead band, every other code narrow, a word in place of any reading,
+a limit, a sign or zeros that printing loses, a cast that truncates. Noise is normal about a level that each piece of
+the record has for itself. The counts of the pieces have a likelihood under each map. Readings on no lattice have cells
+for codes, and their commonest value has one of its own.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
+from scipy.sparse import csr_matrix
 from scipy.special import ndtr
 
-from selfcal.base.grid import Array, Rows, counts_of_pieces
+from selfcal.base.grid import Array, counts_of_pieces
 from selfcal.readings.budget import nats_of
-from selfcal.readings.lattice import COARSEST, Lattice
+from selfcal.readings.lattice import COARSEST, FINE, Lattice, step_of
+from selfcal.readings.lost_words import noise_beside
 
-#: Rows between the smallest and the largest reading, and readings, at least and at most.
-CODES, READINGS_LEAST = (5, 160), 300
+#: Codes or cells at most, and readings at least.
+CODES, READINGS_LEAST = 400, 300
 #: Pieces of a record that have a level each, at most, and readings in one at least.
-PIECES, PIECE = 200, 64
-#: Steps of the levels, in codes or in noises if these are more, and factors of the noise that are tried about its best.
-LEVELS, FACTORS = 0.05, (0.88, 0.94, 1.0, 1.06, 1.13, 1.25)
-#: ... then nearer,
-NEAR = (0.97, 0.98, 0.99, 1.01, 1.02, 1.03)
-#: and where each piece has a noise of its own.
-WIDE = tuple(float(2.0**k) for k in np.linspace(-2.0, 1.6, 13))
-#: Shares that are read as a neighbour, and further codes of a dead band on either side.
+PIECES, PIECE = 100, 64
+#: Cells in the noise of readings on no lattice; parts of true values in one, and points of them.
+CELLS, PARTS, POINTS = 4.0, 8, 32
+#: Noises that are tried, in that of differences; steps of a level, in noises: between them a parabola has the best.
+NOISES, LEVEL_STEP = np.geomspace(0.1, 3.0, 18), 0.25
+#: Shares that are read as another code, and further codes of a dead band on either side.
 SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
-#: Cells in the noise of readings on no lattice, and readings of one value, and their share, at least.
-CELLS, PILE, PILE_SHARE = 4.0, 20, 0.01
-#: Times that it is commoner than the next one, at least.
-STANDS_OUT = 3.0
-#: Quantiles of the readings that all codes and dead bands lie between.
-INNER = (0.01, 0.99)
-#: Times that the shares and the levels are found in turn.
+#: Readings of one value among readings on no lattice at least, and times that it is commoner than the next one.
+PILE, STANDS_OUT = 5, 3.0
+#: Times that a map is sought at the levels and the noise of the last one.
 TURNS = 3
 #: Chance of a reading that the noise and the codes, or a map, do not make.
 ODD = 1e-6
+#: Readings that a map changes at least.
+CHANGED_LEAST = 5
+#: Nats within which another map is possible too.
+ALSO = 5.0
+#: Kinds that are no cause of their own here: lost_words.py and readings.py have them.
+ELSEWHERE = ("word", "limit")
+#: Kinds of codes that are not alike.
+UNEVEN = ("band", "uneven")
 
 
 @dataclass(frozen=True)
-class Uneven:
-    """A `share` (and its `sd`) of the readings is read as another code. A dead band reads them as `value`, up to
-    `width` from it; None: every other code is narrow. `drawn` [n]: each reading as one of the codes that it may come
-    from. `nats`: evidence net of the search."""
+class Misread:
+    """The `kind` of a map, the `share` of the readings that it has changed (of a change of the range: until it, or from
+    it on), and its `nats` net of the search. `undone` [n]: the readings before it, by chance where several are
+    possible, None where they are lost. A dead band reads as `value` what is nearer than `width`. `also_possible`: kinds
+    whose evidence is nearly as large."""
 
+    kind: str
     share: float
-    sd: float
     nats: float
-    drawn: Array
+    undone: Array | None = None
     value: float | None = None
     width: float | None = None
+    also_possible: tuple[str, ...] = ()
+
+    @property
+    def sd(self) -> float:
+        """Of the share of codes that are not alike."""
+        return 0.0 if self.undone is None else math.sqrt(2.0 * self.share / self.undone.size)
 
 
 @dataclass(frozen=True)
-class _Read:
-    """How codes are read: `to` [codes, codes] is the chance that a reading of the second is read as the first.
-    `place`, `inner` and `share`: the centre of a dead band, its whole codes on either side, and the share of the next
-    ones. Of unequal codes `place` is 0 or 1, the narrow ones, and `inner` is -1."""
+class _Map:
+    """`to` [codes, parts]: the chance that a true value in a part of a code is read as a code. Or `lost` [codes], the
+    share of each code that is read as the code `place`, of unequal codes as its neighbours. Of a dead band `inner` is
+    the whole codes on either side, `share` what is lost of the next ones."""
 
-    to: Array
-    place: int
-    inner: int
-    share: float
+    kind: str
+    to: csr_matrix | None = None
+    lost: Array | None = None
+    place: int = 0
+    inner: int = -1
+    share: float = 1.0
 
+    def read(self, expected: Array) -> Array:
+        """Readings [codes] of `expected` true ones [codes]."""
+        assert self.lost is not None
+        moved = self.lost * expected
+        found = np.asarray(expected - moved)
+        if self.kind == "uneven":
+            found[:-1] += 0.5 * moved[1:]
+            found[1:] += 0.5 * moved[:-1]
+        else:
+            found[self.place] += moved.sum()
+        return found
 
-def _band(many: int, place: int, inner: int, share: float) -> _Read:
-    """A dead band about a code."""
-    to = np.eye(many)
-    for k in range(max(0, place - inner - 1), min(many, place + inner + 2)):
-        if k != place:
-            lost = 1.0 if abs(k - place) <= inner else share
-            to[place, k], to[k, k] = lost, 1.0 - lost
-    return _Read(to, place, inner, share)
-
-
-def _every_other(many: int, place: int, share: float) -> _Read:
-    """Narrow codes from `place` on."""
-    to = np.eye(many)
-    for k in range(place, many, 2):
-        sides = [side for side in (k - 1, k + 1) if 0 <= side < many]
-        to[k, k] = 1.0 - share
-        to[sides, k] = share / len(sides)
-    return _Read(to, place, -1, share)
+    def within(self, cells: Cells) -> csr_matrix:
+        """`to`, of codes as they are without the map."""
+        if self.to is not None:
+            return self.to
+        assert self.lost is not None
+        lost, code = csr_matrix(np.diag(self.lost)), np.arange(self.lost.size)
+        if self.kind == "uneven":
+            to = 0.5 * (np.eye(code.size, k=1) + np.eye(code.size, k=-1))
+        else:
+            to = np.where(code[:, None] == self.place, 1.0, np.zeros(code.size))
+        return (csr_matrix(np.diag(1.0 - self.lost)) @ cells.own + csr_matrix(to) @ lost @ cells.own).tocsr()
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """`value`: ln likelihood; `chance` [codes, pieces] of each true code at the level of each piece."""
+    """ln likelihood with one noise, and with one for each piece; the levels [pieces] and the noise at the first."""
 
-    value: float
+    one: float
+    each: float
+    level: Array
     sigma: float
-    chance: Array
+
+    def over(self, other: _Fit) -> float:
+        """Evidence over another: noise that comes and goes must not make it."""
+        return min(self.one - other.one, self.each - other.each)
 
 
-def ln_of(count: Array | Rows, chance: Array) -> Array:
-    """ln likelihood [pieces, levels] of counts [pieces, codes] of what is read with a chance [codes, levels]."""
-    return np.asarray(count @ np.log((1.0 - ODD) * chance + ODD / len(chance)))
+class Cells:
+    """Readings [n] in codes of a `width` about an `origin`. `count` [pieces, codes]; the last code is the commonest
+    value of readings on no lattice. `edges` of parts of codes of true values, and `own` [codes, parts]: as which each
+    is read by itself."""
+
+    def __init__(self, y: Array, step: float) -> None:
+        commonest, most, self.noise = noise_beside(y)
+        self.pile = None
+        if not step > 0.0 and most >= PILE:  # it may lie beside the lattice of the others
+            others = y[y != commonest]
+            step = step_of(others)[0]
+            beside = step > FINE * self.noise or most > STANDS_OUT * np.unique(others, return_counts=True)[1].max(
+                initial=0
+            )
+            self.pile = commonest if beside else None
+        self.step = step if step > FINE * self.noise else 0.0
+        self.noise = max(self.noise, 0.5 * self.step)  # of a reading that toggles
+        self.origin, self.width = self.pile or 0.0, self.noise / CELLS
+        if self.step > 0.0:
+            many = max(1.0, float(np.ptp(y)) / step / CODES, 0.5 * self.width / step)
+            self.width = step * (2.0 * math.floor(0.5 * many) + 1.0)
+            self.origin = step * float(np.median(y / step - np.rint(y / step)))
+            self.origin *= abs(self.origin) > 0.1 * step
+        # A code has an upper and a lower half: that is enough for a cast.
+        self.parts = 2 if self.width < 1.5 * self.step else PARTS
+        place = np.rint((y - self.origin) / self.width).astype(np.int64)
+        middle = int(np.median(place))
+        self.kept = np.abs(place - middle) < CODES // self.parts
+        place = place[self.kept]
+        low, high = int(place.min()), int(place.max())
+        self.about_zero = abs(self.origin) < 1e-9 * self.width or self.pile is not None
+        reach = (high - low + 1) // 2
+        self.first, last = low - reach, high + reach
+        self.folds = self.about_zero and low <= CELLS and high >= -CELLS
+        if self.folds:
+            self.first, last = min(self.first, -high), max(last, -low)
+        self.many = last - self.first + 2
+        self.code = place - self.first
+        if self.pile is not None:
+            self.code[y[self.kept] == commonest] = self.many - 1
+        self.piece, self.count = counts_of_pieces(self.code, self.many, PIECE, PIECES)
+        self.total = self.count.sum(axis=0).astype(np.float64)
+        self.there = np.flatnonzero(self.total)
+        self.edges = self.origin + self.width * (
+            self.first - 0.5 + np.arange((self.many - 1) * self.parts + 1) / self.parts
+        )
+        self.own = self.read(lambda x: x)
+
+    def read(self, map_of: Callable[[Array], Array]) -> csr_matrix:
+        """Chance [codes, parts] that a true value is read as a code, by a map of values."""
+        many = self.edges.size - 1
+        each = POINTS // self.parts
+        points = self.edges[:-1, None] + self.width * (np.arange(each) + 0.5) / POINTS
+        code = np.rint((map_of(points) - self.origin) / self.width).astype(np.int64) - self.first
+        inside = (code >= 0) & (code < self.many - 1)
+        return csr_matrix(
+            (np.full(int(inside.sum()), 1.0 / each), (code[inside], np.nonzero(inside)[0])), shape=(self.many, many)
+        )
+
+    @cached_property
+    def true(self) -> list[tuple[Array, Array]]:
+        """Of each noise the levels, and the chance [parts, levels] of parts of codes."""
+        found = []
+        # The mean of a piece is within two noises of its level, unless the readings are folded.
+        mean = self.count @ (self.origin + self.width * np.append(np.arange(self.many - 1) + self.first, 0))
+        mean = mean / self.count.sum(axis=1)
+        low, high = mean.min() - 2.0 * self.noise, mean.max() + 2.0 * self.noise
+        if self.folds:
+            low, high = min(low, -high), max(high, -low)
+        for sigma in self.noise * NOISES:
+            level = np.arange(low, high + LEVEL_STEP * sigma, LEVEL_STEP * sigma)
+            found.append((level, np.diff(ndtr((self.edges[:, None] - level) / sigma), axis=0)))
+        return found
+
+    def fit(self, to: csr_matrix) -> _Fit:
+        """The likeliest levels and noise under a map."""
+        count, to = self.count[:, self.there], to[self.there]
+        worth, at = np.empty((len(self.true), len(count))), []
+        for k, (level, chance) in enumerate(self.true):
+            ln = count @ np.log((1.0 - ODD) * (to @ chance) + ODD / self.many)
+            best = np.clip(np.argmax(ln, axis=1), 1, level.size - 2)
+            more, place = _summit(*(ln[np.arange(len(count)), best + side] for side in (-1, 0, 1)))
+            worth[k] = more
+            at.append(level[best] + place * (level[1] - level[0]))
+        total = worth.sum(axis=1)
+        k = min(max(int(np.argmax(total)), 1), len(total) - 2)
+        one, place = _summit(*(total[k + side, None] for side in (-1, 0, 1)))
+        best = np.clip(np.argmax(worth, axis=0), 1, len(total) - 2)
+        each = _summit(*(worth[best + side, np.arange(len(count))] for side in (-1, 0, 1)))[0]
+        ratio = float(NOISES[1] / NOISES[0])
+        return _Fit(float(one[0]), float(each.sum()), at[k], self.noise * NOISES[k] * ratio ** float(place[0]))
+
+    def of_pieces(self, fit: _Fit) -> Array:
+        """Chance [parts, pieces] of parts of codes at the levels and the noise of a fit."""
+        return np.asarray(np.diff(ndtr((self.edges[:, None] - fit.level) / fit.sigma), axis=0))
+
+    def expected(self, fit: _Fit) -> Array:
+        """Readings [parts] that a fit has in each part."""
+        return np.asarray(self.of_pieces(fit) @ self.count.sum(axis=1))
+
+    def gain(self, one: _Map, expected: Array) -> float:
+        """Of ln likelihood of the counts of all pieces together by a map, over those `expected` [codes] without it."""
+        floor = ODD * float(self.total.sum()) / self.many
+        return float(self.total @ np.log((one.read(expected) + floor) / (expected + floor)))
+
+    def limit(self, side: int) -> csr_matrix:
+        """All above the largest reading, or below the smallest, are read as it."""
+        ends = self.there[self.there < self.many - 1]
+        end = self.origin + self.width * (self.first + int(ends[-1] if side > 0 else ends[0]))
+        clip = np.minimum if side > 0 else np.maximum
+        if self.pile is None or side * (self.pile - end) < -self.width:
+            return self.read(lambda x: clip(x, end))
+        beyond = side * (self.edges[:-1] + 0.5 * self.width / self.parts - self.pile) > 0.0
+        row = csr_matrix(
+            (np.ones(int(beyond.sum())), (np.full(int(beyond.sum()), self.many - 1), np.flatnonzero(beyond))),
+            shape=self.own.shape,
+        )
+        return (self.own.multiply(~beyond) + row).tocsr()
 
 
-def _of_pieces(count: Array, to: Array, sigma: float) -> float:
-    """ln likelihood of counts [pieces, codes] where each piece has the noise and the level that suit it best."""
-    return float(np.max([_values(count, to, factor * sigma)[0].max(axis=1) for factor in WIDE], axis=0).sum())
+def _summit(left: Array, middle: Array, right: Array) -> tuple[Array, Array]:
+    """The largest value of parabolas through three values, and its place from the middle."""
+    bend = np.maximum(2.0 * middle - left - right, 1e-9)
+    place = np.clip(0.5 * (right - left) / bend, -1.0, 1.0)
+    return middle + 0.5 * place * (right - left) - 0.5 * place**2 * bend, place
 
 
-def _values(count: Array | Rows, to: Array, sigma: float) -> tuple[Array, Array]:
-    """ln likelihood [pieces, levels], and the chance [codes, levels] of each true code."""
-    many = count.shape[1]
-    ends = np.arange(many + 1)[:, None] - 0.5 - np.arange(-1.0, many, LEVELS * max(1.0, sigma))
-    below = ndtr(ends / sigma)
-    below[0], below[-1] = 0.0, 1.0
-    true = np.diff(below, axis=0)
-    return ln_of(count, to @ true), true
+def _no_zeros(x: Array) -> Array:
+    """Zeros behind the point are lost: 0.05 is read as 0.5."""
+    size = np.abs(x)
+    whole = np.floor(size)
+    zeros = np.floor(-np.log10(np.maximum(size - whole, 1e-9)))
+    return np.asarray(np.sign(x) * (whole + (size - whole) * 10.0**zeros))
 
 
-def fit_of(count: Array | Rows, to: Array, sigma: float) -> _Fit:
-    """The likeliest level of each piece and the likeliest noise near `sigma`, in codes, for counts [pieces, codes]."""
-    best = _Fit(-math.inf, sigma, np.empty((0, 0)))
-    for factors in (FACTORS, NEAR):
-        for own in [factor * best.sigma for factor in factors]:
-            value, true = _values(count, to, own)
-            at = np.argmax(value, axis=1)
-            total = float(value[np.arange(len(count)), at].sum())
-            if total > best.value:
-                best = _Fit(total, own, true[:, at])
-    return best
+def _about_zero(cells: Cells, y: Array) -> Iterator[_Map]:
+    """What printing or a cast may have made of values about zero."""
+    step = cells.step
+    below = y[y < 0.0]
+    gap = -float(below.max()) if below.size else math.inf
+
+    def unsigned(x: Array) -> Array:
+        return np.where((x < 0.0) & (x > -gap), -x, x)
+
+    def printed(x: Array) -> Array:
+        return _no_zeros(step * np.rint(x / step) if step > 0.0 else x)
+
+    yield _Map("digits_lost", cells.read(printed))
+    if gap > max(cells.noise, 1.5 * step):
+        yield _Map("sign_lost", cells.read(unsigned))
+        yield _Map("digits_lost", cells.read(lambda x: printed(unsigned(x))))
+    if step > 0.0:
+        yield _Map("truncated", cells.read(lambda x: step * np.trunc(x / step)))
 
 
-def uneven_of(values: Array, lattice: Lattice | None) -> Uneven | None:
-    """The likeliest way in which codes of readings [n] are unequal, NaN where there is none; None where all are alike,
-    or one value has readings of all others alike."""
-    known = np.flatnonzero(np.isfinite(values))
-    if known.size < READINGS_LEAST or (lattice is not None and lattice.coarseness > COARSEST):
-        return None
-    y = values[known]
-    pile = _pile(y) if lattice is None else (float(y.min()), lattice.step, lattice.coarseness)
-    if pile is None:
-        return None
-    origin, step, coarseness = pile
-    place = np.rint((y - origin) / step)
-    if not np.ptp(place) < CODES[1]:
-        return None
-    code = (place - place.min()).astype(np.int64)
-    many = int(code.max()) + 1
-    if not CODES[0] <= many <= CODES[1]:
-        return None
-    piece, whole = counts_of_pieces(code, many, PIECE, PIECES)
-    count = whole.astype(np.float64)
-    sigma = math.sqrt(max(1.0 / coarseness**2 - 1.0 / 12.0, 0.04))
-    alike = fit_of(count, np.eye(many), sigma)
-    read = max(_candidates(count, alike), key=lambda one: _gain(count, alike, one.to))
-    fit = alike
-    for _ in range(TURNS):
-        fit = fit_of(count, read.to, fit.sigma)
-        read = max(_near(read), key=lambda one: _gain(count, fit, one.to))
-    fit = fit_of(count, read.to, fit.sigma)
-    nats = fit.value - alike.value - math.log(many * (SHARES.size + WIDTHS))
-    if nats < nats_of("quantization"):
-        return None
-    total, expected = count.sum(axis=0), fit.chance @ count.sum(axis=1)
-    if _of_all(count, alike, total, read) > fit.value - nats_of("quantization"):
-        return None
-    # Noise that comes and goes piles up as well: where each piece has its own, it must not.
-    nats = _of_pieces(count, read.to, fit.sigma) - _of_pieces(count, np.eye(many), fit.sigma)
-    nats -= math.log(many * (SHARES.size + WIDTHS))
-    if nats < nats_of("quantization"):
-        return None
-    moved = float(expected @ (1.0 - np.diag(read.to))) / y.size
-    drawn = values.copy()
-    away = _true(code, piece, read.to, fit.chance) - code
-    drawn[known] += step * away
-    sd = math.sqrt(2.0 * moved / y.size)
-    if read.inner < 0:
-        return Uneven(moved, sd, nats, drawn) if lattice is not None else None
-    own = code == read.place
-    if lattice is None:
-        if not own[np.argmax(y == origin)]:
-            return None
-        # The band swallows the readings of the cell about its value too.
-        moved += float(expected[read.place]) / y.size
-        drawn[known] += np.where(own, step * (np.random.default_rng(2).random(y.size) - 0.5), 0.0)
-        sd = math.sqrt(2.0 * moved / y.size)
-    width = step * (read.inner + read.share + 0.5)
-    return Uneven(moved, sd, nats, drawn, float(y[np.argmax(own)]) if lattice is not None else origin, width)
-
-
-def _pile(y: Array) -> tuple[float, float, float] | None:
-    """The commonest value of readings [n] on no lattice, a cell about it, and cells in their noise; None where no value
-    is common."""
-    unique, counts = np.unique(y, return_counts=True)
-    largest = np.sort(counts)[::-1]
-    if largest[0] < max(PILE, PILE_SHARE * y.size, STANDS_OUT * float(largest[1:2].sum())):
-        return None
-    value, step = float(unique[np.argmax(counts)]), float(np.diff(y).std()) / math.sqrt(2.0) / CELLS
-    low, high = np.quantile(y[y != value], INNER)
-    return (value, step, 1.0 / CELLS) if step > 0.0 and low < value < high else None  # beyond, it is a lost word
-
-
-def _candidates(count: Array, fit: _Fit) -> Iterator[_Read]:
-    """Dead bands about every code that is read too often, and unequal codes."""
-    many = count.shape[1]
-    total, expected = count.sum(axis=0), fit.chance @ count.sum(axis=1)
-    for place in np.argsort((expected - total) / np.sqrt(expected + 1.0))[:3]:
-        for inner in range(WIDTHS):
-            for share in SHARES[:: 6 if inner else 2]:
-                yield _band(many, int(place), inner, float(share))
-    for place in (0, 1):
-        for share in SHARES[::2]:
-            yield _every_other(many, place, float(share))
-
-
-def _near(read: _Read) -> Iterator[_Read]:
-    """The same with other shares, and with a code more or less."""
-    many = len(read.to)
-    for share in SHARES:
-        if read.inner < 0:
-            yield _every_other(many, read.place, float(share))
+def _of_places(cells: Cells, over: Array, near: _Map | None = None) -> Iterator[_Map]:
+    """Dead bands, words and unequal codes, about the codes that are read too often, or those next to one. `over`:
+    readings [codes] that are expected without them."""
+    code, n = np.arange(cells.many), float(cells.total.sum())
+    kinds = {"band", "word", "uneven"} if near is None else {near.kind}
+    often = np.argsort((over - cells.total) / np.sqrt(over + 1.0))[:3] if near is None else [near.place]
+    if cells.pile is not None:
+        often = [cells.many - 1]
+    for place in map(int, often) if "uneven" not in kinds or near is None else ():
+        share = float((cells.total[place] - over[place]) / (n - over[place]))
+        if share > 0.0 and "word" in kinds:
+            yield _Map("word", None, np.full(code.size, share), place, share=share)
+        if "band" not in kinds:
             continue
-        for inner in range(max(0, read.inner - 1), read.inner + 2):
-            yield _band(many, read.place, inner, float(share))
+        centre = place if cells.pile is None else round((cells.pile - cells.origin) / cells.width) - cells.first
+        off = np.abs(code - centre)
+        off[-1] = code.size
+        for inner in range(WIDTHS) if near is None else range(max(0, near.inner - 1), near.inner + 2):
+            for share in SHARES[:: 6 if inner else 2] if near is None else SHARES:
+                lost = np.where(off <= inner, 1.0, np.where(off == inner + 1, share, 0.0))
+                yield _Map("band", None, lost, place, inner, float(share))
+    if "uneven" in kinds and cells.pile is None and cells.width < 1.5 * cells.step:
+        for place in (0, 1) if near is None else (near.place,):
+            narrow = (code % 2 == place) & (code > 0) & (code < cells.many - 2)
+            for share in SHARES[::2] if near is None else SHARES:
+                yield _Map("uneven", None, share * narrow, place, share=float(share))
 
 
-def _gain(count: Array, fit: _Fit, to: Array) -> float:
-    """Of ln likelihood of the counts of all pieces together, at the levels and the noise of a fit."""
-    total, expected = count.sum(axis=0), fit.chance @ count.sum(axis=1)
-    floor = ODD * float(total.sum()) / total.size
-    return float(total @ np.log((to @ expected + floor) / (expected + floor)))
+def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
+    """The map of readings [n], NaN where there is none, that explains their codes best; None where all are read alike,
+    or their counts show nothing: on a lattice that is coarse beside the noise, or too few of them."""
+    known = np.flatnonzero(np.isfinite(values))
+    y = values[known]
+    if y.size < READINGS_LEAST or (not noise_beside(y)[2] > 0.0 if lattice is None else lattice.too_coarse):
+        return None
+    cells = Cells(y, 0.0 if lattice is None else lattice.step)
+    plain = cells.fit(cells.own)
+    over = cells.own @ cells.expected(plain)
+    here = cells.there
+    lacking = float(cells.total[here] @ np.log(cells.total[here] / (over[here] + ODD * y.size / cells.many)))
+    if lacking < cells.there.size + nats_of("quantization"):
+        return None
+    maps = list(_about_zero(cells, y)) if cells.folds else []
+    maps += [_Map("limit", cells.limit(side)) for side in (1, -1)]
+    tried = list(_of_places(cells, over)) if lattice is None or lattice.coarseness < COARSEST else []
+    for kind in {one.kind for one in tried}:
+        maps.append(max((one for one in tried if one.kind == kind), key=lambda one: cells.gain(one, over)))
+    fits = []
+    for one in maps:
+        fit, best = cells.fit(one.within(cells)), one
+        for _ in range(TURNS if one.to is None else 0):
+            over = cells.own @ cells.expected(fit)
+            best = max(_of_places(cells, over, best), key=lambda one: cells.gain(one, over), default=best)
+            fit = cells.fit(best.within(cells))
+        fits.append((fit.over(plain) - math.log(len(tried) if one.kind in UNEVEN else len(maps)), best, fit))
+    nats, best, fit = max(fits, key=lambda one: one[0])
+    also = tuple(dict.fromkeys(one.kind for more, one, _ in fits if more > nats - ALSO and one.kind != best.kind))
+    if best.kind in ELSEWHERE:
+        return Misread(best.kind, best.share, nats)
+    if nats < nats_of("quantization" if best.kind in UNEVEN else "misread"):
+        return None
+    now, to = cells.expected(fit), best.within(cells)
+    share = 1.0 - float(now @ np.asarray(to.multiply(cells.own).sum(axis=0)).ravel()) / float(now.sum())
+    if best.kind not in UNEVEN:
+        return Misread(best.kind, share, nats, also_possible=also)
+    undone = values.copy()
+    undone[known[cells.kept]] = _drawn(cells, y[cells.kept], to, fit)
+    if best.kind == "uneven":
+        return Misread("uneven", share, nats, undone, also_possible=also)
+    value = cells.pile
+    if value is None:
+        unique, often = np.unique(y[cells.kept][cells.code == best.place], return_counts=True)
+        value = float(unique[np.argmax(often)])
+    return Misread("band", share, nats, undone, value, cells.width * (best.inner + best.share + 0.5), also)
 
 
-def _of_all(count: Array, alike: _Fit, total: Array, read: _Read) -> float:
-    """ln likelihood of a word that is shown in place of a share of all readings: the likeliest, or that of the band."""
-    expected = alike.chance @ count.sum(axis=1)
-    n = float(total.sum())
-    share = np.clip((total - expected) / np.maximum(n - expected, 1.0), 0.0, 0.9)
-    with np.errstate(divide="ignore"):
-        gains = total * np.log((expected + share * (n - expected) + ODD * n) / (expected + ODD * n))
-        gains += (n - total) * np.log1p(-share)
-    found = []
-    for place in {int(np.argmax(gains)), read.place}:
-        own, sigma = float(share[place]), alike.sigma
-        for _ in range(TURNS):
-            to = (1.0 - own) * np.eye(total.size)
-            to[place] += own
-            fit = fit_of(count, to, sigma)
-            found.append(fit.value)
-            usual = float((fit.chance @ count.sum(axis=1))[place])
-            own, sigma = min(max((float(total[place]) - usual) / (n - usual), 0.0), 0.9), fit.sigma
-    return max(found)
-
-
-def _true(code: Rows, piece: Rows, to: Array, chance: Array) -> Rows:
-    """Each code [n] as one that it may come from, drawn by chance."""
-    random = np.random.default_rng(1)
-    found = code.copy()
-    for read in np.flatnonzero((to - np.diag(np.diag(to))).sum(axis=1) > 0.0):
-        rows = np.flatnonzero(code == read)
-        possible = np.cumsum(to[read][:, None] * chance, axis=0)
-        if rows.size and float(possible[-1].min()) > 0.0:
-            below = possible[:, piece[rows]] < random.random(rows.size) * possible[-1, piece[rows]]
-            found[rows] = below.sum(axis=0)
+def _drawn(cells: Cells, y: Array, to: csr_matrix, fit: _Fit) -> Array:
+    """Each reading [n] as one that it may come from, drawn by chance."""
+    random, chance, found = np.random.default_rng(1), cells.of_pieces(fit), y.copy()
+    other = to - to.multiply(cells.own > 0.0)
+    own = cells.own.argmax(axis=0).A1 + cells.first
+    for code in np.flatnonzero(np.asarray(other.sum(axis=1)).ravel() > 0.0):
+        rows = np.flatnonzero(cells.code == code)
+        parts = to[code].indices
+        possible = np.cumsum(to[code].data[:, None] * chance[parts], axis=0)
+        if not rows.size or not float(possible[-1].min()) > 0.0:
+            continue
+        piece = cells.piece[rows]
+        below = possible[:, piece] < random.random(rows.size) * possible[-1, piece]
+        part = parts[below.sum(axis=0)]
+        if cells.step > 0.0:
+            found[rows] = y[rows] + cells.width * (own[part] - (code + cells.first))
+        else:
+            found[rows] = cells.edges[part] + cells.width / cells.parts * random.random(rows.size)
     return found

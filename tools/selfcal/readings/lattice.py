@@ -31,6 +31,8 @@ ROUNDED = 1e-8
 COARSEST = 1.0
 #: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
 FINE = 0.01
+#: Last digits of printed values in a step at least, for it to show.
+PRINTED = 3.0
 #: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.
 SHOWN = 20
 
@@ -118,17 +120,20 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
 
 def _step(unique: NDArray[np.floating[Any]]) -> float:
     """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
-    where every difference is a whole multiple of it."""
+    where every difference is a whole multiple of it; or to the last digit of values that are printed with few."""
     if unique.size < 2:
         return 0.0
     gaps = np.diff(unique)
     gaps = gaps[gaps > ROUNDED * max(np.ptp(unique), np.abs(unique).max())]
     if not gaps.size:
         return 0.0
-    least = float(gaps.min())
-    steps = gaps / least
-    np.rint(steps, out=steps)
+    q, digit = float(gaps.min()), 0.0
+    if unique.size > SHOWN:
+        digit = 10.0 ** math.floor(math.log10(q / PRINTED))
+        if float(np.abs(unique / digit - np.rint(unique / digit)).max()) > 0.02:
+            digit = 0.0
+        else:
+            q = float(np.mean(gaps[gaps < q + 2.5 * digit]))
+    steps = np.rint(gaps / q)
     q = float(gaps.sum() / steps.sum())
-    steps *= q
-    gaps -= steps
-    return q if max(float(gaps.max()), -float(gaps.min())) < 0.02 * q else 0.0
+    return q if float(np.abs(gaps - steps * q).max()) < max(0.02 * q, 1.1 * digit) else 0.0

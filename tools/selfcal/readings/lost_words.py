@@ -58,9 +58,7 @@ def recurring_of(values: Array, rate_hz: float) -> Recurring | None:
     y = values if known.all() else values[known]
     if y.size < 8 * AROUND:
         return None
-    unique, counts = np.unique(y, return_counts=True)
-    commonest, most = float(unique[np.argmax(counts)]), int(counts.max())
-    sigma = noise_of(y[y != commonest] if most > COMMON * y.size else y)
+    commonest, most, sigma = noise_beside(y)
     found = _too_often(y, sigma, rate_hz) if sigma > 0.0 else None
     if found is None or (2 * most > y.size and found[0] != commonest):
         return None
@@ -70,6 +68,13 @@ def recurring_of(values: Array, rate_hz: float) -> Recurring | None:
     if share <= MOST:
         mask[known] = _lost(y, value, excess, rate_hz)
     return Recurring(value, share, mask, min(1e6, nats))
+
+
+def noise_beside(y: Array) -> tuple[float, int, float]:
+    """The commonest of readings [n], how often it comes, and the noise, of the others alone where it is common."""
+    unique, counts = np.unique(y, return_counts=True)
+    commonest, most = float(unique[np.argmax(counts)]), int(counts.max())
+    return commonest, most, noise_of(y[y != commonest] if most > COMMON * y.size else y)
 
 
 def _rests(y: Array, own: Mask, sigma: float) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -17,16 +16,16 @@ from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 from scipy.special import log_ndtr, ndtr, ndtri_exp
 
-from selfcal.base.grid import Array, Mask, Rows, block_means, counts_of_pieces, equal_runs, noise_of, runs
+from selfcal.base.grid import Array, Mask, Rows, block_means, equal_runs, noise_of, runs
 from selfcal.logs.recording import Column, Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import CODES, PIECE, PIECES, Uneven, fit_of, uneven_of
+from selfcal.readings.codes import ELSEWHERE, PIECE, PIECES, UNEVEN, Cells, Misread
 from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import Recurring, is_limit, recurring_of
-from selfcal.readings.misread import ABOUT_ZERO, Misread, misread_of, spans_of
+from selfcal.readings.misread import misread_of, spans_of
 from selfcal.readings.motion import Moved, moves_of
 
 #: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
@@ -44,9 +43,6 @@ LN_STUCK = -nats_of("stuck")
 HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 1.5, 0.8
 #: Samples on either side that make the level of one.
 AROUND = 32
-#: Codes beyond either end of the readings that a limit may hide, and the evidence for it in nats. Of clean records with
-#: a noise of 0.25 to 0.5 steps 1 in 120 has 15: levels change within a piece.
-BEYOND_CODES, PILED_LEAST = 4, 30.0
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
 #: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
@@ -115,16 +111,12 @@ class Readings:
     clipped: Clipped | None = None
     recurring: Recurring | None = None
     misread: Misread | None = None
+    uneven: Misread | None = None
     moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held: Held | None = None
     changes: tuple[RateChange, ...] = ()
     slower: tuple[Slower, ...] = ()
-
-    @cached_property
-    def uneven(self) -> Uneven | None:
-        """How the codes of the readings are unequal."""
-        return None if self.misread is not None else uneven_of(self.values, self.lattice)
 
     @property
     def held_hz(self) -> float | None:
@@ -208,27 +200,32 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
 def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     values = recording.in_unit(axis, group.unit)
     none = np.zeros(values.size, bool)
-    misread = spans_of(values, recording.rate_hz)
+    misread = spans_of(values)
     if misread is not None and misread.undone is not None:
         values = misread.undone
     # Readings beyond the part's range are none: the engines leave them out. Of many it is known that they are beyond.
     inside = within(values, group)
     if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
-        return Readings(recording, values, values, values, None, none, none)
+        return Readings(recording, values, values, values, None, none, none, misread=misread)
     beyond = float(np.mean(~inside & np.isfinite(values)))
     sound = values if inside.all() else np.where(inside, values, np.nan)
     near = group.range - abs(float(np.median(_known(sound)))) < BEYOND_SD * noise_of(values)
     if beyond > BEYOND_MOST and near:
         values = sound = np.clip(values, -group.range, group.range)
     lattice = lattice_of(_known(sound), recording.rate_hz)
+    uneven = explained = None
     if misread is None and (lattice is None or not lattice.carried):
-        misread = misread_of(sound, lattice)
-        limited = _clipped(sound, lattice) if misread is not None and misread.kind in ABOUT_ZERO else None
-        if limited is not None and abs(limited.limit) > float(np.nanstd(sound)):
-            misread = None  # it ends at a limit of the part, and not at zero
-    recurring = recurring_of(sound, recording.rate_hz) if misread is None else None
-    if recurring is not None and ((lattice is not None and lattice.carried) or uneven_of(sound, lattice) is not None):
-        recurring = None  # the codes of a counter recur; a dead band takes its counts from its neighbours
+        explained = misread_of(sound, lattice)
+        held_rows = _stuck(sound, lattice, group.stuck_limit)[0] if explained is not None else none
+        if held_rows.any():  # held readings have more of the codes that were held
+            explained = misread_of(np.where(held_rows, np.nan, sound), lattice)
+        if explained is not None and explained.kind in UNEVEN:
+            uneven = explained
+        elif explained is not None and explained.kind not in ELSEWHERE:
+            misread = explained
+    # The codes of a counter recur; a dead band takes its counts from its neighbours.
+    counter = lattice is not None and lattice.carried > 0.0
+    recurring = None if misread or uneven or counter else recurring_of(sound, recording.rate_hz)
     if recurring is not None:
         values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
         lattice = lattice_of(_known(sound), recording.rate_hz)
@@ -269,6 +266,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         clipped=clipped,
         recurring=recurring,
         misread=misread,
+        uneven=uneven,
         moved=moved,
         kept_out=counts,
         slower=stretches,
@@ -550,7 +548,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
         found = {
             sign * edge: (worth, rows[at_edge])
             for (sign, edge), at_edge, worth in zip(edges, at_edges, _piled(y, lattice), strict=True)
-            if worth > PILED_LEAST and at_edge.sum() >= 3
+            if worth > nats_of("saturation") and at_edge.sum() >= 3
         }
         masks = {edge: np.isin(np.arange(values.size), at) for edge, (_, at) in found.items()}
         return Clipped(masks, sum(worth for worth, _ in found.values())) if found else None
@@ -589,21 +587,13 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
 
 
 def _piled(y: Array, lattice: Lattice) -> tuple[float, float]:
-    """Evidence, nats, that the last and the first code of readings [n] on a coarse lattice hold those beyond as well.
-
-    Each piece of the readings has its best level, and the record its best noise, in codes with others beyond either end
-    that a limit reads as the last one."""
-    code = np.rint((y - y.min()) / lattice.step).astype(np.int64) + BEYOND_CODES
-    many = int(code.max()) + 1 + BEYOND_CODES
-    if not 3 + 2 * BEYOND_CODES <= many <= CODES[1]:
+    """Evidence, nats, that the last and the first code of readings [n] on a coarse lattice hold those beyond too."""
+    if np.unique(y).size < 3:
         return 0.0, 0.0
-    _, count = counts_of_pieces(code, many, 2 * AROUND, PIECES)
-    of, sigma = np.arange(many), math.sqrt(max(1.0 / lattice.coarseness**2 - 1.0 / 12.0, 0.04))
-    limits = [np.minimum(of, many - 1 - BEYOND_CODES), np.maximum(of, BEYOND_CODES)]
-    noises = [sigma * 2.0**k for k in (0.0, 0.5, 1.0, 1.5, 2.0)]  # a limit hides some of it
-    to = [(of[:, None] == read).astype(np.float64) for read in (of, *limits)]
-    plain, high, low = (max(fit_of(count, one, noise).value for noise in noises) for one in to)
-    return high - plain, low - plain
+    cells = Cells(y, lattice.step)
+    plain = cells.fit(cells.own)
+    high, low = (cells.fit(cells.limit(side)).one - plain.one for side in (1, -1))
+    return high, low
 
 
 def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:

@@ -11,9 +11,8 @@ import numpy as np
 
 from selfcal.base.grid import Mask
 from selfcal.readings.budget import SHARES
-from selfcal.readings.codes import Uneven
+from selfcal.readings.codes import Misread
 from selfcal.readings.lost_words import Recurring
-from selfcal.readings.misread import Misread
 from selfcal.readings.readings import Clipped, Readings
 
 
@@ -38,11 +37,11 @@ def _repeats(readings: Readings) -> Mask | float:
     return found
 
 
-def _nats(found: Misread | Uneven | Recurring | Clipped | None) -> float:
+def _nats(found: Misread | Recurring | Clipped | None) -> float:
     return 0.0 if found is None else found.nats
 
 
-def _share(found: Misread | Uneven | Recurring | None) -> float:
+def _share(found: Misread | Recurring | None) -> float:
     return 0.0 if found is None else found.share
 
 

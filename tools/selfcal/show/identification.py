@@ -161,7 +161,9 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
             share = f"{100.0 * value:.2g} % of the rows repeat the one before at no fixed rate"
             return f"held_samples: {share}: log at the sensor's own rate"
         case "misread":
-            return f"misread ({outcome['kind']}): {100.0 * value:.2g} % of the readings: {MISREAD[outcome['kind']]}"
+            kinds = " or ".join([outcome["kind"], *outcome.get("also_possible", ())])
+            undone = "; undone here" if outcome.get("undone") else ""
+            return f"misread ({kinds}): {100.0 * value:.2g} % of the readings: {MISREAD[outcome['kind']]}{undone}"
         case "quantization":
             return f"quantization: {100.0 * value:.2g} % of the readings are read as another code: a dead band?"
         case "motion" | "stuck":
