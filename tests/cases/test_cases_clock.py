@@ -537,7 +537,7 @@ def test_empty_cells_at_regular_rows_are_missing_samples(tmp_path: Path) -> None
     )
 
 
-# ------------------------------------------------------------------------------------------------- one law of the stamps
+# ------------------------------------------------------------------------------------------------ one law of the stamps
 
 
 @pytest.mark.parametrize("lattice_s", [1e-3, 4e-3, 1e-2])
