@@ -250,7 +250,8 @@ def effects(finding: Mapping[str, Any]) -> str:
         told.append(f"bias error {horizon} s ahead {100.0 * most:.0f} % larger")
     seen = []
     if finding["confirmed"] is False:
-        event = {"time_s", "intervals"} & finding["estimate"].keys() and CAUSES[finding["cause"]].score.once
+        cause = CAUSES.get(finding["cause"])
+        event = cause is not None and cause.score.once and {"time_s", "intervals"} & finding["estimate"].keys()
         seen = ["an event: no other time can confirm it" if event else "not confirmed on held-out time"]
     if finding.get("confirmed_on") is not None:
         seen.append("holds on the second recording" if finding["confirmed_on"] else "not seen on the second recording")
