@@ -49,9 +49,7 @@ def found(time: Floats) -> tuple[float, int]:
     ],
     ids=["least 0.2", "least 0.28", "least 0.45", "two steps", "Poisson", "Gamma"],
 )
-def test_random_steps_have_their_mean_rate(
-    draw: Callable[[Random], Floats], spread: float
-) -> None:
+def test_random_steps_have_their_mean_rate(draw: Callable[[Random], Floats], spread: float) -> None:
     for seed in range(case_records(4, 100)):
         steps = draw(np.random.default_rng(seed)) / RATE_HZ
         rate, missing = found(np.concatenate([[0.0], np.cumsum(steps)]))
@@ -64,42 +62,23 @@ def test_random_steps_have_their_mean_rate(
 def test_stamps_on_no_grid_are_noted(least: float, noted: bool, tmp_path: Path) -> None:
     """Steps from `least` to 2 - `least` intervals: samples lost among random ones do not show, those of a grid do."""
     random = np.random.default_rng(4)
-    time = np.concatenate(
-        [[0.0], np.cumsum(random.uniform(least, 2.0 - least, ROWS) / RATE_HZ)]
-    )
-    rows = (
-        f"{t:.6f},{value:.5f}"
-        for t, value in zip(time, random.standard_normal(time.size), strict=True)
-    )
-    (tmp_path / "log.csv").write_text(
-        "t[s],gx[deg/s]\n" + "\n".join(rows) + "\n", encoding="utf-8"
-    )
-    assert (
-        any("on no grid" in note for note in load(tmp_path / "log.csv").notes) == noted
-    )
+    time = np.concatenate([[0.0], np.cumsum(random.uniform(least, 2.0 - least, ROWS) / RATE_HZ)])
+    rows = (f"{t:.6f},{value:.5f}" for t, value in zip(time, random.standard_normal(time.size), strict=True))
+    (tmp_path / "log.csv").write_text("t[s],gx[deg/s]\n" + "\n".join(rows) + "\n", encoding="utf-8")
+    assert any("on no grid" in note for note in load(tmp_path / "log.csv").notes) == noted
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.03, 0.09, 0.14])
 @pytest.mark.parametrize("lost", [0.004, 0.06, 0.22])
-def test_a_grid_keeps_its_rate_with_jitter_and_losses(
-    jitter: float, lost: float
-) -> None:
+def test_a_grid_keeps_its_rate_with_jitter_and_losses(jitter: float, lost: float) -> None:
     for seed in range(case_records(2, 50)):
         random = np.random.default_rng(seed)
-        time = np.sort(
-            (np.arange(ROWS) + jitter * random.standard_normal(ROWS)) / RATE_HZ
-        )
+        time = np.sort((np.arange(ROWS) + jitter * random.standard_normal(ROWS)) / RATE_HZ)
         kept = random.random(ROWS) >= lost
         rate, missing = found(time[kept])
-        truth = (
-            int(np.flatnonzero(kept)[-1] - np.flatnonzero(kept)[0])
-            + 1
-            - int(kept.sum())
-        )
+        truth = int(np.flatnonzero(kept)[-1] - np.flatnonzero(kept)[0]) + 1 - int(kept.sum())
         assert rate == pytest.approx(RATE_HZ, rel=1e-6 if jitter == 0.0 else 2e-3)
-        assert abs(missing - truth) <= (
-            0 if jitter < 0.05 else 0.01 * truth + 0.002 * ROWS
-        )
+        assert abs(missing - truth) <= (0 if jitter < 0.05 else 0.01 * truth + 0.002 * ROWS)
 
 
 @pytest.mark.parametrize(
@@ -121,11 +100,7 @@ def test_a_grid_shows_behind_jitter_that_hides_it_from_single_steps(
         time = np.arange(ROWS) + delay(random)
         kept = random.random(ROWS) >= lost
         rate, missing = found(np.sort(time[kept]) / RATE_HZ)
-        truth = (
-            int(np.flatnonzero(kept)[-1] - np.flatnonzero(kept)[0])
-            + 1
-            - int(kept.sum())
-        )
+        truth = int(np.flatnonzero(kept)[-1] - np.flatnonzero(kept)[0]) + 1 - int(kept.sum())
         assert rate == pytest.approx(RATE_HZ, rel=2e-3)
         assert abs(missing - truth) <= 0.01 * truth + 0.002 * ROWS
 
@@ -142,9 +117,7 @@ def test_an_exact_grid_may_lose_half_of_its_samples(lost: float) -> None:
 
 @pytest.mark.parametrize("rate_hz", [880.0, 771.3, 655.0])
 @pytest.mark.parametrize("lost", [0.12, 0.35])
-def test_the_lattice_of_the_stamps_is_not_taken_for_the_grid(
-    rate_hz: float, lost: float
-) -> None:
+def test_the_lattice_of_the_stamps_is_not_taken_for_the_grid(rate_hz: float, lost: float) -> None:
     """Stamps of 1 ms of another rate, samples lost: the true rate or a refusal."""
     for seed in range(case_records(2, 30)):
         kept = np.random.default_rng(seed).random(ROWS) >= lost
@@ -157,9 +130,7 @@ def test_the_lattice_of_the_stamps_is_not_taken_for_the_grid(
 
 @pytest.mark.parametrize("jitter", [0.0, 0.05, 0.14])
 @pytest.mark.parametrize("lost", [0.6, 0.8])
-def test_a_stated_rate_is_taken_however_many_samples_are_lost(
-    jitter: float, lost: float
-) -> None:
+def test_a_stated_rate_is_taken_however_many_samples_are_lost(jitter: float, lost: float) -> None:
     """The rate right or 0.02 % off: each sample has its place. Twice, half and 4/3 of the rate are refused."""
 
     def fail(row: int, why: str) -> NoReturn:
@@ -173,10 +144,7 @@ def test_a_stated_rate_is_taken_however_many_samples_are_lost(
         for stated in (RATE_HZ, 1.0002 * RATE_HZ):
             clock = clock_of("log.csv", time, 1e-6, stated, fail)
             assert clock.rate_hz == stated
-            assert (
-                abs(int(clock.missing_before.sum()) - int(np.ptp(kept)) - 1 + kept.size)
-                <= 0.0003 * ROWS + 1
-            )
+            assert abs(int(clock.missing_before.sum()) - int(np.ptp(kept)) - 1 + kept.size) <= 0.0003 * ROWS + 1
         for wrong in (2.0, 0.5, 1.333):
             with pytest.raises(UserError, match="does not agree with --rate"):
                 clock_of("log.csv", time, 1e-6, wrong * RATE_HZ, fail)
@@ -184,9 +152,7 @@ def test_a_stated_rate_is_taken_however_many_samples_are_lost(
 
 @pytest.mark.parametrize("lost", [0.1, 0.35, 0.5, 0.72])
 @pytest.mark.parametrize("jitter", [0.0, 0.06, 0.13])
-def test_another_rate_than_that_of_the_grid_is_refused(
-    lost: float, jitter: float
-) -> None:
+def test_another_rate_than_that_of_the_grid_is_refused(lost: float, jitter: float) -> None:
     """Of 41 Hz, at which lost samples hide best: 4/3, 3/4, 2/3 and half of it, and two rates of no simple ratio. The
     mean rate between longer steps agrees with some of them. A clock that is 2 % off is accepted."""
 
@@ -196,17 +162,12 @@ def test_another_rate_than_that_of_the_grid_is_refused(
     for seed in range(case_records(1, 10)):
         random = np.random.default_rng([seed, 5])
         kept = np.flatnonzero(random.random(3000) >= lost)
-        time = np.round(
-            np.sort(kept + jitter * random.standard_normal(kept.size)) / 41.0, 6
-        )
+        time = np.round(np.sort(kept + jitter * random.standard_normal(kept.size)) / 41.0, 6)
         for share in (1.333, 0.75, 0.667, 0.5, 0.79, 0.6):
             with pytest.raises(UserError, match="does not agree with --rate"):
                 clock_of("log.csv", time, 1e-6, 41.0 * share, fail)
         if lost < 0.5:
-            assert (
-                clock_of("log.csv", time, 1e-6, 41.0 * 1.02, fail).rate_hz
-                == 41.0 * 1.02
-            )
+            assert clock_of("log.csv", time, 1e-6, 41.0 * 1.02, fail).rate_hz == 41.0 * 1.02
 
 
 def in_bursts(random: Random, rows: int, lost: float, run: float) -> NDArray[np.bool_]:
@@ -226,9 +187,7 @@ def test_an_exact_grid_is_known_whatever_it_loses(lost: float, run: float) -> No
     """Samples lost one by one (`run` 0) or in bursts. The stamps are exact multiples of the interval, to 1 us."""
     for seed in range(case_records(2, 30)):
         random = np.random.default_rng(seed)
-        kept = (
-            in_bursts(random, 24000, lost, run) if run else random.random(24000) >= lost
-        )
+        kept = in_bursts(random, 24000, lost, run) if run else random.random(24000) >= lost
         place = np.flatnonzero(kept)
         rate, missing = found(np.round(place / 30.0, 6))
         assert rate == pytest.approx(30.0, rel=1e-7)
@@ -243,9 +202,7 @@ def test_ticks_of_a_clock_make_no_grid_of_random_times(tick_s: float) -> None:
         rate, missing = found(np.floor(np.cumsum(steps) / tick_s) * tick_s)
         assert missing == 0
         # The steps spread by 0.4.
-        assert rate == pytest.approx(
-            1.0 / (6.2 * tick_s), rel=4.0 * 0.4 / np.sqrt(ROWS)
-        )
+        assert rate == pytest.approx(1.0 / (6.2 * tick_s), rel=4.0 * 0.4 / np.sqrt(ROWS))
 
 
 @pytest.mark.parametrize("jitter", [0.0, 0.08])
@@ -258,23 +215,15 @@ def test_ticks_of_a_clock_make_no_grid_of_random_times(tick_s: float) -> None:
     ],
     ids=["burst", "slow stretches", "steps"],
 )
-def test_each_change_of_rate_is_found(
-    parts: list[tuple[float, float]], jitter: float
-) -> None:
+def test_each_change_of_rate_is_found(parts: list[tuple[float, float]], jitter: float) -> None:
     for seed in range(case_records(2, 30)):
         random = np.random.default_rng(seed)
         steps = np.concatenate([np.full(round(s * hz), 1.0 / hz) for s, hz in parts])
-        time = np.concatenate([[0.0], np.cumsum(steps)])[
-            :-1
-        ] + jitter * steps * random.uniform(-0.5, 0.5, steps.size)
+        time = np.concatenate([[0.0], np.cumsum(steps)])[:-1] + jitter * steps * random.uniform(-0.5, 0.5, steps.size)
         changes = rate_changes(time)
         # A change lies within one interval of its first sample, where the jitter hides it two.
-        assert [one.row for one in changes] == pytest.approx(
-            np.cumsum([s * hz for s, hz in parts])[:-1], abs=2
-        )
-        assert [1.0 / one.after_s for one in changes] == pytest.approx(
-            [hz for _, hz in parts[1:]], rel=0.01
-        )
+        assert [one.row for one in changes] == pytest.approx(np.cumsum([s * hz for s, hz in parts])[:-1], abs=2)
+        assert [1.0 / one.after_s for one in changes] == pytest.approx([hz for _, hz in parts[1:]], rel=0.01)
 
 
 @pytest.mark.parametrize("stalled", [45, 80])
@@ -287,9 +236,7 @@ def test_a_burst_after_a_stall_is_no_change_of_rate(stalled: int) -> None:
 
 
 @pytest.mark.parametrize(("lost", "whole"), [(0.5, True), (0.74, True), (0.88, False)])
-def test_lossy_records_are_right_or_refused(
-    lost: float, whole: bool, tmp_path: Path
-) -> None:
+def test_lossy_records_are_right_or_refused(lost: float, whole: bool, tmp_path: Path) -> None:
     """15 Hz, 40 minutes: the intervals of N and K hold the truth to four of their standard deviations, at the model's
     bank rate where averages are whole, and reading by reading."""
     n_true, k_true, rate_hz = 0.02, 0.002, 15.0
@@ -303,9 +250,7 @@ def test_lossy_records_are_right_or_refused(
         text = "\n".join(f"{row / rate_hz:.6f},{values[row]:.7g}" for row in kept)
         log.write_text(f"t[s],gx[deg/s]\n{text}\n", encoding="utf-8")
         if not whole:
-            with pytest.raises(
-                UserError, match="--decimate 15 takes each reading alone"
-            ):
+            with pytest.raises(UserError, match="--decimate 15 takes each reading alone"):
                 identify(log, suspicion=False)
         for decimate in (None, rate_hz) if whole else (rate_hz,):
             axis = identify(log, decimate=decimate, suspicion=False)["axes"]["gx"]
@@ -346,16 +291,12 @@ def test_sleep_between_stretches_is_gaps(
     time = (kept + off * sleeps + jitter * random.standard_normal(kept.size)) / rate_hz
     rate, missing = found(time)
     assert rate == pytest.approx(rate_hz, rel=1e-9 if jitter == off == 0.0 else 2e-4)
-    assert missing == pytest.approx(
-        kept[-1] - kept[0] + 1 - kept.size + off * sleeps[-1], abs=1 + missing * 2e-4
-    )
+    assert missing == pytest.approx(kept[-1] - kept[0] + 1 - kept.size + off * sleeps[-1], abs=1 + missing * 2e-4)
 
 
 @pytest.mark.parametrize("size", [16, 25])
 @pytest.mark.parametrize("true_hz", [188.0, 193.0, 199.0, 204.5, 215.0, 231.0])
-def test_batches_stamped_by_a_nominal_step_have_the_rate_of_their_count(
-    size: int, true_hz: float
-) -> None:
+def test_batches_stamped_by_a_nominal_step_have_the_rate_of_their_count(size: int, true_hz: float) -> None:
     """A FIFO whose first sample has the time of its interrupt, the others follow by 1/208 s. Small holes or overlaps
     lie between batches; no sample is lost. The interrupt comes 0.1 ms late, at random."""
 
@@ -369,40 +310,30 @@ def test_batches_stamped_by_a_nominal_step_have_the_rate_of_their_count(
         time = np.round(at // size * size / true_hz + at % size / 208.0 + late, 6)
         clock = clock_of("log.csv", time - time[0], 1e-9, None, fail)
         # The first and the last batch bend the line by their part of 1200.
-        assert clock.rate_hz == pytest.approx(
-            true_hz, rel=2.0 / 1200 * abs(true_hz / 208.0 - 1.0) + 1e-5
-        )
+        assert clock.rate_hz == pytest.approx(true_hz, rel=2.0 / 1200 * abs(true_hz / 208.0 - 1.0) + 1e-5)
         assert int(clock.missing_before.sum()) <= 2
 
 
 @pytest.mark.parametrize("lost", [1, 2])
 @pytest.mark.parametrize(("step_s", "digits"), [(0.1, 1), (0.01, 2), (0.25, 2)])
-def test_a_few_lost_samples_do_not_bend_the_rate(
-    lost: int, step_s: float, digits: int
-) -> None:
+def test_a_few_lost_samples_do_not_bend_the_rate(lost: int, step_s: float, digits: int) -> None:
     """Stamps in whole intervals: one step of two is a lost sample, and not an interval that is longer by one in n."""
     for seed in range(case_records(4, 40)):
         random = np.random.default_rng([seed, lost, digits])
         rows = int(random.integers(150, 5000))
-        kept = np.delete(
-            np.arange(rows), random.choice(np.arange(1, rows - 1), lost, replace=False)
-        )
+        kept = np.delete(np.arange(rows), random.choice(np.arange(1, rows - 1), lost, replace=False))
         rate, missing = found(np.round(kept * step_s, digits))
         assert (rate, missing) == (pytest.approx(1.0 / step_s, rel=1e-9), lost)
 
 
 @pytest.mark.parametrize(("rate_hz", "every"), [(50.0, 16), (125.0, 20), (40.0, 35)])
-def test_losses_in_a_rhythm_are_told_and_either_rate_can_be_stated(
-    rate_hz: float, every: int, tmp_path: Path
-) -> None:
+def test_losses_in_a_rhythm_are_told_and_either_rate_can_be_stated(rate_hz: float, every: int, tmp_path: Path) -> None:
     """One row of so many is missing: a sensor of the mean rate, whose stamps are rounded down to intervals, writes the
     same. The line names both rates, and each can be given."""
     kept = np.flatnonzero(np.arange(12_000) % every)
     values = np.random.default_rng(3).standard_normal(kept.size)
     log = tmp_path / "log.csv"
-    rows = "\n".join(
-        f"{t:.6f},{value:.4f}" for t, value in zip(kept / rate_hz, values, strict=True)
-    )
+    rows = "\n".join(f"{t:.6f},{value:.4f}" for t, value in zip(kept / rate_hz, values, strict=True))
     log.write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
     recording = load(log)
     lost = int(np.ptp(kept)) + 1 - kept.size
@@ -418,12 +349,8 @@ def test_losses_in_a_rhythm_are_told_and_either_rate_can_be_stated(
     assert int(load(log, rate=rate_hz).missing_before.sum()) == lost
 
 
-@pytest.mark.parametrize(
-    "pattern", ["110", "11011110", "0111101", "1110100", "11111111111100", "1100"]
-)
-@pytest.mark.parametrize(
-    ("rate_hz", "digits"), [(40.0, 3), (30.0, 6), (62.5, 3), (13.7, 4)]
-)
+@pytest.mark.parametrize("pattern", ["110", "11011110", "0111101", "1110100", "11111111111100", "1100"])
+@pytest.mark.parametrize(("rate_hz", "digits"), [(40.0, 3), (30.0, 6), (62.5, 3), (13.7, 4)])
 @pytest.mark.parametrize("lost", [0.0, 0.004])
 def test_rows_lost_in_a_pattern_are_missing_and_told(
     pattern: str, rate_hz: float, digits: int, lost: float, tmp_path: Path
@@ -433,20 +360,14 @@ def test_rows_lost_in_a_pattern_are_missing_and_told(
     from rounded stamps is off by their digit over the length."""
     random = np.random.default_rng([len(pattern), digits])
     place = np.arange(9000)
-    kept = np.flatnonzero(
-        (np.array([*pattern])[place % len(pattern)] == "1")
-        & (random.random(place.size) >= lost)
-    )
+    kept = np.flatnonzero((np.array([*pattern])[place % len(pattern)] == "1") & (random.random(place.size) >= lost))
     log = tmp_path / "log.csv"
     rows = "\n".join(
-        f"{k / rate_hz:.{digits}f},{v:.4f}"
-        for k, v in zip(kept, random.normal(size=kept.size), strict=True)
+        f"{k / rate_hz:.{digits}f},{v:.4f}" for k, v in zip(kept, random.normal(size=kept.size), strict=True)
     )
     log.write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
     recording = load(log)
-    assert recording.rate_hz == pytest.approx(
-        rate_hz, rel=10.0**-digits * rate_hz / kept[-1] + 1e-9
-    )
+    assert recording.rate_hz == pytest.approx(rate_hz, rel=10.0**-digits * rate_hz / kept[-1] + 1e-9)
     assert np.array_equal(recording.clock.place, kept - kept[0])
     (note,) = recording.notes
     assert "missing, at regular intervals" in note
@@ -475,22 +396,17 @@ def test_a_change_to_a_slower_rate_within_the_tick_is_no_loss(
     stamps = tick_s * np.floor(time / tick_s + 0.4)
     (change,) = rate_changes(stamps - stamps[0])
     assert abs(change.row - 3000) <= 10
-    assert 1.0 / np.array([change.before_s, change.after_s]) == pytest.approx(
-        rates_hz, rel=1e-3
-    )
+    assert 1.0 / np.array([change.before_s, change.after_s]) == pytest.approx(rates_hz, rel=1e-3)
     log = tmp_path / "log.csv"
     rows = "\n".join(
-        f"{t:.3f},{v:.4f}"
-        for t, v in zip(stamps, np.random.default_rng(1).normal(size=7000), strict=True)
+        f"{t:.3f},{v:.4f}" for t, v in zip(stamps, np.random.default_rng(1).normal(size=7000), strict=True)
     )
     log.write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
     assert "the sampling rate changes" in load(log).notes[0]
 
 
 @pytest.mark.parametrize("pattern", ["110", "11110", "101101"])
-def test_a_pattern_of_ticks_names_the_rate_that_loses_rows(
-    pattern: str, tmp_path: Path
-) -> None:
+def test_a_pattern_of_ticks_names_the_rate_that_loses_rows(pattern: str, tmp_path: Path) -> None:
     """A slower sensor stamped in ticks of 0.01 s writes the same, as 66.7 Hz does. The line names the rate to state."""
     kept = np.flatnonzero(np.resize(np.array([*pattern]) == "1", 8000))
     log = tmp_path / "log.csv"
@@ -504,12 +420,8 @@ def test_a_pattern_of_ticks_names_the_rate_that_loses_rows(
     assert np.array_equal(stated.clock.place, kept - kept[0])
 
 
-@pytest.mark.parametrize(
-    ("before_hz", "after_hz"), [(25.0, 21.0), (64.0, 80.0), (10.0, 7.0)]
-)
-def test_a_change_of_rate_has_a_line(
-    before_hz: float, after_hz: float, tmp_path: Path
-) -> None:
+@pytest.mark.parametrize(("before_hz", "after_hz"), [(25.0, 21.0), (64.0, 80.0), (10.0, 7.0)])
+def test_a_change_of_rate_has_a_line(before_hz: float, after_hz: float, tmp_path: Path) -> None:
     """At 300 s, between neighbouring rows."""
     time = np.concatenate(
         [
@@ -524,9 +436,7 @@ def test_a_change_of_rate_has_a_line(
     )
     (note,) = load(log).notes
     assert f"the sampling rate changes: {before_hz:g} Hz, {after_hz:g} Hz from " in note
-    assert float(note.split(" from ")[1].split()[0]) == pytest.approx(
-        300.0, abs=1.5 / min(before_hz, after_hz)
-    )
+    assert float(note.split(" from ")[1].split()[0]) == pytest.approx(300.0, abs=1.5 / min(before_hz, after_hz))
 
 
 def test_a_stall_is_no_loss_and_no_sleep() -> None:
@@ -536,9 +446,7 @@ def test_a_stall_is_no_loss_and_no_sleep() -> None:
         time = np.arange(9000) / 40.0
         for begin in random.choice(np.arange(200, 8800, 200), 5, replace=False):
             size = int(random.integers(8, 60))
-            time[begin : begin + size] = time[begin + size] - 4e-4 * np.arange(
-                size, 0, -1
-            )
+            time[begin : begin + size] = time[begin + size] - 4e-4 * np.arange(size, 0, -1)
         rate, missing = found(time)
         assert (rate, missing) == (pytest.approx(40.0, rel=1e-4), 0)
 
@@ -573,22 +481,13 @@ def test_a_clock_that_goes_back_goes_on(
 ) -> None:
     """No sample is missing but those that were taken out, of which none lies where the clock begins anew. Jitter of
     0.07 intervals moves the mean rate by its share of the length."""
-    back = np.flatnonzero(
-        np.abs(np.diff(stamps)) > 100.0 * np.median(np.abs(np.diff(stamps)))
-    )
+    back = np.flatnonzero(np.abs(np.diff(stamps)) > 100.0 * np.median(np.abs(np.diff(stamps))))
     kept = np.ones(COUNT, bool)
     if lost:
-        kept[
-            np.setdiff1d(
-                np.arange(700, COUNT - 700, 1111), np.concatenate([back, back + 1])
-            )
-        ] = False
+        kept[np.setdiff1d(np.arange(700, COUNT - 700, 1111), np.concatenate([back, back + 1]))] = False
     log = tmp_path / "log.csv"
     values = np.random.default_rng(5).standard_normal(COUNT)
-    rows = "\n".join(
-        f"{t:.7f},{value:.4f}"
-        for t, value in zip(stamps[kept], values[kept], strict=True)
-    )
+    rows = "\n".join(f"{t:.7f},{value:.4f}" for t, value in zip(stamps[kept], values[kept], strict=True))
     log.write_text(f"t[{unit}],gx[deg/s]\n{rows}\n", encoding="utf-8")
     recording = load(log)
     assert recording.rate_hz == pytest.approx(rate_hz, rel=1e-5)
@@ -601,18 +500,14 @@ def test_a_clock_that_goes_back_goes_on(
 @pytest.mark.parametrize("twice", [0, 150])
 @pytest.mark.parametrize("swapped", [0, 180])
 @pytest.mark.parametrize("lost", [0, 210])
-def test_rows_out_of_order_have_ways_that_work(
-    twice: int, swapped: int, lost: int, tmp_path: Path
-) -> None:
+def test_rows_out_of_order_have_ways_that_work(twice: int, swapped: int, lost: int, tmp_path: Path) -> None:
     """Rows written twice, neighbours swapped, rows lost: alone and together. One line names --skip-bad, by which each
     row is in its place, and --no-time --rate, by which rows are as they come."""
     random = np.random.default_rng([twice, swapped, lost])
     rows, rate_hz = 20_000, 40.0
     values = np.round(random.standard_normal(rows), 5)
     order = np.delete(np.arange(rows), np.arange(77, rows - 9, 93)[:lost])
-    order = np.sort(
-        np.concatenate([order, random.choice(order[1:-1], twice, replace=False)])
-    )
+    order = np.sort(np.concatenate([order, random.choice(order[1:-1], twice, replace=False)]))
     for row in np.arange(40, rows - 500, 101)[:swapped]:
         order[row], order[row + 1] = order[row + 1], order[row]
     log = tmp_path / "log.csv"
@@ -620,9 +515,7 @@ def test_rows_out_of_order_have_ways_that_work(
     log.write_text(f"t[s],gx[deg/s]\n{text}\n", encoding="utf-8")
     sound = np.unique(order)
     if twice or swapped:
-        with pytest.raises(
-            UserError, match=r"line \d+: column 't': .*--skip-bad .*--no-time --rate HZ"
-        ) as caught:
+        with pytest.raises(UserError, match=r"line \d+: column 't': .*--skip-bad .*--no-time --rate HZ") as caught:
             load(log)
         assert "\n" not in str(caught.value)
     recording = load(log, skip_bad=True)
@@ -635,9 +528,7 @@ def test_rows_out_of_order_have_ways_that_work(
 
 def test_empty_cells_at_regular_rows_are_missing_samples(tmp_path: Path) -> None:
     """Every 90th cell is empty; the stamps of these rows are there, in tenths of a second."""
-    rows = "\n".join(
-        f"{k / 10:.1f},{'' if k % 90 == 5 else k % 7}" for k in range(4000)
-    )
+    rows = "\n".join(f"{k / 10:.1f},{'' if k % 90 == 5 else k % 7}" for k in range(4000))
     (tmp_path / "log.csv").write_text(f"t[s],gx[deg/s]\n{rows}\n", encoding="utf-8")
     recording = load(tmp_path / "log.csv")
     assert (recording.rate_hz, int(recording.missing_before.sum())) == (
@@ -646,25 +537,19 @@ def test_empty_cells_at_regular_rows_are_missing_samples(tmp_path: Path) -> None
     )
 
 
-# ------------------------------------------------------------------------------------------------- one law of the stamps
+# ------------------------------------------------------------------------------------------------ one law of the stamps
 
 
 @pytest.mark.parametrize("lattice_s", [1e-3, 4e-3, 1e-2])
 @pytest.mark.parametrize("intervals", [0.71, 0.957, 1.021, 1.37, 3.6])
 @pytest.mark.parametrize(("lost", "run"), [(0.004, 1), (0.04, 1), (0.1, 1), (0.03, 6)])
-def test_a_rate_that_the_lattice_does_not_divide(
-    lattice_s: float, intervals: float, lost: float, run: int
-) -> None:
+def test_a_rate_that_the_lattice_does_not_divide(lattice_s: float, intervals: float, lost: float, run: int) -> None:
     """Stamps cut to a lattice of so many intervals, samples lost one by one or in runs of `run` on average. Before, six
     in ten such records were refused. A few gaps at the ends of the record can be misjudged by one, of 6000 places."""
     for seed in range(case_records(3, 30)):
         random = np.random.default_rng([31, seed, round(1e3 * intervals)])
         rate_hz = random.uniform(0.99, 1.01) * intervals / lattice_s
-        kept = (
-            random.random(6000) >= lost
-            if run == 1
-            else ~in_bursts(random, 6000, 1.0 - lost, run)
-        )
+        kept = random.random(6000) >= lost if run == 1 else ~in_bursts(random, 6000, 1.0 - lost, run)
         place = np.flatnonzero(kept)
         time = np.floor((place / rate_hz + random.random()) / lattice_s) * lattice_s
         rate, missing = found(np.round(time, 9))
@@ -676,9 +561,7 @@ def test_a_rate_that_the_lattice_does_not_divide(
 @pytest.mark.parametrize("size", [16, 32, 64])
 @pytest.mark.parametrize("within_s", [0.0, 2e-5])
 @pytest.mark.parametrize("tick_s", [1e-6, 1e-3])
-def test_batches_with_a_stamp_each_have_the_rate_of_their_count(
-    size: int, within_s: float, tick_s: float
-) -> None:
+def test_batches_with_a_stamp_each_have_the_rate_of_their_count(size: int, within_s: float, tick_s: float) -> None:
     """A FIFO that is read with one stamp, or a few us from row to row. Its slope over 300 batches is known to the
     lateness of a batch, 0.2 ms and the tick, over the record, and to the square of a batch's share of it."""
     for seed in range(case_records(3, 30)):
@@ -686,18 +569,10 @@ def test_batches_with_a_stamp_each_have_the_rate_of_their_count(
         rate_hz = float(random.choice([91.7, 421.0, 850.0]))
         at = np.arange(300 * size)
         late = 2e-4 * np.abs(random.standard_normal(300)).repeat(size)
-        time = (
-            np.floor(
-                ((at // size + 1) * size / rate_hz + late + at % size * within_s)
-                / tick_s
-            )
-            * tick_s
-        )
+        time = np.floor(((at // size + 1) * size / rate_hz + late + at % size * within_s) / tick_s) * tick_s
         rate, missing = found(time)
         assert missing == 0
-        assert rate == pytest.approx(
-            rate_hz, rel=2.0 / 300**2 + (4e-4 + tick_s) * rate_hz / at.size
-        )
+        assert rate == pytest.approx(rate_hz, rel=2.0 / 300**2 + (4e-4 + tick_s) * rate_hz / at.size)
 
 
 @pytest.mark.parametrize("stray", [0.004, 0.025])

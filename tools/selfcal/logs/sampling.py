@@ -89,8 +89,8 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Stamps:
-    """Stamps float64[n], s, and which steps [n - 1] are sleeps between stretches. `lattice`: what the stamps are rounded
-    to, s, 0 for none; `typical`: the mean step, s."""
+    """Stamps float64[n], s, and which steps [n - 1] are sleeps. `lattice`: what the stamps are rounded to, s, or 0;
+    `typical`: the mean step, s."""
 
     time: Floats
     asleep: NDArray[np.bool_]
