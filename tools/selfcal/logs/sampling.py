@@ -30,35 +30,29 @@ from scipy.special import betaln
 
 #: Intervals of a record at most.
 _LONGEST = 2.0**53
-#: Rows that decide on the law.
-_HEAD = 4000
+#: Rows that decide on the law, and that show the phase of the first.
+_HEAD, _NEAR_FIRST = 4000, 512
 #: Places of a histogram in one of its cells.
 _PARTS = 5
 #: Lattice over mean step from which stamps are coarse, and the smallest cell of errors over the mean step.
 _COARSE, _FINEST = 0.25, 1e-3
 #: Nats of another interval than a lattice that is no tick of a clock, and of one that is not the stated one at most;
-#: the relative sd of that one.
-_COINCIDENCE, _STATED, _STATED_SD = 400.0, 20.0, 0.005
+#: the relative sd of that one. Ticks of clocks are 10^-k s, 2^-k s, and this, s.
+_COINCIDENCE, _STATED, _STATED_SD, _JIFFY = 400.0, 20.0, 0.005, 0.004
 #: Nats of a line that random times show by chance, and of one in a row at most: rows of batches make lines as well.
 _NO_CHANCE, _LINE_MOST = 25.0, 0.1
 #: Another dt that costs so few nats more is as good; and may cost less by the whole record.
 _AS_GOOD, _CLOSE = 10.0, 25.0
-#: Ticks of clocks are 10^-k s, 2^-k s, and this, s.
-_JIFFY = 0.004
 #: Change of rate within a record that the decoder follows; rows over which a grid's phase is followed, and at which
 #: a row or several between late ones are early.
 _WANDER, _PIECE_OF_GRID, _EARLY = 3e-5, 100, 3
 #: Grids proposed, harmonics of their lines, the band of a line in rates of the stamps, and the least ln of its power
 #: over that around it.
 _LINES, _HARMONICS, _BAND, _LINE = 8, 6, (0.9, 4.0), 3.0
-#: Rows that show the phase of the first.
-_NEAR_FIRST = 512
 #: Steps of one interval on a grid at least, of all; and steps of less than half of one where each strays, at most.
 _ONES, _TOO_SHORT = 0.05, 0.01
 #: Rows of a record whose stamps make no line: all grids in this band are tried, in rates of the stamps.
 _FEW, _BAND_OF_FEW = 64, (0.95, 1.4)
-#: Rows of the head that show whether a part of a record lost samples.
-_STRETCH = 4000
 #: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
 _STEPS, _PIECES = 20, 500
 #: A part of one rate must save so many squares of the scatter between neighbouring pieces.
@@ -68,14 +62,11 @@ _CHANGE = 0.015
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
 #: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
 _ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
-#: A gap between steps of any length, in the step beyond which half of the time is.
-_GAP = 12.0
-#: Errors about their line that are far off, in the median one.
-_FAR = 6.0
+#: A gap between steps of any length, in the step beyond which half of the time is; errors about their line that are
+#: far off, in the median one; how far batches that overlap may stray from a steady count, in their length.
+_GAP, _FAR, _STRAY = 12.0, 6.0, 5.0
 #: The share of the gaps that keep to a rhythm, and gaps in a period of losses at most.
 _RHYTHM, _OF_PATTERN = 0.9, 4
-#: Mean steps, times the samples of a batch, by which stamps of batches that overlap may stray from a steady count.
-_STRAY = 5.0
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -98,18 +89,13 @@ class _Fit:
 
 @dataclass(frozen=True)
 class _Stamps:
-    """Stamps float64[n], s, and the steps [n - 1] between stretches, whatever they last. `cell`: what errors are
-    written to, s; `lattice`: what the stamps are rounded to, 0 for none; `typical`: the mean step, s."""
+    """Stamps float64[n], s, and which steps [n - 1] are sleeps. `lattice`: what the stamps are rounded to, s, or 0;
+    `typical`: the mean step, s."""
 
     time: Floats
     asleep: NDArray[np.bool_]
     lattice: float
     typical: float
-
-    @cached_property
-    def steps(self) -> Floats:
-        """Between neighbours, [n - 1]."""
-        return np.diff(self.time)
 
     @property
     def cell(self) -> float:
@@ -124,7 +110,8 @@ class _Stamps:
     @cached_property
     def slept(self) -> Floats:
         """Beyond one usual step, so far, [n], s."""
-        extra = np.where(self.asleep, self.steps - _usual(self.steps), 0.0) if self.asleep.any() else self.steps * 0.0
+        steps = np.diff(self.time)
+        extra = np.where(self.asleep, steps - _usual(steps), 0.0)
         return np.concatenate(([0.0], np.cumsum(extra)))
 
     @cached_property
@@ -249,9 +236,6 @@ def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
         return np.zeros_like(long)
     even = np.mean(np.abs(steps - usual) < 0.5 * usual) > _EVEN and usual * steps.size > _AWAKE_SHARE * time[-1]
     return long if even or 10 * count * _AWAKE < steps.size else np.zeros_like(long)
-
-
-# -------------------------------------------------------------------------------------------------- what a law costs
 
 
 def _ln_values(values: Floats, cell: float) -> float:
@@ -430,7 +414,7 @@ def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     """Intervals, s, of which the stamps may have a grid: of short steps, of the lattice, and of lines in the spectrum
     of the stamps. Lattice and jitter leave a line's harmonics, the lattice folds them."""
     found: list[float] = [] if rate is None else [1.0 / rate]
-    steps, typical, q = stamps.steps[~stamps.asleep], stamps.typical, stamps.lattice
+    steps, typical, q = np.diff(stamps.time)[~stamps.asleep], stamps.typical, stamps.lattice
     for short in np.quantile(steps[steps > 0.0], [0.02, 0.25]).tolist():
         dt = short
         for _ in range(4):
@@ -462,9 +446,6 @@ def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     return found
 
 
-# ------------------------------------------------------------------------------------------ rhythms and changes of rate
-
-
 def in_rhythm(rows: NDArray[np.int64]) -> bool:
     """Whether rows, four or more apart, are as far apart from each other, but for one row."""
     runs = np.diff(rows)
@@ -486,7 +467,7 @@ def _periods(steps: NDArray[np.floating[Any]] | Places) -> list[tuple[int, NDArr
     return [(k, (each[:, k:] == each[:, :-k]).all(axis=0)) for k in periods]
 
 
-def overlapping(time: NDArray[np.float64]) -> bool:
+def overlapping(time: Floats) -> bool:
     """Whether stamps fall in a rhythm, and go on from there: batches overlap. Where rows are swapped they catch up."""
     steps = np.diff(time)
     rows = np.flatnonzero(steps < 0.0)
@@ -507,7 +488,7 @@ def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), off: Floats | 
     return float(x @ y / (x @ x))
 
 
-def _usual(steps: NDArray[np.float64]) -> float:
+def _usual(steps: Floats) -> float:
     """The median of the steps that are no repeats."""
     return float(np.median(steps[steps > 0.0], overwrite_input=True))
 
@@ -522,7 +503,7 @@ class Change:
     nats: float
 
 
-def rate_changes(time: NDArray[np.float64]) -> list[Change]:
+def rate_changes(time: Floats) -> list[Change]:
     """Every change of rate in stamps float64[n], s, in order of time.
 
     A rate must last two pieces of n / _PIECES rows, or of 3 * _STEPS; one that differs much, of _STEPS."""
@@ -573,7 +554,7 @@ def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
     ]
 
 
-def _constant(value: NDArray[np.float64], mean: NDArray[np.float64]) -> list[tuple[int, int]]:
+def _constant(value: NDArray[np.float64], mean: Floats) -> list[tuple[int, int]]:
     """First piece and the piece after the last of every part of one rate. `value` and `mean` [pieces]: ln of the
     interval by the quantile and by the mean. A piece with a change in it belongs to no part.
 
@@ -621,11 +602,7 @@ def _scatter(value: NDArray[np.float64], parts: list[tuple[int, int]]) -> float:
 
 
 def _bend(
-    time: NDArray[np.float64],
-    parts: tuple[tuple[int, int], tuple[int, int]],
-    level: tuple[float, float],
-    most: tuple[float, float],
-    size: int,
+    time: Floats, parts: Sequence[tuple[int, int]], level: Sequence[float], most: Sequence[float], size: int
 ) -> int:
     """First row of the second of two parts [first piece, piece after], with intervals `level`, s, of `most`: the row
     farthest from the line of the mean interval, gaps left out."""
@@ -641,7 +618,7 @@ def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[floa
     """Whether a part is no slower one: its likeliest grid is that of the fastest part. Its stamps are not rounded to a
     coarse `lattice`."""
     fastest = min(level)
-    heads = [(time[one][:_STRETCH], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
+    heads = [(time[one][:_HEAD], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
     coarse = [lattice > _COARSE * fastest and in_pattern(np.rint(np.diff(head) / lattice)) for head, _ in heads]
     return any(
         abs(_likeliest(_stamps(head - head[0], 1e-9 * fastest), None).dt / fastest - 1.0) < 0.05
@@ -671,9 +648,7 @@ def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
     return float(distinct @ times / (times @ times))
 
 
-def followed_phase(
-    x: NDArray[np.float64], time: NDArray[np.float64], frequency: float, block: int
-) -> tuple[NDArray[np.float64], float]:
+def followed_phase(x: Floats, time: Floats, frequency: float, block: int) -> tuple[Floats, float]:
     """Phase [n], turns, of the line near a frequency in x [n] at these times, followed over blocks of so many rows; and
     the size of the line. It is whole where x is largest."""
     edges = np.arange(0, max(1, x.size // block)) * block
