@@ -134,6 +134,7 @@ def test_a_number_must_move_by_more_than_half_its_interval(
 def test_numbers_in_words_have_two_digits_and_no_lists() -> None:
     told = words.inflation_sentence({"N": 1.2345, "K": math.inf, "B": 296.23})
     assert "N 23 % too large" in told and "K not identified" in told and "B 300 times too large" in told
+    assert "K hidden" in words.inflation_sentence({"K": 0.0})  # without the cause there is no walk at all
     estimate = {
         "coefficient": interval(0.031100000000000003, 0.0, "deg/s/degC"),
         "intervals": [[1199.5, 1200.8], [1300.0, 1302.25]],

@@ -217,13 +217,16 @@ def _range(values: Sequence[float]) -> str:
 
 
 def _off(factors: Sequence[float]) -> str:
-    """How far a number is off, by its values without a cause over those with it: in percent up to twice or half."""
+    """How far a number is off, by its values without a cause over those with it: in percent up to twice or half. It is
+    not identified without the cause where a factor is infinite, and hidden where one is 0."""
     told = []
-    for word, own in (("large", [f for f in factors if f > 1.0]), ("small", [1.0 / f for f in factors if f < 1.0])):
+    above, below = [f for f in factors if 1.0 < f < math.inf], [1.0 / f for f in factors if 0.0 < f < 1.0]
+    for word, own in (("large", above), ("small", below)):
         if own:
             percent = [100.0 * (f - 1.0) if word == "large" else 100.0 * (1.0 - 1.0 / f) for f in own]
             told.append(f"{_range(percent)} % too {word}" if max(own) < 2.0 else f"{_range(own)} times too {word}")
-    return " or ".join(told)
+    told += [] if all(f < math.inf for f in factors) else ["not identified"]
+    return " or ".join(told + (["hidden"] if 0.0 in factors else []))
 
 
 def effects(finding: Mapping[str, Any]) -> str:
@@ -236,10 +239,7 @@ def effects(finding: Mapping[str, Any]) -> str:
         own = [one for one in changes.values() if name in one["material"]]
         own = [one for one in own if name != "B" or "K" not in one["material"]]
         factors = [math.inf if one[name] is None else one[name] for one in own]
-        parts = [_off([one for one in factors if 0.0 < one < math.inf])]
-        parts += ["not identified"] if math.inf in factors else []
-        parts += ["hidden"] if 0.0 in factors else []
-        told += [f"{name} {' or '.join(filter(None, parts))}"] if any(parts) else []
+        told += [f"{name} {off}"] if (off := _off(factors)) else []
     moved = [(axis, abs(one["bias"]), one["unit"]) for axis, one in changes.items() if "bias" in one["material"]]
     if moved:
         told.append(f"bias off by {_by_unit(moved)}")
@@ -372,11 +372,7 @@ def navigation(document: Mapping[str, Any]) -> list[str]:
 
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
-    told = [
-        f"{name} {_off([factor])}" if math.isfinite(factor) else f"{name} not identified"
-        for name, factor in inflation.items()
-        if not 0.95 < factor < 1.05
-    ]
+    told = [f"{name} {_off([factor])}" for name, factor in inflation.items() if not 0.95 < factor < 1.05]
     return f"Without it, the numbers of plain white noise and random walk are wrong: {', '.join(told)}." if told else ""
 
 
