@@ -369,6 +369,9 @@ def test_a_noisy_axis_is_told_beside_its_siblings() -> None:
     white |= {"ay": interval(1.0, 0.1, "g/sqrt(Hz)")}
     assert noisier(white) == ["gz is 3.1 times as noisy as gx and gy"]
     assert noisier(white | {"gz": interval(1.9, 0.1, "deg/s/sqrt(Hz)")}) == []
+    # Of two siblings whose N a line has spoilt, 1e-4 and 1e-6, none is a measure.
+    spoilt = {name: interval(size, 0.1 * size, "deg/s/sqrt(Hz)") for name, size in (("gx", 1e-4), ("gy", 1e-6))}
+    assert noisier(white | spoilt) == []
 
 
 def test_a_lag_of_several_axes_is_by_all_of_them() -> None:

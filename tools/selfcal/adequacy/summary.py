@@ -150,15 +150,18 @@ def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]
 
 def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
     """A line an axis whose white noise is another than that of its siblings, by names that differ in the last letter:
-    NOISIER times their median or more, the 90 % intervals apart. `white`: median, q05, q95 and unit."""
+    NOISIER times their median or more, the 90 % intervals apart. Siblings that differ as much themselves are no batch.
+    `white`: median, q05, q95 and unit."""
     lines = []
     for name, own in white.items():
         alike = [axis for axis in white if axis[:-1] == name[:-1] and white[axis]["unit"] == own["unit"]]
         others = [axis for axis in alike if axis != name]
         if len(others) < 2:
             continue
-        times = own["median"] / float(np.median([white[other]["median"] for other in others]))
-        if times >= NOISIER and own["q05"] > max(white[other]["q95"] for other in others):
+        known = [white[other]["median"] for other in others]
+        times = own["median"] / float(np.median(known))
+        batch = max(known) < NOISIER * min(known)
+        if batch and times >= NOISIER and own["q05"] > max(white[other]["q95"] for other in others):
             lines.append(f"{name} is {times:.2g} times as noisy as {' and '.join(others)}")
     return lines
 
