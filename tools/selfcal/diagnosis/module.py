@@ -460,7 +460,8 @@ def _of_columns(y: Array, model: Joint, weights: Array, multiples: Sequence[int]
 
 
 def transients(seen: Seen) -> Iterator[Candidate]:
-    """A constant rate, and a bias that settles: theta is its time constant, s, and the sd of the logarithm of that."""
+    """A constant rate, and a bias that settles: theta is its time constant, s, and how far off that may be, in its
+    logarithm."""
     t = (np.arange(seen.n) + 0.5) * seen.dt
     ln_tau = math.log(FASTEST * seen.dt) + 0.5 * math.log(2.0) * np.arange(2 * int(math.log2(seen.n / FASTEST)) + 1)
     tau = np.exp(ln_tau)
@@ -472,14 +473,7 @@ def transients(seen: Seen) -> Iterator[Candidate]:
     for one in found:
         if one.theta and one.evidence < ramp + ALIKE:  # of what is as likely the simpler one is meant
             continue
-        if one.theta:
-            near = np.abs(ln_tau - math.log(one.theta[0])) < NEAR_TAU
-            weight = softmax(full(scored[1], scored[2])[1:][near])
-            middle = float(weight @ ln_tau[near])
-            sd = math.sqrt(float(weight @ (ln_tau[near] - middle) ** 2) + (ln_tau[1] - ln_tau[0]) ** 2 / 12.0)
-            yield replace(one, theta=(math.exp(middle), sd))
-        else:
-            yield one
+        yield replace(one, theta=(*one.theta, NEAR_TAU)) if one.theta else one
 
 
 def channels(seen: Seen) -> Iterator[Candidate]:
@@ -562,6 +556,29 @@ def locked(seen: Seen, one: Candidate) -> Candidate:
     return one
 
 
+def settled(seen: Seen, one: Candidate) -> Candidate:
+    """A bias that settles with the drifts fitted anew beside it, by the time constants that it may have there: ever
+    closer ones, until the record no longer tells them apart."""
+    t, (tau, step) = (np.arange(seen.n) + 0.5) * seen.dt + seen.since_s, one.theta
+    for _ in range(LOCKED):
+        model = refitted(seen.model, seen.y - one.effect, seen.dt)
+        found, ln_tau = course(model, seen.y, smooth=True), math.log(tau) + step * np.linspace(-1.0, 1.0, 7)
+        columns = np.exp(-t / np.exp(ln_tau)[:, None])
+        columns /= columns.std(axis=1)[:, None]
+        score, known = columns @ found.weights, information(model, seen.y, columns)
+        weight = softmax(full(score, known))
+        middle, apart = float(weight @ ln_tau), step / 3.0
+        sd = math.sqrt(float(weight @ (ln_tau - middle) ** 2) + apart**2 / 12.0)
+        k = int(np.argmax(weight))
+        one = replace(one, theta=(math.exp(middle), sd), act=act(score[k][None], known[k]), columns=columns[k][None])
+        one = _gained(seen, one, score[k][None], model, found)
+        moved, tau = abs(middle - math.log(tau)), math.exp(middle)
+        if sd > apart and moved < 0.5 * sd:
+            break
+        step = apart if sd < apart and 0 < k < ln_tau.size - 1 else step
+    return one
+
+
 def between_levels(seen: Seen, one: Candidate) -> Candidate:
     """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one that a
     jump widens takes a half for the whole."""
@@ -588,6 +605,8 @@ def between_levels(seen: Seen, one: Candidate) -> Candidate:
     return replace(beside(replace(seen, y=y), one), passing=tuple(passing))
 
 
+#: Causes whose shape is looked for once more with the drifts beside them: their family, and that look.
+FIRMED = {"periodic": ("line", locked), "turn_on": ("transient", settled)}
 #: The searches; a jump's has the name of its cause.
 FAMILIES: dict[str, Callable[[Seen], Iterator[Candidate]]] = {
     "step": steps,
@@ -653,9 +672,10 @@ class Search:
                 found = _best_of(beside(self.seen, one) for each in jumps for one in each if one.evidence > 0.0)
             if found is None or found.evidence < least:
                 return
-            if found.cause == "periodic" and not any(found is one for one in firm):
-                firm.append(locked(self.seen, found))
-                self.known["line"] = [firm[-1] if one is found else one for one in self.known["line"]]
+            if found.cause in FIRMED and not any(found is one for one in firm):
+                family, firmed = FIRMED[found.cause]
+                firm.append(firmed(self.seen, found))
+                self.known[family] = [firm[-1] if one is found else one for one in self.known[family]]
                 continue
             turns -= 1
             own = self._is_own(found)
