@@ -25,7 +25,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
 from scipy.ndimage import grey_closing, uniform_filter1d
-from scipy.optimize import isotonic_regression
 from scipy.special import betaln
 
 #: Intervals of a record at most.
@@ -328,6 +327,8 @@ def _phased(stamps: _Stamps, dt: float) -> _Fit | None:
     """The nearest places of a grid whose phase and rate are followed over pieces of the record.
 
     A sample may be late, and none after it is then. Those in a row that are early, and late, share their place."""
+    from scipy.optimize import isotonic_regression  # a quarter of a second to import: for grids that are followed alone
+
     index = np.arange(stamps.time.size)
     turns = followed_phase(np.ones(index.size), stamps.awake, 1.0 / dt, _PIECE_OF_GRID)[0] - index
     ahead = np.rint(turns)

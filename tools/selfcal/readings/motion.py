@@ -99,14 +99,13 @@ class Energy:
 @dataclass(frozen=True)
 class Stretch:
     """Pieces from `begin` on and before `end` in which `axes` [axes] move; the `nats` of each [axes], and those `net`
-    of the search. `several`: by all axes together, of which some may be too quiet to be named."""
+    of the search."""
 
     begin: int
     end: int
     axes: Mask
     nats: Array
     net: float
-    several: bool
 
 
 def moves_of(recording: Recording) -> dict[str, Moved]:
@@ -117,10 +116,7 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         names = [name for name in recording.columns if name not in channels]
         energy = energy_of(recording, names)
         found: dict[str, list[Stretch]] = {name: [] for name in names}
-        every = stretches(energy)
-        together = [_times(energy, one, recording) for one in every if one.several]
-        recording.seen["motion together"] = joined(together)
-        for one in every:
+        for one in stretches(energy):
             for k in np.flatnonzero(one.axes).tolist():
                 found[names[k]].append(one)
         for k, name in enumerate(names):
@@ -129,13 +125,6 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
             ratio = _loudness(recording, name, energy, found[name], times)
             seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]), ratio)
     return {name: one for name, one in seen.items() if one.intervals}
-
-
-def moved_together(recording: Recording) -> list[tuple[float, float]]:
-    """When the sensor moved by several axes together, s from the first row: no axis is at rest then."""
-    moves_of(recording)
-    together: list[tuple[float, float]] = recording.seen["motion together"]
-    return together
 
 
 def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, float]:
@@ -309,7 +298,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
             of_others = np.count_nonzero(which) == 1
             more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else TOGETHER))
             which = which | more if of_others else more  # noqa: PLW2901
-            apart.append(Stretch(a, b, which, nats, net, not of_others))
+            apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
     nets = sorted((one.net for one in [*known, *apart] if one.axes.sum() > 1 and one.net <= sure), reverse=True)
     # At rest exp(-net) stretches of several axes are beyond a net: the fewest that are together no chance.
@@ -391,12 +380,13 @@ def _ratio(energy: Energy, begin: int, end: int) -> tuple[Array, Array]:
 
 
 def _sharing(energy: Energy, begin: int, end: int, axes: Mask) -> Mask:
-    """Which axes [axes] are as loud as the quieter half of `axes` is in a stretch, and not at rest."""
+    """Which axes [axes] are as loud as the quieter half of `axes` is in a stretch, and not at rest. Where an axis as
+    loud would show little itself, half of that suffices."""
     ratio, _ = _ratio(energy, begin, end)
-    n = energy.counts[..., begin:end].sum(axis=2)
+    n = 0.5 / SQUARES * energy.counts[..., begin:end].sum(axis=2)
     r = np.quantile(ratio[axes], 0.5, axis=0, method="lower")
-    nats = 0.5 / SQUARES * n * (ratio * (1.0 - 1.0 / r) - np.log(r))
-    return np.asarray(nats.max(axis=1) > TOGETHER)
+    nats, expected = n * (ratio * (1.0 - 1.0 / r) - np.log(r)), n * (r - 1.0 - np.log(r))
+    return np.asarray(nats.max(axis=1) > np.minimum(TOGETHER, 0.5 * expected.max(axis=1)))
 
 
 def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:

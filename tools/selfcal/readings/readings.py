@@ -26,7 +26,7 @@ from selfcal.readings.held import Held, Slower, held, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import Recurring, is_limit, recurring_of
 from selfcal.readings.misread import misread_of, spans_of
-from selfcal.readings.motion import Moved, moved_together, moves_of
+from selfcal.readings.motion import Moved, moves_of
 
 #: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
 CLOCK_LEAST = 1e-3
@@ -289,7 +289,7 @@ def _moving(recording: Recording, axis: str) -> tuple[Mask, Moved | None]:
     """Rows [n] in which the sensor moved, by all axes, and the motion of the axis."""
     moved, time = moves_of(recording).get(axis), recording.time_s
     found = np.zeros(time.size, bool)
-    for begin_s, end_s in (*moved_together(recording), *(moved.intervals if moved is not None else ())):
+    for begin_s, end_s in moved.intervals if moved is not None else ():
         found |= (time >= begin_s) & (time < end_s)
     return found, moved
 
