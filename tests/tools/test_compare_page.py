@@ -57,16 +57,18 @@ def tilted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     t = np.arange(2400.0)
     for k, log in enumerate(logs):
         rng = np.random.default_rng(70 + k)
-
-        def drifting(N: float, K: float, mean: float = 0.0) -> Any:
-            return mean + N * rng.standard_normal(t.size) + np.cumsum(K * rng.standard_normal(t.size))  # noqa: B023
-
+        rows = {"gz": (0.0, 0.04, 0.002 * (1 + 4 * k)), "ax": (0.0, 0.007, 0.0003), "ay": (0.0, 0.007, 0.0003)}
+        rows["az"] = (9.81, 0.007, 0.0003)
+        drifting = {
+            name: mean + N * rng.standard_normal(t.size) + np.cumsum(K * rng.standard_normal(t.size))
+            for name, (mean, N, K) in rows.items()
+        }
         turned = k * (t >= 1500.0)
         log_of = {
-            "gz": ("deg/s", drifting(0.04, 0.002 * (1 + 4 * k))),
-            "ax": ("m/s^2", drifting(0.007, 0.0003) + 9.81 * np.deg2rad(0.7) * turned),
-            "ay": ("m/s^2", drifting(0.007, 0.0003) - 9.81 * np.deg2rad(0.5) * turned),
-            "az": ("m/s^2", drifting(0.007, 0.0003, 9.81)),
+            "gz": ("deg/s", drifting["gz"]),
+            "ax": ("m/s^2", drifting["ax"] + 9.81 * np.deg2rad(0.7) * turned),
+            "ay": ("m/s^2", drifting["ay"] - 9.81 * np.deg2rad(0.5) * turned),
+            "az": ("m/s^2", drifting["az"]),
         }
         save(log, log_of, 1.0, {})
     return dict(compare(logs))

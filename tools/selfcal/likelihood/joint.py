@@ -293,8 +293,6 @@ class _Cost:
 
 def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     """The model of most likelihood, with f or without. `start`: one near it, to which f is added if it has none."""
-    from scipy.optimize import minimize  # a quarter of a second to import: for records of several axes alone
-
     cost, m = _Cost(bins, f), bins.power.shape[1]
     size, rate = np.log(SIZE_LIMITS), np.log(np.array(ALPHA_LIMITS) * dt)
     rate[1] = min(rate[1], math.log(2.0))
@@ -312,20 +310,25 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     elif f:
         vector = _together(bins, own)
         tries = [np.concatenate([head, vector, [np.clip(math.log(dt / tau), *bounds[-1])]]) for tau in STARTS_S]
-    found = []
-    for one in tries:  # in units of how well each parameter is known: else a fit takes five times as many steps
-        unit = cost.deviations(one)
-        within = np.array(bounds) / unit[:, None]
-
-        def scaled(z: Array, unit: Array = unit) -> tuple[float, Array]:
-            value, slope = cost(z * unit)
-            return value, slope * unit
-
-        end = minimize(scaled, one / unit, jac=True, method="L-BFGS-B", bounds=within, options={"maxiter": 400})
-        found.append((float(end.fun), end.x * unit))
-    value, x = min(found, key=lambda one: one[0])
+    value, x = min((_least(cost, one, np.array(bounds)) for one in tries), key=lambda end: end[0])
     own, root, _, loading, ln_rate = cost.parts(x)
     return Joint(own, root @ root.T, loading * np.exp(own[:, 0]), math.exp(ln_rate), -value)
+
+
+def _least(cost: _Cost, start: Array, bounds: Array) -> tuple[float, Array]:
+    """The least cost within bounds [parameters, 2], and where it is. It is sought in units of how well each parameter
+    is known: else it takes five times as many steps."""
+    from scipy.optimize import minimize  # a quarter of a second to import: for records of several axes alone
+
+    unit = cost.deviations(start)
+
+    def scaled(z: Array) -> tuple[float, Array]:
+        value, slope = cost(z * unit)
+        return value, slope * unit
+
+    within = bounds / unit[:, None]
+    end = minimize(scaled, start / unit, jac=True, method="L-BFGS-B", bounds=within, options={"maxiter": 400})
+    return float(end.fun), end.x * unit
 
 
 def refitted(model: Joint, y: Array, dt: float) -> Joint:

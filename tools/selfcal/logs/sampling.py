@@ -4,7 +4,8 @@ Sample n was taken at n dt and stamped a little later; some samples have no stam
 A law says which n each stamp has; it costs the nats that write the stamps by it: the errors to one cell by the best
 histogram, the missing samples, its numbers. The cheapest law is taken. The laws:
 
-- an even grid, whose phase is followed where stamps jitter (`_phased`), or kept within the lattice (`_decoded`);
+- an even grid, whose phase is followed where stamps jitter (`_phased`), or kept within the lattice (`_within`,
+  `_exactly`);
 - steps of whole intervals that stray from each other, as those of a timer that is set anew (`_stepped`);
 - steps of any length, none of which is missing: random times, bursts of a bus, batches stamped by a nominal step. Their
   count alone is steady (`_counted`).
