@@ -90,12 +90,13 @@ class _Fit:
 @dataclass(frozen=True)
 class _Stamps:
     """Stamps float64[n], s, and which steps [n - 1] are sleeps. `lattice`: what the stamps are rounded to, s, or 0;
-    `typical`: the mean step, s."""
+    `typical`: the mean step, s; `noise`: of the lattice, s."""
 
     time: Floats
     asleep: NDArray[np.bool_]
     lattice: float
     typical: float
+    noise: float
 
     @property
     def cell(self) -> float:
@@ -131,10 +132,34 @@ class _Stamps:
     def fit(self, dt: float, missing: Places, errors: Floats, patterned: bool = True) -> _Fit:
         """A law of the interval about `dt` with its errors, s, [n] or [n - 1], and the samples missing while awake."""
         n = self.time.size
-        nats = _ln_losses((missing[1:] + 1)[~self.asleep], patterned) + _ln_values(errors, self.cell)
+        nats = _ln_losses((missing[1:] + 1)[~self.asleep], patterned) + self.ln_values(errors)
         if not self.whole(dt):
             nats += 3.0 * math.log(n) - 2.0 * math.log(math.pi)  # the lines of n pixels: about n^3 / pi^2
         return self.put_back(_Fit(dt, missing, nats))
+
+    def ln_values(self, values: Floats) -> float:
+        """Nats that write values [n] to a cell by the best histogram, of cells 2^k wide at any of some places."""
+        # Values of one lattice are not parted by its noise.
+        part = np.floor((np.sort(values - values.min()) + 4.0 * self.noise) * (_PARTS / self.cell) + 1e-6)
+        first = np.flatnonzero(np.diff(part, prepend=-1.0))
+        part, times, n = part[first], np.diff(first, append=part.size), part.size
+        best, width, top = math.inf, float(_PARTS), float(part[-1])
+        while True:
+            for shift in (*(np.arange(_PARTS) * width / _PARTS), -(top + 1.0) % width):
+                at = np.floor((part + shift) / width)
+                begin = np.flatnonzero(np.diff(at, prepend=-1.0))
+                counts = np.add.reduceat(times, begin)
+                far = np.count_nonzero(np.diff(at) > 1.0) * math.log(1.0 + top / width)
+                best = min(
+                    best,
+                    n * math.log(width / _PARTS)
+                    + float(counts @ np.log(n / counts))
+                    + far
+                    + 0.5 * counts.size * math.log(n),
+                )
+            if width > top:
+                return best
+            width *= 2.0
 
     def put_back(self, fit: _Fit) -> _Fit:
         """With the samples that are missing in the sleeps: no sleep moves the grid by more than half an interval."""
@@ -181,7 +206,7 @@ def _stamps(time: Floats, noise_s: float) -> _Stamps:
     pieces = np.linspace(0, steps.size, max(1, min(_AWAKE, steps.size // _AWAKE)) + 1).astype(int)
     awake = np.concatenate(([0.0], np.cumsum(np.where(asleep, usual, steps))))
     typical = float(np.median(np.diff(awake[pieces]) / np.diff(pieces))) or float(awake[-1]) / steps.size
-    return _Stamps(time, asleep, common_step(steps, max(4.0 * noise_s, 1e-9 * typical)), typical)
+    return _Stamps(time, asleep, common_step(steps, max(4.0 * noise_s, 1e-9 * typical)), typical, noise_s)
 
 
 def _likeliest(stamps: _Stamps, rate: float | None) -> _Fit:
@@ -238,30 +263,6 @@ def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
     return long if even or 10 * count * _AWAKE < steps.size else np.zeros_like(long)
 
 
-def _ln_values(values: Floats, cell: float) -> float:
-    """Nats that write values [n] to a cell by the best histogram, of cells 2^k wide at any of some places."""
-    part = np.floor(np.sort(values - values.min()) * (_PARTS / cell) + 1e-6)
-    first = np.flatnonzero(np.diff(part, prepend=-1.0))
-    part, times, n = part[first], np.diff(first, append=part.size), part.size
-    best, width, top = math.inf, float(_PARTS), float(part[-1])
-    while True:
-        for shift in (*(np.arange(_PARTS) * width / _PARTS), -(top + 1.0) % width):
-            at = np.floor((part + shift) / width)
-            begin = np.flatnonzero(np.diff(at, prepend=-1.0))
-            counts = np.add.reduceat(times, begin)
-            far = np.count_nonzero(np.diff(at) > 1.0) * math.log(1.0 + top / width)
-            best = min(
-                best,
-                n * math.log(width / _PARTS)
-                + float(counts @ np.log(n / counts))
-                + far
-                + 0.5 * counts.size * math.log(n),
-            )
-        if width > top:
-            return best
-        width *= 2.0
-
-
 def _ln_losses(steps: Places, patterned: bool) -> float:
     """Nats that write steps of whole intervals [m]: samples lost one by one, in runs, in runs of any length, or in a
     pattern of a few gaps, if that can be."""
@@ -308,7 +309,7 @@ def _counted(stamps: _Stamps, _: float) -> _Fit:
     dt = _slope(index, time, [cut for cut, seconds in zip(cuts, lost, strict=True) if seconds])
     missing[cuts] = np.maximum(0, np.rint(np.array(lost) / dt)).astype(np.int64)
     kept = steps[~stamps.asleep]
-    nats = _ln_values(kept, stamps.cell) + 3.0 * math.log(index.size) if kept.size else 0.0
+    nats = stamps.ln_values(kept) + 3.0 * math.log(index.size) if kept.size else 0.0
     return stamps.put_back(_Fit(dt, missing, nats))
 
 
