@@ -158,7 +158,7 @@ def test_diagnose_names_it_and_every_verb_reads_its_model(tmp_path: Path) -> Non
     stated = Model.load(model).hidden_input
     assert stated is not None
     assert set(stated.loadings) == set(NAMES)
-    assert "findings" not in diagnose(tmp_path / "log.npz", model=model, axes=["gx"])
+    assert diagnose(tmp_path / "log.npz", model=model, axes=["gx"])["findings"] == []
     assert identify(tmp_path / "log.npz", model=model, axes=["gx"])["axes"]["gx"]["adequate"] is not None
     codegen(model, tmp_path / "tables")
     simulate(model, tmp_path / "again.npz", seed=4)

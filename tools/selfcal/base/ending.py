@@ -26,6 +26,10 @@ class Stopped(Exception):
     """Raised at a point where long work may end early, for its caller to keep what is done."""
 
 
+#: Time until a signal is looked at again that came in an import, s.
+_AGAIN_S = 0.02
+
+
 class _State:
     """The signal that came while signals are held."""
 
@@ -43,9 +47,20 @@ def _on_signal(number: int, frame: FrameType | None) -> None:
     if _state.holding and _state.came is None:
         _state.came, _state.came_at = number, time.monotonic()  # a second one ends at once, whatever is held
         return
+    if _imports(frame):
+        signal.signal(signal.SIGALRM, lambda _, later: _on_signal(number, later))
+        signal.setitimer(signal.ITIMER_REAL, _AGAIN_S)
+        return
     for other in SIGNALS[1:]:
         signal.signal(other, signal.SIG_IGN)  # the end is under way: it is not to be cut short
     _end(number)
+
+
+def _imports(frame: FrameType | None) -> bool:
+    """Whether a module is being imported: libraries try their parts by a bare `except`, which would swallow the end."""
+    while frame is not None and frame.f_code.co_filename != "<frozen importlib._bootstrap>":
+        frame = frame.f_back
+    return frame is not None
 
 
 def _end(number: int) -> NoReturn:
