@@ -183,9 +183,9 @@ class Seen:
     @cached_property
     def wandering(self) -> float:
         """Evidence of the best of some slow curves, nats: what wanders goes like one, whatever channel does too."""
-        curves = np.cos(math.pi * np.outer(np.arange(1, CURVES + 1), (np.arange(self.n) + 0.5) / self.n))
-        each = zip(curves @ self.course.weights, information(self.model, self.y, curves), strict=True)
-        return max(act(score[None], known).evidence for score, known in each) - math.log(CURVES)
+        t = (np.arange(self.n) + 0.5) / self.n
+        shapes: list[Shape] = [("", (), np.cos(math.pi * half * t), math.log(CURVES)) for half in range(1, CURVES + 1)]
+        return max((one.evidence for one in _weighed(self, shapes, _scored(self, shapes))), default=0.0)
 
     @property
     def edge(self) -> int:
@@ -702,7 +702,10 @@ class Search:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
         if one.share_of(self.model.loading) <= PATTERN:
             return False
-        return one.cause in OF_TIME or (one.cause in self.channels and one.evidence < self.seen.wandering + ALIKE)
+        if one.cause in OF_TIME or one.cause not in self.channels:
+            return one.cause in OF_TIME
+        slow = max([self.seen.wandering, *(each.evidence for each in self.known["transient"])])
+        return one.evidence < slow + ALIKE
 
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. What goes like it over the axes is its own, or a channel that is looked for
