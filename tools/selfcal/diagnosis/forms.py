@@ -76,7 +76,7 @@ KEPT_LEAST = 0.3
 @dataclass(frozen=True)
 class Channel:
     """What may act: `values` [n] of the channel `column` in `unit`, about `reference` of it. `name` is that of its
-    regressors, `widths_s` of its smoothing means. `slow`: its gain must hold beside a drift of two terms. `extra`: what
+    regressors, `widths_s` of its smoothing means. `slow`: its gain must hold over all possible drifts. `extra`: what
     the estimate says of it. `ln_looks`: price of its search."""
 
     cause: str

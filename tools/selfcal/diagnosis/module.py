@@ -28,10 +28,12 @@ from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.edges import scan
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
+    WIDTHS,
     Act,
     Course,
     Joint,
     act,
+    act_apart,
     bins_of,
     bridged_rows,
     course,
@@ -186,6 +188,12 @@ class Seen:
         t = (np.arange(self.n) + 0.5) / self.n
         shapes: list[Shape] = [("", (), np.cos(math.pi * half * t), math.log(CURVES)) for half in range(1, CURVES + 1)]
         return max((one.evidence for one in _weighed(self, shapes, _scored(self, shapes))), default=0.0)
+
+    @cached_property
+    def axes(self) -> list[State]:
+        """Each axis by itself."""
+        white = np.ones(self.n)
+        return [State("", "", row, self.dt, 0.0, white).refit() for row in self.y]
 
     @property
     def edge(self) -> int:
@@ -468,12 +476,15 @@ def transients(seen: Seen) -> Iterator[Candidate]:
     shapes: list[Shape] = [("ramp", (), t - t.mean(), LN_SLOW)]
     shapes += [("turn_on", (float(one),), np.exp(-(t + seen.since_s) / one), LN_LOOKS + LN_SLOW) for one in tau]
     scored = _scored(seen, shapes)
-    found = list(_weighed(seen, shapes, scored))
-    ramp = max((one.evidence for one in found if not one.theta), default=-math.inf)
-    for one in found:
-        if one.theta and one.evidence < ramp + ALIKE:  # of what is as likely the simpler one is meant
-            continue
+    for one in _simplest(_weighed(seen, shapes, scored)):
         yield replace(one, theta=(*one.theta, NEAR_TAU)) if one.theta else one
+
+
+def _simplest(found: Iterable[Candidate]) -> list[Candidate]:
+    """Of what is as likely as a constant rate that one alone."""
+    found = list(found)
+    ramp = max((one.evidence for one in found if one.cause == "ramp"), default=-math.inf)
+    return [one for one in found if one.cause == "ramp" or one.evidence > ramp + ALIKE]
 
 
 def channels(seen: Seen) -> Iterator[Candidate]:
@@ -509,7 +520,9 @@ def _scored(seen: Seen, shapes: Sequence[Shape]) -> tuple[Array, Array, Array]:
 
 
 def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Array]) -> Iterator[Candidate]:
-    """Slow columns. Beside the best ones the drifts are fitted anew."""
+    """Slow columns. The best ones are weighed over the drifts of each axis that its record leaves possible: a law
+    alone is too sure of what a drift does over the whole record. Beside a quantity, which the axes have in common, the
+    drifts are fitted anew."""
     columns, score, known = scored
     gain = full(score, known)
     for k in np.argsort(-gain)[:REFITTED]:
@@ -517,7 +530,13 @@ def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Ar
             return
         cause, theta, _, price = shapes[k]
         plain = Candidate(cause, theta, act(score[k][None], known[k]), price, columns[k][None])
-        yield max(plain, beside(seen, plain), key=lambda one: one.evidence)
+        yield max(plain, beside(seen, plain), key=lambda one: one.evidence) if seen.model.has_f else apart(seen, plain)
+
+
+def apart(seen: Seen, one: Candidate) -> Candidate:
+    """A slow candidate over the drifts of each axis that its record leaves possible."""
+    each = [state.bayes(one.columns[0], np.array(WIDTHS)) for state in seen.axes]
+    return replace(one, act=act_apart(*map(np.array, zip(*each, strict=True))), more=0.0)
 
 
 def beside(seen: Seen, one: Candidate) -> Candidate:
@@ -567,16 +586,16 @@ def settled(seen: Seen, one: Candidate) -> Candidate:
         columns /= columns.std(axis=1)[:, None]
         score, known = columns @ found.weights, information(model, seen.y, columns)
         weight = softmax(full(score, known))
-        middle, apart = float(weight @ ln_tau), step / 3.0
-        sd = math.sqrt(float(weight @ (ln_tau - middle) ** 2) + apart**2 / 12.0)
+        middle, between = float(weight @ ln_tau), step / 3.0
+        sd = math.sqrt(float(weight @ (ln_tau - middle) ** 2) + between**2 / 12.0)
         k = int(np.argmax(weight))
         one = replace(one, theta=(math.exp(middle), sd), act=act(score[k][None], known[k]), columns=columns[k][None])
         one = _gained(seen, one, score[k][None], model, found)
         moved, tau = abs(middle - math.log(tau)), math.exp(middle)
-        if sd > apart and moved < 0.5 * sd:
+        if sd > between and moved < 0.5 * sd:
             break
-        step = apart if sd < apart and 0 < k < ln_tau.size - 1 else step
-    return one
+        step = between if sd < between and 0 < k < ln_tau.size - 1 else step
+    return one if seen.model.has_f else apart(seen, one)
 
 
 def between_levels(seen: Seen, one: Candidate) -> Candidate:
@@ -675,7 +694,7 @@ class Search:
             if found.cause in FIRMED and not any(found is one for one in firm):
                 family, firmed = FIRMED[found.cause]
                 firm.append(firmed(self.seen, found))
-                self.known[family] = [firm[-1] if one is found else one for one in self.known[family]]
+                self.known[family] = _simplest(firm[-1] if one is found else one for one in self.known[family])
                 continue
             turns -= 1
             own = self._is_own(found)

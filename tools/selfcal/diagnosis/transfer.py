@@ -329,7 +329,7 @@ def worth(state: State, one: Tried) -> float:
     """Evidence of an influence, -ln p: net of the search, and of an input's decay that any drift might have."""
     own = len(one.structure.keys)
     start = max(0.0, state.with_columns(one.columns[own:])[0]) if own < len(one.columns) else 0.0
-    gain = min(one.gain, state.rich_gain(one.columns)) - start
+    gain = min(one.gain, state.average_gain(one.columns)) - start
     return net(gain, own + len(one.structure.shape), LN_STRUCTURES + own * LN_SLOW)
 
 

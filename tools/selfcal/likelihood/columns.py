@@ -136,8 +136,8 @@ def fitted(state: State, shape: Shape) -> Tried:
 
 
 def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = SCREEN) -> dict[str, Tried]:
-    """The best shape of each form that ranks high enough, in the order of the forms. `slow`: its gain must hold beside
-    a drift of two terms."""
+    """The best shape of each form that ranks high enough, in the order of the forms. `slow`: its gain must hold over
+    the drifts that the record leaves possible."""
     shapes = [one for one in shapes if all(np.ptp(column) > 0.0 for column in one.columns)]
     if not shapes:
         return {}
@@ -162,7 +162,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
             best = fitted(state, shapes[better])
         best = between(state, best)
         if slow and best.net >= 1.0:
-            best = replace(best, gain=min(best.gain, state.rich_gain(best.shape.columns)))
+            best = replace(best, gain=min(best.gain, state.average_gain(best.shape.columns)))
         done[best.shape.form] = best
     # A form whose score alone is known is fitted by who takes it: only a finding needs that.
     return {form: done[form] for form in dict.fromkeys(one.form for one in shapes) if form in done}

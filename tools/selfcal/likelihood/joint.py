@@ -12,7 +12,7 @@ course of f, and shocks of any state come from the Kalman filter of the model an
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
@@ -453,9 +453,7 @@ class Act:
 def act(score: Array, known: Array) -> Act:
     """Of scores [p, m] of the p parts of a column, each with its information `known` [p, m, m], or all with one [m, m].
 
-    The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. Sizes are
-    normal about 0 with one width for all axes of a set, in standard deviations of each axis' own. The probability of an
-    axis is what its own readings say, whatever the others do."""
+    Sizes are normal about 0 with one width for all axes of a set, in standard deviations of each axis' own."""
     p, m = score.shape
     known = np.broadcast_to(known, (p, m, m))
     own = np.diagonal(known, axis1=1, axis2=2)
@@ -463,24 +461,17 @@ def act(score: Array, known: Array) -> Act:
     scale = shown / np.sqrt(np.where(shown, own, 1.0))
     z, R = score * scale, known * scale[:, :, None] * scale[:, None, :]
     widths = np.array(WIDTHS)
-    values, members, priors = [], [], []
-    for count in range(1, m + 1):
-        sets = np.array(list(combinations(range(m), count)))
+
+    def ln_bf(sets: NDArray[np.intp]) -> Array:
+        count = sets.shape[1]
         rho = R[:, sets[:, :, None], sets[:, None, :]]
         firm = rho + np.eye(count) / widths[:, None, None, None, None] ** 2
         x = np.broadcast_to(z[:, sets, None], (widths.size, p, len(sets), count, 1))
         explained = 0.5 * (x * np.linalg.solve(firm, x)).sum(axis=(1, 3, 4))
         volume = np.linalg.slogdet(firm)[1].sum(axis=1) + 2.0 * p * count * np.log(widths)[:, None]
-        ln_bf = logsumexp(explained - 0.5 * volume, axis=0) - math.log(widths.size)
-        values.append(ln_bf)
-        priors.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
-        one = np.zeros((len(sets), m))
-        np.put_along_axis(one, sets, 1.0, axis=1)
-        members.append(one)
-    ln_bf = np.concatenate(values)
-    total = float(logsumexp(ln_bf + np.concatenate(priors)))
-    member = np.vstack(members)
-    probability = softmax(ln_bf + LN_ODDS * member.sum(axis=1)) @ member
+        return np.asarray(logsumexp(explained - 0.5 * volume, axis=0) - math.log(widths.size))
+
+    total, probability = _over_sets(m, ln_bf)
     held = np.flatnonzero((probability >= 0.5) & shown.all(axis=0))
     size, sd = np.zeros((p, m)), np.full(m, math.inf)
     if held.size:
@@ -488,3 +479,32 @@ def act(score: Array, known: Array) -> Act:
         size[:, held] = np.einsum("pj,pjk->pk", score[:, held], inverse)
         sd[held] = np.sqrt(np.diag(inverse[0]))
     return Act(total, probability, size, sd)
+
+
+def act_apart(ln_bf: Array, size: Array, sd: Array) -> Act:
+    """Of a column on axes whose drifts have nothing in common, by the ln Bayes factors [m, widths] of each alone, its
+    size and that one's standard deviation [m]."""
+    total, probability = _over_sets(
+        size.size, lambda sets: np.asarray(logsumexp(ln_bf[sets].sum(axis=1), axis=1)) - math.log(len(WIDTHS))
+    )
+    held = probability >= 0.5
+    return Act(total, probability, np.where(held, size, 0.0)[None], np.where(held, sd, math.inf))
+
+
+def _over_sets(m: int, ln_bf: Callable[[NDArray[np.intp]], Array]) -> tuple[float, Array]:
+    """Evidence of a column on some of m axes, and the probability [m] of each, by ln Bayes factors [s] of sets of axes
+    [s, count].
+
+    The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. The
+    probability of an axis is what its own readings say, whatever the others do."""
+    values, members, priors = [], [], []
+    for count in range(1, m + 1):
+        sets = np.array(list(combinations(range(m), count)))
+        values.append(ln_bf(sets))
+        priors.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
+        one = np.zeros((len(sets), m))
+        np.put_along_axis(one, sets, 1.0, axis=1)
+        members.append(one)
+    worth, member = np.concatenate(values), np.vstack(members)
+    total = float(logsumexp(worth + np.concatenate(priors)))
+    return total, np.asarray(softmax(worth + LN_ODDS * member.sum(axis=1)) @ member)

@@ -9,7 +9,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import chdtrc, ndtr
+from scipy.special import chdtrc, logsumexp, ndtr, softmax
 
 from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
@@ -199,6 +199,40 @@ class State:
         places = [np.swapaxes(np.array([each[i] for each in found]), 0, 1) for i in (1, 2)]
         return np.exp(value - value.max()), places[0], places[1]
 
+    def averaged(self, more: Array) -> tuple[Array, Array, Array]:
+        """Gains [a] of ln likelihood by further columns [k, n] at every near drift, one of two terms, and their
+        parameters; ln of the share of the record's likelihood without them that each stands for; and the last column's
+        coefficients and variances there [a, 2]."""
+        none = np.empty((0, more.shape[1]))
+        rich = [] if self.extras.flicker else [self.rich]
+        before = [
+            ln_share + _ln_marginal(next(self.sums(one.terms, theta, [none])))
+            for one, theta, ln_share in (*self.drifts(), *_nodes(self.series, rich))
+        ]
+        gains, shares, sizes = [], [], []
+        for one, theta, ln_share in self.possible(more, rich=True):
+            less, sums = self.sums(one.terms, theta, [none, more])
+            c, inverse, rss = sums.coefficients()
+            gains.append(max(0.0, ln_likelihood(sums) - ln_likelihood(less)))
+            shares.append(ln_share + _ln_marginal(less))
+            sizes.append((float(c[-1]), rss / sums.n * float(inverse[-1, -1])))
+        return np.array(gains), np.array(shares) - logsumexp(before), np.array(sizes)
+
+    def average_gain(self, more: Array) -> float:
+        """Gain by further columns [k, n] averaged over the drifts that the record leaves possible: one that is known
+        from few of its own turns makes nats of any slow column."""
+        gains, ln_share, _ = self.averaged(more)
+        return float(logsumexp(gains + ln_share))
+
+    def bayes(self, column: Array, widths: Array) -> tuple[Array, float, float]:
+        """ln Bayes factors [w] of a column [n], its size normal about 0 with a width [w] in its standard deviations;
+        and its size beside all drifts with its deviation."""
+        gains, ln_share, sizes = self.averaged(column[None])
+        each = (ln_share + gains)[:, None] - gains[:, None] / (1.0 + widths**2) - 0.5 * np.log1p(widths**2)
+        weight, (mean, variance) = softmax(each.max(axis=1)), sizes.T
+        size = float(weight @ mean)
+        return np.asarray(logsumexp(each, axis=0)), size, math.sqrt(float(weight @ (variance + (mean - size) ** 2)))
+
     def sums(self, terms: Terms, theta: Array, blocks: Sequence[Array]) -> Iterator[Sums]:
         """Of the model with each of the blocks [k, n] of further columns: one pass for many of them."""
         known = range(2 + len(self.regressors))
@@ -231,14 +265,6 @@ class State:
         terms = replace(self.extras, walk=True, markov=True)
         return fit(self.series, terms, moved(self.best, terms))
 
-    def rich_gain(self, more: Array) -> float:
-        """The same gain beside a drift of two terms: a poor drift model makes some nats of any slow column. 1/f noise
-        has several terms by itself."""
-        if self.extras.flicker:
-            return math.inf
-        after = refit(self.series.beside(more), self.rich)
-        return after.ln_likelihood - max(self.rich.ln_likelihood, self.best.ln_likelihood)
-
     def scores(self, blocks: Sequence[Array], at: Fit | None = None) -> Array:
         """Gain [b] of each block [k, n] of further columns with the drift of a fit, by default of the best: a bound
         from below for what they gain with it refitted. One pass for many of them."""
@@ -257,6 +283,11 @@ def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, fl
     for one in fits:
         for theta, ln_share in nodes(series, one):
             yield one, theta, ln_share
+
+
+def _ln_marginal(sums: Sums) -> float:
+    """ln likelihood at the best sigma, over coefficients with a flat prior."""
+    return ln_likelihood(sums) + 0.5 * float(np.linalg.slogdet(sums.coefficients()[1])[1])
 
 
 def gain_for(worth: Callable[[float], float]) -> float:

@@ -22,7 +22,7 @@ from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array, M
 
 #: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
 TURNS_LEAST, BAND_TURNS = 1.5, 3.0
-#: A line of fewer turns is as slow as a drift: its gain must hold beside one of two terms, and its search costs more.
+#: A line of fewer turns is as slow as a drift: its gain must hold over all possible drifts, and its search costs more.
 SLOW_TURNS = 30.0
 #: Two axes know the frequency of one line to so many turns in the record: nearer ones share a column.
 SAME = 0.25
