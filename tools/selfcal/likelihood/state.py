@@ -199,16 +199,22 @@ class State:
         places = [np.swapaxes(np.array([each[i] for each in found]), 0, 1) for i in (1, 2)]
         return np.exp(value - value.max()), places[0], places[1]
 
+    @cached_property
+    def ln_marginal(self) -> float:
+        """ln likelihood of the record over every near drift, one of two terms, and their parameters."""
+        none = np.empty((0, self.y.size))
+        rich = [] if self.extras.flicker else [self.rich]
+        each = [
+            ln_share + _ln_marginal(next(self.sums(one.terms, theta, [none])))
+            for one, theta, ln_share in (*self.drifts(), *_nodes(self.series, rich))
+        ]
+        return float(logsumexp(each))
+
     def averaged(self, more: Array) -> tuple[Array, Array, Array]:
         """Gains [a] of ln likelihood by further columns [k, n] at every near drift, one of two terms, and their
         parameters; ln of the share of the record's likelihood without them that each stands for; and the last column's
         coefficients and variances there [a, 2]."""
         none = np.empty((0, more.shape[1]))
-        rich = [] if self.extras.flicker else [self.rich]
-        before = [
-            ln_share + _ln_marginal(next(self.sums(one.terms, theta, [none])))
-            for one, theta, ln_share in (*self.drifts(), *_nodes(self.series, rich))
-        ]
         gains, shares, sizes = [], [], []
         for one, theta, ln_share in self.possible(more, rich=True):
             less, sums = self.sums(one.terms, theta, [none, more])
@@ -216,7 +222,7 @@ class State:
             gains.append(max(0.0, ln_likelihood(sums) - ln_likelihood(less)))
             shares.append(ln_share + _ln_marginal(less))
             sizes.append((float(c[-1]), rss / sums.n * float(inverse[-1, -1])))
-        return np.array(gains), np.array(shares) - logsumexp(before), np.array(sizes)
+        return np.array(gains), np.array(shares) - self.ln_marginal, np.array(sizes)
 
     def average_gain(self, more: Array) -> float:
         """Gain by further columns [k, n] averaged over the drifts that the record leaves possible: one that is known
