@@ -36,8 +36,8 @@ ALIKE = 3.0
 SCREEN = 2.0
 #: Columns that one pass of the filter takes beside the model's.
 ABREAST = 8
-#: Means of a record that are enough for a first search.
-MEANS_MOST = 3000
+#: Means of a record that are enough for a first search; the longest in which a slow column is whole, s.
+MEANS_MOST, SLOW_S = 3000, 1.0
 
 
 #: No term beside white noise and the drift.
@@ -200,6 +200,16 @@ class State:
         return np.exp(value - value.max()), places[0], places[1]
 
     @cached_property
+    def slow(self) -> tuple[State, int]:
+        """The axis in means of up to `SLOW_S`, in which all of a slow column is, and the samples of a mean."""
+        series, block = self.means(SLOW_S)
+        if block == 1:
+            return self, 1
+        columns = [replace(one, values=mean) for one, mean in zip(self.regressors, series.columns[1:], strict=True)]
+        means = replace(self, y=series.y, dt=series.dt, r=series.r, block=block * self.block, fits=())
+        return means.refit(regressors=tuple(columns)), block
+
+    @cached_property
     def ln_marginal(self) -> float:
         """ln likelihood of the record over every near drift, one of two terms, and their parameters."""
         none = np.empty((0, self.y.size))
@@ -225,9 +235,10 @@ class State:
         return np.array(gains), np.array(shares) - self.ln_marginal, np.array(sizes)
 
     def average_gain(self, more: Array) -> float:
-        """Gain by further columns [k, n] averaged over the drifts that the record leaves possible: one that is known
-        from few of its own turns makes nats of any slow column."""
-        gains, ln_share, _ = self.averaged(more)
+        """Gain by further slow columns [k, n] averaged over the drifts that the record leaves possible: one that is
+        known from few of its own turns makes nats of any slow column."""
+        slow, block = self.slow
+        gains, ln_share, _ = slow.averaged(more[:, : slow.y.size * block].reshape(len(more), -1, block).mean(axis=2))
         return float(logsumexp(gains + ln_share))
 
     def bayes(self, column: Array, widths: Array) -> tuple[Array, float, float]:
