@@ -25,10 +25,11 @@ from selfcal.batch.spread import Row, spread
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.studies.methods.problem import Problem
-from selfcal.studies.rivals import ensemble, measured
+from selfcal.studies.rivals import measured
 from selfcal.verbs.montecarlo import montecarlo
 from selfcal.verbs.navigate import navigate
 from selfcal.verbs.paper import paper
+from selfcal.verbs.rivals import rivals
 from selfcal.verbs.worth import worth
 
 from conftest import COMMAND, case_records
@@ -59,7 +60,7 @@ def test_rows_of_unequal_keys_are_read_back_as_they_were(tmp_path: Path) -> None
 #: A verb with --results at its smallest, by name.
 STUDIES: dict[str, Callable[[Path, Path], object]] = {
     "montecarlo": lambda file, kept: montecarlo(records=3, duration_s=60.0, json=file, results=kept),
-    "rivals": lambda file, kept: ensemble(2, samples=(60,), only=("ml", "whittle"), json=file, results=kept),
+    "rivals": lambda file, kept: rivals(records=2, samples=(60,), only=("ml", "whittle"), json=file, results=kept),
     "worth": lambda file, kept: worth(records=2, json=file, results=kept),
     "navigate": lambda file, kept: navigate(records=2, json=file, results=kept),
     "paper": lambda file, kept: paper(file, records=2, results=kept),

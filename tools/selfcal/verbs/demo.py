@@ -24,7 +24,6 @@ def demo(
     how to watch.
 
     On a pseudo-terminal the module's time stands still while nobody has its channel open, and hosts may come and go.
-    `node`: its number on its bus. `model`: file of the module's model.
     With `transport` can it goes on by itself, on the CAN device `channel` or over UDP within this machine.
     """
     import shlex

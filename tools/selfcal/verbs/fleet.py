@@ -58,19 +58,12 @@ def fleet(
     gate: shared.Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
-    """Identify every recording of the batch and write the table `output`, .csv or .parquet.
+    """Identify every recording of the batch and write the table `output`.
 
-    `patterns`: files, or patterns as 'logs/**/*.ulg'. `serial_from`: 'name', the file's; 'name:PATTERN', what a regular
-    expression finds in the path; 'field', the recording's metadata. `units_table`: a CSV of file, device, station, lot
-    and date. `diagnose`: the causes too. `fail_on`: see fail_on.py; a cause needs `diagnose`.
-    `limits`: a file of limits (verdicts.py), `junit` and `verdicts`: the files of their verdicts.
-    `workers`: processes here, one for each processor by default; `scheduler`: a Dask scheduler's address instead.
-    `results`: the folder that keeps finished recordings, OUTPUT.parts by default: a run that was stopped goes on, and a
-    changed file is done anew. The other options are those of `identify`, for each recording.
+    A cause as `fail_on` needs `diagnose`. By `results` a run that was stopped goes on, and a changed file is done anew.
     Returns the document `selfcal.fleet/1`, and writes it to `json`: by device what failed, what could not be judged,
     and the exit `code`; the `population`, each unit's estimates by it, and the units `unlike` it.
-    `report`: the page to write. With `diagnose`, devices that need a look have an own page in `report`.units.
-    `write_model`: the model file with the batch's priors (batch/prior_file.py).
+    With `diagnose`, devices that need a look have an own page in `report`.units.
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
     from functools import partial

@@ -30,10 +30,7 @@ def paper(
 ) -> list[Reproduction]:
     """Write the page to `output`; returns its figures.
 
-    `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
-    so and a line says so too. `records`: of each law in Figs 1 and 2, 500 in the paper. `scheduler`, `results`: as for
-    `montecarlo`. `tracks`: a folder for the map errors of Section 4.2, a recording a track. All seeds follow from
-    `seed`.
+    Where the real recordings are absent, their figures and a line say so. All seeds follow from `seed`.
     """
     from selfcal.base.output import check_writable, write_text
     from selfcal.base.progress import bar

@@ -49,11 +49,8 @@ def tumble(
 ) -> dict[str, Any]:
     """Calibrate the accelerometers and gyros of a part by its rests in several positions and the turns between them.
 
-    `logs`: one recording, or a sequence of one a position, in order of time. `model`: the part's own model file: its
-    law, noise and range; without one the law is of a rest of 20 min in the log, else the default model's prior.
-    `latitude`, `height`, `gravity`: see `calibration/earth.py`. `output`: the YAML file; `export`: a format of
-    `tumble_export.py` and its file; `plot`: a picture of the residuals. `start_s`, `end_s`: the stretch to look at, s.
-    `fail_on`: `inadequate`; it is only checked here.
+    Several `logs` are in order of time. `model`: the part's own law, noise and range; without one the law is of a rest
+    of 20 min in the log, else the default model's prior. `fail_on` is only checked here.
     Returns the document `selfcal.tumble/1` and writes it to `json`; gyros without an answer have an `error` there.
     Raises UserError for what the user can put right: fewer than three rests, a place that is none, logs that are not of
     accelerometers.
