@@ -137,7 +137,6 @@ class Ensemble:
             rows = spread(
                 partial(rows_of, self.model, self.axis, tuple(self.wishes), samples),
                 self.seeds,
-                settings={},
                 scheduler=self.scheduler,
             )
             self.at[samples] = np.array([row["metrics"] for row in rows], np.float64)
@@ -211,7 +210,6 @@ def cycling(
             rows = spread(
                 partial(coefficient_rows, replace(model, regressors=(regressor,)), axis, samples, cycles, swing),
                 seeds,
-                settings={},
                 scheduler=scheduler,
             )
             # The information of a swing is as its square: each record's own swing by the one that it had.

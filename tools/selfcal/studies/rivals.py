@@ -114,7 +114,6 @@ class Ensemble:
             "model": settings_of(self.model),
             "samples": list(self.samples),
             "rivals": [rival.name for rival in chosen],
-            "records": self.records if len(self.samples) > 1 else None,  # more of one length may be added
         }
         rows = spread(
             partial(rows_of, self.model, self.axis, self.truth, chosen),

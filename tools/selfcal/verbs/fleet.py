@@ -67,6 +67,7 @@ def fleet(
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
     from functools import partial
+    from operator import itemgetter
 
     import selfcal
     from selfcal.base.output import check_writable, write_json
@@ -75,8 +76,8 @@ def fleet(
     from selfcal.batch.fleet import document_with, judged_units
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
-    from selfcal.batch.spread import spread
-    from selfcal.batch.unit_record import KILLED, ByContent, Options, Verbs, examined, own_pages, settings_of
+    from selfcal.batch.spread import Kept, spread
+    from selfcal.batch.unit_record import KILLED, Options, Verbs, examined, own_pages, settings_of
     from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
     from selfcal.batch.verdicts import Limits, check_options, write
     from selfcal.model.file import Model
@@ -108,15 +109,14 @@ def fleet(
         {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
     )
     version = str(selfcal.__version__)
-    keeper = ByContent(folder, settings_of(options, model_settings_of(loaded), version))
+    kept = Kept(folder, settings_of(options, model_settings_of(loaded), version), key=itemgetter(1))  # its content
     sources = [source for source in named.sources if not source.copy_of]
     records = spread(
         partial(examined, verbs, options),
         [(str(Path(source.path).absolute()), source.content) for source in sources],
-        settings={},
         piece=1,
         scheduler=scheduler,
-        results=keeper,
+        results=kept,
         count=workers,
         lost=lambda _: [{"error": KILLED}],
         weights=[source.size + 1.0 for source in sources],
@@ -143,7 +143,7 @@ def fleet(
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
         pages: dict[str, str] = {}
         if diagnose:
-            pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, keeper, workers)
+            pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, kept, workers)
         write_page(report, document, summary, pages)
     return document
 

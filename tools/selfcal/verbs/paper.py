@@ -34,7 +34,7 @@ def paper(
     """
     from selfcal.base.output import check_writable, write_text
     from selfcal.base.progress import bar
-    from selfcal.batch.spread import check_results, record_seeds
+    from selfcal.batch.spread import record_seeds
     from selfcal.model.file import Model
     from selfcal.studies.paper import DATA, EXPLAINED, page, with_reason
     from selfcal.studies.paper_figures import section3, section4, survey
@@ -42,7 +42,6 @@ def paper(
     from selfcal.verbs.diagnose import diagnose
 
     check_writable(output)
-    check_results(results)
     seeds = record_seeds(records, seed)
     folder = DATA if data is None else Path(data)
     if data is not None and not folder.is_dir():
