@@ -1,8 +1,10 @@
-"""Values on an even grid: runs of a mask and of equal values, counts of pieces, block means, noise of differences."""
+"""Values on an even grid: runs of a mask and of equal values, counts of pieces, block means, noise of differences; and
+the place where a condition begins to hold."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,14 @@ Rows = NDArray[np.int64]
 
 #: Median absolute deviation of a normal with the standard deviation 1.
 MEDIAN_SD = 0.6745
+
+
+def bisected(holds: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """The ends of a span, halved 40 times, from where something does not hold to where it does."""
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return low, high
 
 
 def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:

@@ -10,7 +10,6 @@ import re
 import textwrap
 from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 
 from cantools.database.can import Database, Message
@@ -19,8 +18,7 @@ from jinja2 import Template
 
 from selfcal.base.errors import UserError
 from selfcal.base.templates import of_code
-from selfcal.base.units import parameter_unit
-from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, dbc
+from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, dbc
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
@@ -125,43 +123,16 @@ def fields(message: Message) -> list[Field]:
     return sorted(members, key=lambda field: (field.item, field.start))
 
 
-#: Members that are alike in all axis messages: everything but unit and comment.
-_shape = attrgetter("name", "item", "start", "length", "kind", "scale")
-
-
 def _first(database: Database, suffix: str) -> Message:
     return database.get_message_by_name(AXES[0].upper() + suffix)
 
 
-def check(database: Database) -> None:
-    """Raise UserError unless the messages of all axes and hypotheses are alike, have the identifiers that C works out,
-    and are in the units of their axes."""
+def header(database: Database) -> str:
+    """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack: messages of other axes
+    and hypotheses are made from the first one's (dbc_file.py)."""
     columns = [field.item for field in fields(_first(database, "_COEFFICIENTS"))]
     if columns != list(range(3 * COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
-    suffixes = [*OF_AXIS, *(f"_H{k}" for k in range(1, HYPOTHESES))]
-    for index, axis in enumerate(AXES):
-        for suffix in suffixes:
-            pattern = _first(database, "_H0" if suffix.startswith("_H") else suffix)
-            message = database.get_message_by_name(axis.upper() + suffix)
-            k = int(suffix[2:]) if suffix.startswith("_H") else None
-            if message.frame_id != pattern.frame_id + (index if k is None else HYPOTHESES * index + k):
-                raise UserError(f"selfcal.dbc: {message.name}: identifier {message.frame_id:#x} is out of line")
-            mine = fields(message)
-            if [_shape(field) for field in mine] != [_shape(field) for field in fields(pattern)]:
-                raise UserError(f"selfcal.dbc: {message.name}: differs from {pattern.name}")
-            for field in mine:
-                parameter = "bias" if field.name.startswith("bias_") else field.name.partition("_")[0]
-                if parameter not in ("bias", PLACE_NAMES[0]) or field.name.endswith("_flags"):
-                    continue
-                unit = parameter_unit(parameter, AXIS_UNITS[axis])
-                if field.unit != unit:
-                    raise UserError(f"selfcal.dbc: {message.name}.{field.name}: unit '{field.unit}', not '{unit}'")
-
-
-def header(database: Database) -> str:
-    """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
-    check(database)
     status, corrected, command, answer, tumble = map(
         database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE)
     )
@@ -190,7 +161,6 @@ def _choices(message: Message) -> list[tuple[str, int, str]]:
 
 def table(database: Database) -> str:
     """Every signal of every message for lib/WIRE.md, as Markdown lists."""
-    check(database)
     status, command = map(database.get_message_by_name, (STATUS, COMMAND))
     messages: list[tuple[str, str, list[Field], dict[str, str]]] = []
     for suffix in OF_AXIS:
