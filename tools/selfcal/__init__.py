@@ -48,8 +48,8 @@ def __getattr__(name: str) -> Any:
         globals()[name] = _plain(import_module(f"selfcal.verbs.{name}"), name)
         return globals()[name]
     if name in _OTHERS:
-        found = getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
-        return found if isinstance(found, type) else _in_python(found)
+        other = getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
+        return other if isinstance(other, type) else _in_python(other)
     if name in _BUILDS:
         globals()[name] = import_module(f"selfcal.{name}{_newer(name)}")
         return globals()[name]

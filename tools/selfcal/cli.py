@@ -98,7 +98,7 @@ def _parameter(own: Parameter, meant: Option) -> Parameter:
 
 def _parsed(hint: Any) -> Any:
     """What a parameter's hint is on a command line: a path of a path or a text, a list of a sequence."""
-    kinds = [one for one in get_args(hint) if one is not NoneType] if isinstance(hint, UnionType) else [hint]
+    kinds = [kind for kind in get_args(hint) if kind is not NoneType] if isinstance(hint, UnionType) else [hint]
     kind = Path if Path in kinds else kinds[0]
     return list[get_args(kind)[0]] if get_origin(kind) is Sequence else kind  # type: ignore[misc]
 
@@ -153,7 +153,7 @@ def _fail(message: str) -> NoReturn:
 
 def _check_once(options: Sequence[Any], arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice and takes one value: typer would drop the first without a word."""
-    given = [one.split("=", 1)[0] for one in takewhile(lambda one: one != "--", arguments)]
+    given = [word.split("=", 1)[0] for word in takewhile(lambda word: word != "--", arguments)]
     for option in options:
         times = sum(given.count(name) for name in option.opts if name.startswith("-"))
         if times > 1 and not getattr(option, "multiple", True) and not getattr(option, "is_flag", True):

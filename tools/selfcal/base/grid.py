@@ -4,7 +4,8 @@ the place where a condition begins to hold."""
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from itertools import accumulate, pairwise, starmap
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,17 @@ def bisected(holds: Callable[[float], bool], low: float, high: float) -> tuple[f
         middle = 0.5 * (low + high)
         low, high = (low, middle) if holds(middle) else (middle, high)
     return low, high
+
+
+def slices(sizes: Sequence[int]) -> list[slice]:
+    """Slices of so many entries each, one behind the other."""
+    return list(starmap(slice, pairwise(accumulate(sizes, initial=0))))
+
+
+def weighted_quantiles(values: Array, weight: Array, p: Sequence[float]) -> Array:
+    """Quantiles `p` of `values` [n] in ascending order, each of which stands for the middle of its `weight` [n]."""
+    total = np.cumsum(weight)
+    return np.interp(p, (total - 0.5 * weight) / total[-1], values)
 
 
 def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:

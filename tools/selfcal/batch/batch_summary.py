@@ -36,7 +36,7 @@ from selfcal.model.regressors import coefficient_unit, offered
 OTHER_LAW = 12.0
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Most devices that a line names.
+#: Most devices that a line or a list names, and that have a page of their own.
 MOST_NAMED = 20
 #: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.base.errors import UserError, first_line
+from selfcal.batch.batch_summary import MOST_NAMED
 from selfcal.batch.spread import Job, Kept, Row, spread
 from selfcal.batch.unit_table import Unit
 from selfcal.readings.tests import TESTS
@@ -24,8 +25,7 @@ DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
-#: Most devices with a page of their own, and the characters that its name lacks.
-MOST_PAGES = 20
+#: Characters that the name of a device's page lacks.
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 #: Error of a recording whose workers die.
 KILLED = "its worker process was killed each time, maybe for want of memory"
@@ -96,14 +96,14 @@ def own_pages(
     kept: Kept,
     count: int | None,
 ) -> dict[str, str]:
-    """Write the page of `diagnose` of the last recording of each device, MOST_PAGES at most, into `folder`.
+    """Write the page of `diagnose` of the last recording of each device, MOST_NAMED at most, into `folder`.
 
     A page that is there of the same recording and options is not made anew. Returns where each is from the folder
     above."""
     pages = Path(folder)
     pages.mkdir(exist_ok=True)
     jobs = {}
-    for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_PAGES]:
+    for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_NAMED]:
         source = devices[name][-1].source
         digest = kept.place([(source.path, source.content)]).stem[:12]
         jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{digest}.html"))

@@ -214,7 +214,7 @@ def _response(
     for wish in wishes:
         if wish.parameter not in sizes or not wish.text.endswith("%"):
             raise UserError(f"--want '{wish.text}': with --response takes 'gain within 5 %' and 'lag within 20 %'")
-    found = designed(model, axis, experiment, wishes, record_seeds(min(records, DRAWN), seed), scheduler)
+    design = designed(model, axis, experiment, wishes, record_seeds(min(records, DRAWN), seed), scheduler)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "model": str(model.path),
@@ -224,11 +224,11 @@ def _response(
         "rate_hz": model.bank_rate_hz,
         "levels": [low, high],
         "wishes": [wish.text for wish in wishes],
-        **found,
+        **design,
     }
-    if found["duration_s"] is not None:
-        at, points = experiment.set_points(found["bit_s"], found["duration_s"])
-        rows = [*zip(at.tolist(), points.tolist(), strict=True), (found["duration_s"], float(points[-1]))]
+    if design["duration_s"] is not None:
+        at, points = experiment.set_points(design["bit_s"], design["duration_s"])
+        rows = [*zip(at.tolist(), points.tolist(), strict=True), (design["duration_s"], float(points[-1]))]
         document["set_points"] = [{"time_s": time_s, "value": value} for time_s, value in rows]
         if drive is not None:
             text = "".join(f"{time_s:.10g},{value:.10g}\n" for time_s, value in rows)

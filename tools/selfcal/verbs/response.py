@@ -87,7 +87,7 @@ def response(
     inputs = {name: inputs_of(recording, record, name) for name in names}
     state = record.axes[output]
     # The model file may state an input's influence: it is the question here.
-    state = state.refit(regressors=tuple(one for one in state.regressors if one.entry.get("column") not in names))
+    state = state.refit(regressors=tuple(known for known in state.regressors if known.entry.get("column") not in names))
     parts = [
         {
             "input": {

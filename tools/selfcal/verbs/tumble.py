@@ -14,9 +14,6 @@ from selfcal.verbs._shared import End, Json, ModelFile, Start, to_stderr
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
 
-#: Logs at most: a log a position.
-MOST_LOGS = 200
-
 
 def tumble(
     logs: Annotated[
@@ -59,7 +56,7 @@ def tumble(
     from selfcal.batch.fail_on import INADEQUATE
     from selfcal.calibration import accelerometer, gyroscope
     from selfcal.calibration.earth import place
-    from selfcal.calibration.rests import tumble_of
+    from selfcal.calibration.rests import MOST, tumble_of
     from selfcal.calibration.tumble_document import document_of
     from selfcal.calibration.tumble_export import FORMS, write
     from selfcal.calibration.tumble_show import plot as picture
@@ -67,8 +64,8 @@ def tumble(
     from selfcal.model.file import Model
 
     each = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
-    if not 1 <= len(each) <= MOST_LOGS:
-        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST_LOGS} at most")
+    if not 1 <= len(each) <= MOST:
+        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST} at most")
     files = [path for log in each for path in list_of(log)]
     check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
     check_picture(plot)
@@ -79,10 +76,10 @@ def tumble(
     where = place(latitude, height, gravity)
     loaded = Model.load(model)
     recordings = [load(log, sensors=loaded.sensors, **reading).between(start_s, end_s) for log in each]
-    found = tumble_of(recordings, loaded, part_stated=model is not None)
-    accel = accelerometer.calibrate(found, where)
+    tumbled = tumble_of(recordings, loaded, part_stated=model is not None)
+    accel = accelerometer.calibrate(tumbled, where)
     gyro, failed = None, None
-    if found.has_gyro:
+    if tumbled.has_gyro:
         try:
             gyro = gyroscope.calibrate(accel)
         except UserError as error:

@@ -420,9 +420,9 @@ class Decoder:
         self.statistics.lost = self._sent - self.statistics.received
         if "time_ms" in values:
             # A report may have been begun, and a corrected sample read, 5 min before what was sent before it.
-            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else 300_000)
+            begun_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else 300_000)
         else:
-            told_ms = self._begun(second)
+            begun_ms = self._begun(second)
         if name == STATUS:
             self._take_status(values)
             return self.flush()
@@ -441,7 +441,7 @@ class Decoder:
             return self.flush()
         order = _order(kind, item)
         named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
-        return self._assemble(kind.axis, order, jump, second, told_ms / 1000.0, named)
+        return self._assemble(kind.axis, order, jump, second, begun_ms / 1000.0, named)
 
     def _refused(self) -> list[AxisReport]:
         self.statistics.refused += 1
