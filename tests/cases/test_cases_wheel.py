@@ -24,7 +24,7 @@ import pytest
 import selfcal
 from selfcal.logs.loaders import FORMATS
 from selfcal.wire import package_codegen
-from selfcal.wire.demo import SHIPPED
+from selfcal.wire.frames import SHIPPED
 
 from conftest import CASE_RECORDS, ROOT
 

@@ -60,7 +60,7 @@ def replay(
     from selfcal.show.results import Identification
     from selfcal.wire.frames import names_of
     from selfcal.wire.on_wire import places, sent
-    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, check_sent, document_of, run
+    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, document_of, run
 
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
@@ -77,7 +77,6 @@ def replay(
     loaded_model = Model.load(model)
     say_once(loaded_model.left_out)
     known = None if start is None else load_start(start, loaded_model)
-    check_sent(loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = recording.later(since_power_on_s).between(start_s, end_s)
     known_s = recording.start_s

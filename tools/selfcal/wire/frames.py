@@ -45,6 +45,8 @@ RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is
 #: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
 TREE = Path(__file__).resolve().parents[1] / "tree"
 ROOT = TREE if TREE.is_dir() else TREE.parents[2]
+#: The recording that ships.
+SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
 
 
 @lru_cache(maxsize=1)

@@ -5,7 +5,6 @@ python -m selfcal.wire.frames_codegen    write lib/selfcal.dbc, lib/selfcal_fram
 
 from __future__ import annotations
 
-import argparse
 import re
 import textwrap
 from dataclasses import dataclass
@@ -89,16 +88,14 @@ def _meaning(signal: Signal) -> str:
 
 
 def _field(message: Message, signal: Signal) -> Field:
-    where = f"{message.name}.{signal.name}"
-    items = signal.multiplexer_ids
-    if signal.multiplexer_signal != "item" or items is None or len(items) != 1:
-        raise UserError(f"selfcal.dbc: {where}: must belong to one item")
-    if signal.byte_order != "little_endian" or signal.start + signal.length > 32:
-        raise UserError(f"selfcal.dbc: {where}: must be little-endian and within bits 0 to 31")
-    if signal.is_float and (signal.start, signal.length) != (0, 32):
-        raise UserError(f"selfcal.dbc: {where}: a float must fill bits 0 to 31")
-    if signal.conversion.offset != 0:
-        raise UserError(f"selfcal.dbc: {where}: an offset is not supported")
+    items = signal.multiplexer_ids or []
+    within = signal.byte_order == "little_endian" and signal.start + signal.length <= 32
+    whole = not signal.is_float or (signal.start, signal.length) == (0, 32)
+    if signal.multiplexer_signal != "item" or len(items) != 1 or not within or not whole or signal.offset:
+        wanted = (
+            "C packs what is of one item, little-endian within bits 0 to 31, which a float fills, without an offset"
+        )
+        raise UserError(f"selfcal.dbc: {message.name}.{signal.name}: {wanted}")
     return Field(
         name=signal.name,
         item=items[0],
@@ -196,18 +193,8 @@ def page(text: str, database: Database) -> str:
     return head + mark + "\n" + table(database)
 
 
-def main() -> None:
-    """Write DBC file, header and page."""
-    parser = argparse.ArgumentParser(prog="python -m selfcal.wire.frames_codegen", description=__doc__)
-    parser.parse_args()
-    try:
-        wire = ROOT / "lib" / "WIRE.md"
-        (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")  # first: the others are made from it
-        wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
-        (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
-    except UserError as error:
-        parser.exit(2, f"selfcal: error: {error}\n")
-
-
 if __name__ == "__main__":
-    main()
+    wire = ROOT / "lib" / "WIRE.md"
+    (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")  # first: the others are made from it
+    wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
+    (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
