@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import re
 import textwrap
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -24,8 +23,6 @@ from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTI
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 #: Messages of an axis, by what follows its name, and the name of their items in C; alike for all axes.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
-#: Messages that modules send.
-SENT = ("", "_H0", "_COEFFICIENTS", "_ADEQUACY")
 #: Headings of lib/WIRE.md, by what follows an axis's name or by message.
 HEADINGS = {
     "": "Axis",
@@ -43,36 +40,20 @@ MARK = "<!-- The rest is generated: python -m selfcal.wire.frames_codegen -->\n"
 LATER = re.compile(r"c[1-9]_")
 
 
-@dataclass(frozen=True)
-class Field:
-    """One signal of an item: bits `start` to `start + length - 1` of the 32-bit value."""
+def _bits(signal: Signal) -> str:
+    """Where a signal lies, if it does not fill the value."""
+    if signal.length == 32:
+        return ""
+    last = signal.start + signal.length - 1
+    return f", bit {last}" if signal.length == 1 else f", bits {signal.start} to {last}"
 
-    name: str
-    item: int
-    start: int
-    length: int
-    kind: str  # uint, int or float
-    scale: float
-    unit: str
-    meaning: str
 
-    @property
-    def macro(self) -> str:
-        """Name in C, less the prefix."""
-        return self.name.upper()
+def _kind(signal: Signal) -> str:
+    return f"{'float' if signal.is_float else 'int' if signal.is_signed else 'uint'}{signal.length}"
 
-    @property
-    def shape(self) -> str:
-        """Kind, scale and bits in words."""
-        return f"{self.kind}{self.length}" + (f" × {self.scale:g}" if self.scale != 1.0 else "") + self.bits
 
-    @property
-    def bits(self) -> str:
-        """Where it lies, if it does not fill the value."""
-        if self.length == 32:
-            return ""
-        last = self.start + self.length - 1
-        return f", bit {last}" if self.length == 1 else f", bits {self.start} to {last}"
+def _item(signal: Signal) -> int:
+    return (signal.multiplexer_ids or [-1])[0]
 
 
 def _as_elsewhere(signal: Signal) -> bool:
@@ -87,37 +68,22 @@ def _meaning(signal: Signal) -> str:
     return (signal.comment or "").rstrip(".") + (f": {words}" if words else "")
 
 
-def _field(message: Message, signal: Signal) -> Field:
-    items = signal.multiplexer_ids or []
-    within = signal.byte_order == "little_endian" and signal.start + signal.length <= 32
-    whole = not signal.is_float or (signal.start, signal.length) == (0, 32)
-    if signal.multiplexer_signal != "item" or len(items) != 1 or not within or not whole or signal.offset:
-        wanted = (
-            "C packs what is of one item, little-endian within bits 0 to 31, which a float fills, without an offset"
-        )
-        raise UserError(f"selfcal.dbc: {message.name}.{signal.name}: {wanted}")
-    return Field(
-        name=signal.name,
-        item=items[0],
-        start=signal.start,
-        length=signal.length,
-        kind="float" if signal.is_float else "int" if signal.is_signed else "uint",
-        scale=float(signal.conversion.scale),
-        unit=signal.unit or "",
-        meaning=_meaning(signal),
-    )
-
-
-def fields(message: Message) -> list[Field]:
-    """The item fields of a message, by item and bit. Raises UserError where the DBC leaves the common layout."""
+def fields(message: Message) -> list[Signal]:
+    """The items' signals of a message, by item and bit. Raises UserError where the DBC leaves the common layout."""
     if message.length != 8 or message.is_extended_frame or message.frame_id > 0x7FF:
         raise UserError(f"selfcal.dbc: {message.name}: must have 8 bytes and a standard id")
     for name, bits in COMMON.items():
         signal = message.get_signal_by_name(name)
         if (signal.start, signal.length) != bits or signal.is_signed or signal.byte_order != "little_endian":
             raise UserError(f"selfcal.dbc: {message.name}.{name}: must be bits {bits[0]} to {sum(bits) - 1}, unsigned")
-    members = [_field(message, signal) for signal in message.signals if signal.name not in COMMON]
-    return sorted(members, key=lambda field: (field.item, field.start))
+    members = [signal for signal in message.signals if signal.name not in COMMON]
+    for signal in members:
+        within = signal.byte_order == "little_endian" and signal.start + signal.length <= 32
+        whole = not signal.is_float or (signal.start, signal.length) == (0, 32)
+        if signal.multiplexer_signal != "item" or len(signal.multiplexer_ids or ()) != 1 or not (within and whole):
+            wanted = "C packs what is of one item, little-endian within bits 0 to 31, which a float fills"
+            raise UserError(f"selfcal.dbc: {message.name}.{signal.name}: {wanted}")
+    return sorted(members, key=lambda signal: (_item(signal), signal.start))
 
 
 def _first(database: Database, suffix: str) -> Message:
@@ -127,7 +93,7 @@ def _first(database: Database, suffix: str) -> Message:
 def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack: messages of other axes
     and hypotheses are made from the first one's (dbc_file.py)."""
-    columns = [field.item for field in fields(_first(database, "_COEFFICIENTS"))]
+    columns = [_item(signal) for signal in fields(_first(database, "_COEFFICIENTS"))]
     if columns != list(range(3 * COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
     status, corrected, command, answer, tumble = map(
@@ -135,12 +101,12 @@ def header(database: Database) -> str:
     )
     values = {
         "version": int(database.version or 0),
-        "of_axis": {OF_AXIS[suffix]: _first(database, suffix) for suffix in SENT},
+        "of_axis": {name: _first(database, suffix) for suffix, name in OF_AXIS.items()},
         "of_node": [status, corrected],
         "command": command,
         "of_host": [answer, tumble],
-        "members_of": lambda message: [field for field in fields(message) if not LATER.match(field.name)],
-        "later_of": lambda message: any(LATER.match(field.name) for field in fields(message)),
+        "members_of": lambda message: [signal for signal in fields(message) if not LATER.match(signal.name)],
+        "later_of": lambda message: any(LATER.match(signal.name) for signal in fields(message)),
         "choices_of": _choices,
         "COMMON": COMMON,
         **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES},
@@ -159,12 +125,12 @@ def _choices(message: Message) -> list[tuple[str, int, str]]:
 def table(database: Database) -> str:
     """Every signal of every message for lib/WIRE.md, as Markdown lists."""
     status, command = map(database.get_message_by_name, (STATUS, COMMAND))
-    messages: list[tuple[str, str, list[Field], dict[str, str]]] = []
+    messages: list[tuple[str, str, list[Signal], dict[str, str | None]]] = []
     for suffix in OF_AXIS:
         first, *_, last = of_axes = [database.get_message_by_name(axis.upper() + suffix) for axis in AXES]
         ids = ", ".join(f"`0x{message.frame_id:X}` {message.name}" for message in of_axes)
         more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
-        units = {field.name: field.unit for field in fields(last)}
+        units = {signal.name: signal.unit for signal in fields(last)}
         messages.append((HEADINGS[suffix], ids + more, fields(first), units))
     for message in map(database.get_message_by_name, (STATUS, CORRECTED, ANSWER, TUMBLE)):
         messages.append((HEADINGS[message.name], f"`0x{message.frame_id:X}` {message.name}", fields(message), {}))
@@ -181,6 +147,7 @@ def table(database: Database) -> str:
 def _template(name: str) -> Template:
     templates = of_code(Path(__file__).parent / "templates")
     wrap = partial(textwrap.fill, width=120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    templates.filters |= {"bits": _bits, "kind": _kind, "item": _item, "meaning": _meaning}
     templates.filters |= {"entry": lambda text: wrap(f"- {text}"), "wrapped": partial(textwrap.fill, width=120)}
     return templates.get_template(name)
 
