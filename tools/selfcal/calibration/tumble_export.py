@@ -132,11 +132,12 @@ def _head(mark: str, whole: Whole) -> str:
 def _c(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
     """A header of constants."""
     whole = _whole(accel, gyro, document)
-
+    numbers = {"accel_bias": whole.bias, "accel_matrix": whole.matrix}
+    if whole.gyro is not None:
+        gyro_bias, turned, G = whole.gyro
+        numbers |= {"gyro_bias": gyro_bias, "gyro_matrix": turned, "gyro_g": G / STANDARD_GRAVITY}
     template = of_code(Path(__file__).parent / "templates").get_template("calibration.h.jinja")
-    return template.render(
-        whole=whole, remark=remark, G=None if whole.gyro is None else whole.gyro[2] / STANDARD_GRAVITY
-    )
+    return template.render(lines=whole.lines, numbers={name: values.tolist() for name, values in numbers.items()})
 
 
 def _lower(matrix: Array) -> tuple[Array, Array]:
