@@ -32,18 +32,15 @@ def slices(sizes: Sequence[int]) -> list[slice]:
     return list(starmap(slice, pairwise(accumulate(sizes, initial=0))))
 
 
-def weighted_quantiles(values: Array, weight: Array, p: Sequence[float]) -> Array:
+def weighted_quantiles(values: Array, weight: NDArray[Any], p: Sequence[float]) -> Array:
     """Quantiles `p` of `values` [n] in ascending order, each of which stands for the middle of its `weight` [n]."""
     total = np.cumsum(weight)
     return np.interp(p, (total - 0.5 * weight) / total[-1], values)
 
 
-def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:
-    """First row and the row after the last of every run of true values of a mask [n]. Runs with a gap of at most
-    `apart` rows join."""
+def runs(mask: Mask) -> list[tuple[int, int]]:
+    """First row and the row after the last of every run of true values of a mask [n]."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    near = 2 * np.flatnonzero(edges[2::2] - edges[1:-1:2] <= apart) + 1
-    edges = np.delete(edges, np.concatenate([near, near + 1]))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 

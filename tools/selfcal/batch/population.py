@@ -130,7 +130,7 @@ def _on_grid(y: Array, s: Array, sides: NDArray[np.bool_]) -> tuple[Array, Array
 
 def _tail(weight: Array, off: Array) -> Array:
     """ln of the two-sided probability [...] of being `off` [..., p] standard deviations away, over weighted spreads."""
-    return np.minimum(math.log(2.0) + logsumexp(log_ndtr(-np.abs(off)), axis=-1, b=weight), 0.0)
+    return np.asarray(np.minimum(math.log(2.0) + logsumexp(log_ndtr(-np.abs(off)), axis=-1, b=weight), 0.0))
 
 
 @dataclass(frozen=True)
