@@ -133,7 +133,7 @@ def held(model: Model, lengths: tuple[int, ...], units: int, seed: int) -> dict[
     for _ in range(units):
         for length in lengths:
             y, bias, truth = a_unit(random, length)
-            bank = Bank(tables, coarse=True)
+            bank = Bank(tables, build="_coarse")
             bank.push(y[:, None])
             report = bank.report(0)
             error = report.bias_mean - bias

@@ -41,7 +41,7 @@ def test_the_likelihood_is_that_of_the_weighted_record(with_time: bool) -> None:
     t = np.cumsum(missing + 1.0)
     y = 0.3 + 1e-4 * t * with_time + 0.05 * rng.standard_normal(n) + np.cumsum(2e-3 * rng.standard_normal(n))
     made = tables(half_life, replace(MODEL, regressors=(TIME,) if with_time else ()))
-    bank = Bank(made, double=True)
+    bank = Bank(made, build="_library64")
     bank.push(y[:, None], missing.astype(np.uint64), t[:, None] if with_time else None)
     y = y.astype(np.float32).astype(float)
     sd = np.array([made.axes[0].bias_sd, TIME.sd["gyro"]])[: 1 + with_time]
@@ -65,7 +65,7 @@ def test_float_and_integers_forget_as_double_does(fixed: bool) -> None:
     truth = draw(MODEL.group_of("gx"), "gauss_markov", np.random.default_rng(3))
     y = simulate_bank_samples("gauss_markov", truth, 1.0, 300_000, 3)[0][:, None]
     made = tables(60.0)
-    bank, exact = Bank(made, fixed=fixed), Bank(made, double=True)
+    bank, exact = Bank(made, build="_fixed" if fixed else "_library32"), Bank(made, build="_library64")
     for one in (bank, exact):
         one.push(y)
     _, probability, mean, _ = worst_difference(bank.report(0), exact.report(0))
@@ -107,7 +107,7 @@ def test_nothing_is_forgotten_within_a_short_record() -> None:
     """A half-life of 10^6 records: the same as without, to what a 10^-6 th part of n ln V can do."""
     truth = draw(MODEL.group_of("gx"), "random_walk", np.random.default_rng(2))
     y = simulate_bank_samples("random_walk", truth, 1.0, 1000, 2)[0][:, None]
-    banks = Bank(tables(1e9), double=True), Bank(tables(0.0), double=True)
+    banks = Bank(tables(1e9), build="_library64"), Bank(tables(0.0), build="_library64")
     for bank in banks:
         bank.push(y)
     assert max(worst_difference(*(bank.report(0) for bank in banks))) < 1e-2
@@ -137,9 +137,9 @@ def test_a_snapshot_in_between_changes_nothing() -> None:
         bank = Bank(tables(100.0))
         bank.push(y[:cut])
         restored = Bank(tables(100.0))
-        restored.restore(bank.save())
+        restored.raw.restore(bank.raw.save())
         restored.push(y[cut:])
-        assert restored.save() == whole.save()
+        assert restored.raw.save() == whole.raw.save()
 
 
 def test_bad_half_lives_are_refused(tmp_path: Path) -> None:

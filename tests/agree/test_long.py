@@ -51,7 +51,7 @@ def test_float_holds_at_any_length(law: str) -> None:
     """|dP| <= 1e-3 and means within 0.02 sd of the double build: the design's tolerances, at 3 10^6; `make soak`:
     10^8."""
     tables = make_tables(MODEL, 1.0, ("gx",), "cortex-m4f")
-    banks = [Bank(tables), Bank(tables, double=True)]
+    banks = [Bank(tables), Bank(tables, build="_library64")]
     state = 0.0
     for seed, length in chunks(LENGTH[law]):
         y, state = piece(seed, length, law, state)
@@ -67,7 +67,7 @@ def test_float_holds_at_any_length(law: str) -> None:
 def test_fixed_point_holds_at_its_stated_length(law: str) -> None:
     """|dP| <= 5e-3 and means within 0.05 sd of the double build, and nothing had to be rescaled."""
     tables = make_tables(MODEL, 1.0, ("gx",), "cortex-m0")
-    banks = [Bank(tables, fixed=True), Bank(tables, double=True)]
+    banks = [Bank(tables, build="_fixed"), Bank(tables, build="_library64")]
     y, _ = piece(0, 1_000_000, law, 0.0)
     for bank in banks:
         bank.push(y[:, None])
@@ -88,7 +88,7 @@ def test_fixed_point_holds_at_the_bound(half_period: int) -> None:
     tables = make_tables(MODEL, 1.0, ("gx",), "cortex-m0")
     rng = np.random.default_rng(5)
     noise = (0.04 * rng.standard_normal(16)).astype(np.float32)
-    banks = [Bank(tables, fixed=True), Bank(tables, double=True)]
+    banks = [Bank(tables, build="_fixed"), Bank(tables, build="_library64")]
     for bank in banks:
         bank.push(noise[:, None])
     banks[0].raw.node(0, 0)  # runs the batch
@@ -115,7 +115,7 @@ def test_double_against_the_textbook_at_a_million() -> None:
     """|d ln p| <= 1e-3 at equal nodes: every 20th of the M4F's."""
     n = 1_000_000
     y, _ = piece(0, n, "gauss_markov", 0.0)
-    bank = Bank(make_tables(MODEL, 1.0, ("gx",), "cortex-m4f"), double=True)
+    bank = Bank(make_tables(MODEL, 1.0, ("gx",), "cortex-m4f"), build="_library64")
     bank.push(y[:, None])
     worst = 0.0
     offset = float(y.mean())
@@ -151,7 +151,7 @@ def test_no_reading_makes_a_step_coarser_than_codegen_says(most: float, period: 
     tables = dataclasses.replace(tables, axes=(axis,))
     bound = coarsest_exponent(axis, tables.dt_s)
     swing = axis.range * np.where(np.arange(64) // period % 2 == 0, 1.0, -1.0) * (1.0 - 1e-6)
-    bank = Bank(tables, fixed=True)
+    bank = Bank(tables, build="_fixed")
     bank.push(swing.astype(np.float32)[:, None])
     bank.raw.node(0, 0)  # runs the batches
     found = bank.raw.scale(0)["exponent"]

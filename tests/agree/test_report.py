@@ -106,7 +106,7 @@ def test_report_by_the_cells_of_a_module(law: str, n: int, seed: int) -> None:
     """Against dense nodes and cells, within the design's bound. In the first record alpha's upper limit cuts the
     posterior: with 16 rows, of which one held it, a mean was 0.32 sd and an sd 31 % off."""
     y = a_record(law, n, seed)[0]
-    bank = Bank(tables_of(MODEL), coarse=True)
+    bank = Bank(tables_of(MODEL), build="_coarse")
     push(bank, y)
     evidence, _, mean, sd = worst_difference(bank.report(0), exact_report(y, tables_of(MODEL)))
     print(f"\n{law} n={n}: d ln evidence {evidence:.3f}, d mean {mean:.3f} sd, sd {100 * sd:.1f} %")
@@ -393,7 +393,7 @@ def test_report_of_what_no_one_spectrum_tells(what: str) -> None:
             y, z = a_record(law, 10_000, seed, gaps=what == "stretches", columns=columns)
             if what == "scattered":
                 y[1:][np.random.default_rng(seed).random(len(y) - 1) < MISSING] = np.nan
-            judge, bank = Bank(dense(tables), dense=True), Bank(tables)
+            judge, bank = Bank(dense(tables), build="_dense"), Bank(tables)
             for each in (judge, bank):
                 push(each, y, z)
             mask = (1 << columns) - 1
@@ -418,7 +418,7 @@ def test_report_of_noise_that_varies(what: str) -> None:
     for seed, step in enumerate((0.01, 0.001, 0.012)):  # K is up to 0.02 in the prior
         rng = np.random.default_rng([n, seed])
         drift = np.cumsum(step * rng.normal(size=n))
-        banks = judge, *others = Bank(dense(coarse), dense=True), Bank(coarse), Bank(fine)
+        banks = judge, *others = Bank(dense(coarse), build="_dense"), Bank(coarse), Bank(fine)
         if parts:
             y = np.repeat(drift, block) + 0.05 * math.sqrt(block) * rng.normal(size=block * n)
             gone = rng.random((n, block)) < parts
@@ -500,10 +500,10 @@ def test_the_flag_of_a_cortex_m0_tells_what_its_nodes_bear() -> None:
     recording = load(ROOT / "tests" / "data" / "simulated_adis16405.npz")
     y = np.column_stack([recording.in_unit(axis, MODEL.group_of(axis).unit) for axis in MODEL.axes])
     block = round(recording.rate_hz)
-    bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), fixed=True)
+    bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), build="_fixed")
     bank.push(y[: len(y) // block * block].reshape(-1, block, len(MODEL.axes)).mean(axis=1))
     for index, axis in enumerate(MODEL.axes):
-        judge = Bank(dense(tables_of(MODEL, axis=axis)), dense=True)
+        judge = Bank(dense(tables_of(MODEL, axis=axis)), build="_dense")
         push(judge, y[: len(y) // block * block, index].reshape(-1, block).mean(axis=1))
         exact = judge.report(0)
         evidence, _, mean, sd = worst_difference(bank.report(index), exact)
@@ -527,10 +527,10 @@ def test_the_nodes_of_a_cortex_m0_over_20_minutes(tmp_path: Path) -> None:
         y = np.column_stack([recording.in_unit(axis, MODEL.group_of(axis).unit) for axis in MODEL.axes])
         block = round(recording.rate_hz)
         y = y[: len(y) // block * block].reshape(-1, block, len(MODEL.axes)).mean(axis=1)
-        bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), fixed=True)
+        bank = Bank(make_tables(MODEL, 1.0, None, "cortex-m0"), build="_fixed")
         bank.push(y)
         for index, axis in enumerate(MODEL.axes):
-            judge = Bank(dense(tables_of(MODEL, axis=axis)), dense=True)
+            judge = Bank(dense(tables_of(MODEL, axis=axis)), build="_dense")
             push(judge, y[:, index].astype(np.float32).astype(np.float64))
             _, probability, mean, _ = worst_difference(bank.report(index), judge.report(0))
             print(f"{seed} {axis}: dP {probability:.1e}, mean {mean:.1e} sd")
@@ -540,6 +540,6 @@ def test_the_nodes_of_a_cortex_m0_over_20_minutes(tmp_path: Path) -> None:
 
 def test_the_small_model_takes_12_kb() -> None:
     """Six axes in integers, as on a Cortex-M0; what the nodes cost is in `tolerances.py --only targets`."""
-    bank = Bank(make_tables(MODEL, 1.0, None, SMALL), fixed=True)
+    bank = Bank(make_tables(MODEL, 1.0, None, SMALL), build="_fixed")
     assert len(MODEL.axes) == 6
     assert bank.raw.size <= 12 * 1024

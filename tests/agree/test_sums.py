@@ -114,7 +114,7 @@ def test_walk_and_markov_by_brute_force() -> None:
         y, _ = simulate_bank_samples("random_walk", {"N": 0.084, "K": 0.02, "bias": 0.5}, 1.0, n, seed=seed)
         estimates = []
         for coarse in (False, True):  # the host's cells, and a module's
-            bank = Bank(tables("host", only="walk_and_markov"), coarse=coarse)
+            bank = Bank(tables("host", only="walk_and_markov"), build="_coarse" if coarse else "_library32")
             push(bank, y)
             entry = next(h for h in bank.raw.report(0)["hypotheses"] if h["probability"] > 0.5)
             estimates.append(entry["parameters"][PLACES["N"]])
@@ -160,7 +160,7 @@ def test_drift_that_nearly_hides_the_white_noise(
     too large here, unflagged; with 16 cells a row, most of them where little is, a module's mean of N was 0.33 sd off.
     """
     y, _ = simulate_bank_samples(law, truth, 1.0, n, seed=seed)
-    bank = Bank(tables("host", only=law), coarse=coarse)
+    bank = Bank(tables("host", only=law), build="_coarse" if coarse else "_library32")
     push(bank, y)
     entry = next(h for h in bank.raw.report(0)["hypotheses"] if h["probability"] > 0.5)
     right = identify_axis(y, 1.0, GROUP, {law: 1.0}).parameters[law]
@@ -189,11 +189,11 @@ def test_a_restored_bank_goes_on_bit_for_bit(build: str) -> None:
     y, _ = a_record("flicker", 250, 3, gaps=True)
     banks = [a_bank(made, build) for _ in range(2)]
     push(banks[0], y[:131])
-    banks[1].restore(banks[0].save())
+    banks[1].raw.restore(banks[0].raw.save())
     for bank in banks:
         push(bank, y[131:])
         assert bank.raw.sound
-    assert banks[0].save() == banks[1].save()
+    assert banks[0].raw.save() == banks[1].raw.save()
     assert banks[0].report(0) == banks[1].report(0)
 
 

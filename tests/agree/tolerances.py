@@ -250,12 +250,12 @@ def targets(n: int, seeds: int) -> list[Row]:
     found: dict[tuple[str, str], list[list[float]]] = {}
     bytes_of = {}
     for source, y in (*(six_axes(n, seed) for seed in range(14 * seeds)), *recorded(n)):
-        banks = {target: Bank(tables[target], fixed=fixed[target]) for target in tables}
+        banks = {target: Bank(tables[target], build="_fixed" if fixed[target] else "_library32") for target in tables}
         for target, bank in banks.items():
             bank.push(y)
             bytes_of[target] = bank.raw.size
         for index, axis in enumerate(MODEL.axes):
-            judge = Bank(dense_nodes(tables_of(MODEL, axis=axis)), dense=True)
+            judge = Bank(dense_nodes(tables_of(MODEL, axis=axis)), build="_dense")
             push(judge, y[:, index].astype(np.float32).astype(np.float64))
             exact = judge.report(0)
             for target, bank in banks.items():

@@ -61,7 +61,7 @@ def test_no_target_loses_a_law_in_a_million_samples(law: str, seed: int) -> None
     exact = truth.report(0)
     assert not dropped(truth, y)
     for target in TARGETS:
-        bank = Bank(tables_of(MODEL, target), fixed="m0" in target)
+        bank = Bank(tables_of(MODEL, target), build="_fixed" if "m0" in target else "_library32")
         push(bank, y)
         assert not dropped(bank, y), target
         off = [abs(p - exact.probability[name]) for name, p in bank.report(0).probability.items()]
@@ -84,7 +84,7 @@ def test_a_walk_may_stand_for_a_drift_between_the_nodes() -> None:
     """Of all nodes of the small model one of the walk is the likeliest, and Gauss-Markov drew the record. The process
     supposed was that walk, whose lines could not take off its slow part: a law at -inf and another with P = 1."""
     y, _ = a_record("gauss_markov", 10**6, 7)
-    bank = Bank(tables_of(MODEL, "cortex-m0-small"), fixed=True)
+    bank = Bank(tables_of(MODEL, "cortex-m0-small"), build="_fixed")
     push(bank, y)
     assert bank.report(0).probability["gauss_markov"] > 0.99
 

@@ -149,7 +149,7 @@ def test_means_of_blocks_read_the_swing() -> None:
     random = np.random.default_rng(469)
     samples = noise(random, "walk", 10_000, 10.0) + Swing(30.0, 0.1, 0.05).drawn(random, 10_000, 10.0)
     y = samples.reshape(-1, 10).mean(axis=1).astype(np.float32).astype(np.float64)
-    bank = Bank(made, double=True)
+    bank = Bank(made, build="_library64")
     bank.push(np.repeat(y, 10)[:, None], np.zeros(10 * y.size, np.uint32), None)
     nodes, sigma = Nodes.of(bank, 3), 0.04
     rho, ratio = nodes.rho, nodes.alpha

@@ -24,7 +24,7 @@ import pytest
 import selfcal
 from selfcal.logs.loaders import FORMATS
 from selfcal.wire import package_codegen
-from selfcal.wire.demo import SHIPPED
+from selfcal.wire.frames import SHIPPED
 
 from conftest import CASE_RECORDS, ROOT
 
@@ -105,7 +105,7 @@ for name in ("default", "sums"):
     bank = Bank(make_tables(Model.load(DEFAULT.with_name(f"{name}.yaml")), 10.0, ("gx", "ay"), bank_rate_hz=10.0))
     noise = np.random.default_rng(3).normal(size=(2, 4000, 2))
     bank.push(0.02 * noise[0] + 1e-3 * np.cumsum(noise[1], axis=0))
-    print(_library32.__name__, hashlib.sha256(bank.save()).hexdigest(), bank.report(0), bank.report(1))
+    print(_library32.__name__, hashlib.sha256(bank.raw.save()).hexdigest(), bank.report(0), bank.report(1))
 from selfcal.likelihood.fit import Series, finish, passed, shifts, slopes
 from selfcal.likelihood.statemodel import Terms
 noise = np.random.default_rng(4).normal(size=(3, 1500))

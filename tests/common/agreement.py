@@ -108,13 +108,17 @@ def on_nodes(tables: Tables, alone: int, pair: tuple[int, int]) -> Tables:
 
 
 def dense(tables: Tables) -> Tables:
-    """The same on so many nodes that theirs no longer counts; for Bank(dense=True)."""
+    """The same on so many nodes that theirs no longer counts; for Bank(build="_dense")."""
     return on_nodes(tables, DENSE, DENSE_PAIR)
+
+
+#: Compiled modules, by the names of LIMITS's builds.
+BUILDS = {"float": "_library32", "double": "_library64", "fixed": "_fixed"}
 
 
 def a_bank(tables: Tables, build: str) -> Bank:
     """A bank of one of LIMITS's builds."""
-    return Bank(tables, double=build == "double", fixed=build == "fixed")
+    return Bank(tables, build=BUILDS[build])
 
 
 def push(bank: Bank, y: Floats, z: Floats | None = None) -> None:
@@ -316,7 +320,7 @@ def hold(what: str, found: Sequence[dict[str, Agreement]]) -> None:
 
 def exact_report(y: Floats, tables: Tables) -> AxisResult:
     """The report on dense nodes in double."""
-    bank = Bank(dense(tables), dense=True)
+    bank = Bank(dense(tables), build="_dense")
     push(bank, y)
     return bank.report(0)
 

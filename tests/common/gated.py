@@ -25,7 +25,7 @@ class Gated:
         tables = make_tables(model, rate_hz, axes, target)
         self.learning = learning_gate(model, tables)
         self.gate = self.learning.gate
-        self.bank = Bank(tables, coarse=target != "host")
+        self.bank = Bank(tables, build="_library32" if target == "host" else "_coarse")
         self.resting = False
         self.used: list[bool] = []
 

@@ -162,7 +162,7 @@ def test_nodes_have_the_likelihood_and_the_bias_of_averaged_samples(law: str, bl
     """500 means, in the double build: what is left is the float that a pushed sample is, 2e-4 nat."""
     dt, n, of = 2.0, 500 if block == 50 else 100, GROUP.laws[law]
     y = Dense.of(of, 0.05, 0.02, SECOND[law], dt, block, n).draw(block)
-    bank = Bank(tables_of(law, dt, block), double=True)
+    bank = Bank(tables_of(law, dt, block), build="_library64")
     bank.push(np.repeat(y, block)[:, None])
     grid = bank.tables.hypotheses[0]
     nodes = grid.rho.nodes * (grid.alpha.nodes if grid.alpha else 1)
@@ -203,7 +203,7 @@ def test_nodes_have_the_likelihood_of_means_that_lack_readings(law: str, most: f
     left = np.random.default_rng(block).integers((block + 1) // 2, block + 1, n)
     left[np.arange(0, n, 3)] = left[-1] = block
     y = Dense.of(of, 0.02, 0.02, SECOND[law], dt, block, n, left).draw(block)
-    bank = Bank(tables_of(law, dt, block), double=True)
+    bank = Bank(tables_of(law, dt, block), build="_library64")
     lost = np.zeros(int(left.sum()), np.int64)
     lost[np.cumsum(left)[:-1]] = block - left[:-1]
     bank.push(np.repeat(y, left)[:, None], lost)

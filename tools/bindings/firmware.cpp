@@ -16,6 +16,7 @@
 
 extern "C" {
 #include "app.h"
+#include "command.h"
 #include "replay.h"
 const firmware_model_t *firmware_model;
 }
@@ -153,4 +154,10 @@ NB_MODULE(_firmware, m) {
              nb::arg().none(), nb::arg().none(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg(), nb::arg())
         .def("play", &Module::play)
         .def_prop_ro("ended", &Module::ended);
+    m.def("crc12",
+          [](const nb::bytes &data) { return selfcal_crc12(static_cast<const uint8_t *>(data.data()), data.size()); });
+    m.def("siphash", [](uint64_t low, uint64_t high, uint64_t message) {
+        const uint64_t key[2] = {low, high};
+        return command_siphash(key, message);
+    });
 }

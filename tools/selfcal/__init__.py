@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import builtins
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from difflib import get_close_matches
 from functools import wraps
 from importlib import import_module
@@ -48,8 +48,8 @@ def __getattr__(name: str) -> Any:
         globals()[name] = _plain(import_module(f"selfcal.verbs.{name}"), name)
         return globals()[name]
     if name in _OTHERS:
-        found = getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
-        return found if isinstance(found, type) else _in_python(found)
+        other = getattr(import_module(f"selfcal.{_OTHERS[name]}"), name)
+        return other if isinstance(other, type) else _in_python(other)
     if name in _BUILDS:
         globals()[name] = import_module(f"selfcal.{name}{_newer(name)}")
         return globals()[name]
@@ -67,25 +67,43 @@ class Names(dict[str, Any]):
         return getattr(builtins, name, Any)
 
 
-def _plain(module: Any, name: str) -> Callable[..., Any]:
-    """A verb whose signature has the types alone, without the options of the command line, and each keyword."""
+def keywords(module: Any, name: str) -> Iterator[tuple[Any, Any]]:
+    """Each keyword of a verb, annotated with its type alone, and its option of the command line or None."""
     from inspect import Parameter, signature
     from typing import Annotated, get_args, get_origin, get_type_hints
 
-    verb = getattr(module, name)
-    shown = []
-    for one in signature(verb).parameters.values():
-        hint = eval(one.annotation, {}, Names(vars(module)))  # our own source
-        if one.kind is not Parameter.VAR_KEYWORD:
-            of = get_args(hint)[0] if get_origin(hint) is Annotated else one.annotation
-            shown.append(one.replace(annotation=of))
-            continue
-        for key, of in get_type_hints(get_args(hint)[0]).items():
-            shown.append(Parameter(key, Parameter.KEYWORD_ONLY, default=None, annotation=of))
+    for parameter in signature(getattr(module, name)).parameters.values():
+        hint = eval(parameter.annotation, {}, Names(vars(module)))  # our own source, not a user's
+        hints = {parameter: hint}
+        if parameter.kind is Parameter.VAR_KEYWORD:  # Unpack[TypedDict]: each of its keys is a keyword
+            each = get_type_hints(get_args(hint)[0], include_extras=True)
+            hints = {Parameter(key, Parameter.KEYWORD_ONLY, default=None): of for key, of in each.items()}
+        for own, of in hints.items():
+            kind, *options = get_args(of) if get_origin(of) is Annotated else (of,)
+            yield own.replace(annotation=kind), options[0] if options else None
 
+
+def _plain(module: Any, name: str) -> Callable[..., Any]:
+    """A verb whose signature has the types alone, without the options of the command line, and each keyword. Its
+    docstring ends with what the command's help says of each."""
+    from inspect import cleandoc, signature
+    from textwrap import fill
+
+    from selfcal.base.errors import in_python
+
+    verb = getattr(module, name)
+    known = list(keywords(module, name))
     call = _in_python(verb)
+    shown = [parameter for parameter, _ in known]
     call.__signature__ = signature(verb).replace(parameters=shown)  # type: ignore[attr-defined]
     call.__module__ = __name__
+    words = [cleandoc(str(verb.__doc__)), ""]
+    for parameter, option in known:
+        if option is not None:
+            typed = f" ({option.names[-1]})" if option.names else ""
+            said = f"{parameter.name}{typed}: {in_python(option.help)}"
+            words.append(fill(said, 120, subsequent_indent="    "))
+    call.__doc__ = "\n".join(words)
     return call
 
 

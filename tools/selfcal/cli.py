@@ -10,11 +10,11 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib import import_module
-from inspect import Parameter, Signature, signature
+from inspect import Parameter, Signature
 from itertools import takewhile
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Annotated, Any, NoReturn, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, NoReturn, get_args, get_origin
 
 import typer
 from typer.core import TyperGroup
@@ -58,22 +58,12 @@ def _first_line(path: Path) -> str:
 def _command(name: str) -> Any:
     """The command of a verb, by the annotations of its function."""
     module = import_module(f"selfcal.verbs.{name}")
-    verb = getattr(module, name)
     options: dict[str, tuple[Option, Any]] = {}
     parameters = []
-    for own in signature(verb).parameters.values():
-        hint = own.annotation
-        if isinstance(hint, str):  # `from __future__ import annotations`; our own source, not a user's
-            hint = eval(hint, {}, selfcal.Names(vars(module)))
-        fields = {own.name: (hint, own.default)}
-        if own.kind is Parameter.VAR_KEYWORD:  # Unpack[TypedDict]: each of its keys is an option
-            fields = {key: (one, None) for key, one in get_type_hints(get_args(hint)[0], include_extras=True).items()}
-        for key, (kind, default) in fields.items():
-            of, *more = get_args(kind) if get_origin(kind) is Annotated else (kind,)
-            meant = next((one for one in more if isinstance(one, Option)), None)
-            if meant is not None:
-                parameters.append(_parameter(key, of, default, meant))
-                options[key] = meant, parameters[-1].default
+    for own, meant in selfcal.keywords(module, name):
+        if meant is not None:
+            parameters.append(_parameter(own, meant))
+            options[own.name] = meant, parameters[-1].default
 
     def run(**parsed: Any) -> None:
         given = {}
@@ -81,34 +71,34 @@ def _command(name: str) -> Any:
             meant, unset = options[key]
             if value not in (unset, []):  # what is not typed keeps the function's default
                 given[key] = meant.made(value) if meant.made is not None else value
-        answer = verb(**given)
+        answer = getattr(module, name)(**given)
         sys.exit(module.show(answer, given) or 0 if hasattr(module, "show") else 0)
 
     run.__doc__ = f"{_first_line(selfcal.VERBS[name])}."
     run.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
-    run.__annotations__ = {one.name: one.annotation for one in parameters}
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     alone = typer.Typer(pretty_exceptions_enable=False, rich_markup_mode=None, add_completion=False)
     alone.command(name)(run)
     return typer.main.get_command(alone)
 
 
-def _parameter(key: str, hint: Any, default: Any, meant: Option) -> Parameter:
+def _parameter(own: Parameter, meant: Option) -> Parameter:
     """A parameter as typer takes it: the type that is parsed, and the default that the help shows."""
-    kind = meant.kind or _parsed(hint)
+    kind, default = meant.kind or _parsed(own.annotation), own.default
     if default == () or (meant.made is not None and default is not Parameter.empty):
         default = False if kind is bool else None
     more = dict(meant.more)
     default = more.pop("default", default)
-    names = meant.names if meant.names or meant.argument else (f"--{key.replace('_', '-')}",)
+    names = meant.names if meant.names or meant.argument else (f"--{own.name.replace('_', '-')}",)
     info = typer.Argument if meant.argument else typer.Option
     shown = info(*names, metavar=meant.metavar, help=meant.help, **more)
     optional = kind if default is not None else kind | None
-    return Parameter(key, Parameter.KEYWORD_ONLY, annotation=Annotated[optional, shown], default=default)
+    return Parameter(own.name, Parameter.KEYWORD_ONLY, annotation=Annotated[optional, shown], default=default)
 
 
 def _parsed(hint: Any) -> Any:
     """What a parameter's hint is on a command line: a path of a path or a text, a list of a sequence."""
-    kinds = [one for one in get_args(hint) if one is not NoneType] if isinstance(hint, UnionType) else [hint]
+    kinds = [kind for kind in get_args(hint) if kind is not NoneType] if isinstance(hint, UnionType) else [hint]
     kind = Path if Path in kinds else kinds[0]
     return list[get_args(kind)[0]] if get_origin(kind) is Sequence else kind  # type: ignore[misc]
 
@@ -163,7 +153,7 @@ def _fail(message: str) -> NoReturn:
 
 def _check_once(options: Sequence[Any], arguments: Sequence[str]) -> None:
     """Refuse an option that is given twice and takes one value: typer would drop the first without a word."""
-    given = [one.split("=", 1)[0] for one in takewhile(lambda one: one != "--", arguments)]
+    given = [word.split("=", 1)[0] for word in takewhile(lambda word: word != "--", arguments)]
     for option in options:
         times = sum(given.count(name) for name in option.opts if name.startswith("-"))
         if times > 1 and not getattr(option, "multiple", True) and not getattr(option, "is_flag", True):

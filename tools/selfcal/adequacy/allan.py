@@ -100,20 +100,16 @@ def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int 
     if law.coloured_noise:
         theta = (second - 1.0) / (second + 1.0)
         variance, lag1 = variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
-    step = sum((term.deviation * drift) ** 2 * dt_s for term in law.terms if term.kind == "walk")
+    sized = list(law.sized(drift, second))
+    step = sum(term.variance * dt_s for term in sized if term.kind == "walk")
     lacking = (1.0 - 1.0 / block**2) * step / 6.0
     markov: list[tuple[complex, complex]] = []
-    for term in law.terms:
-        if term.kind != "walk":
-            alpha = term.bandwidth * (1.0 if term.stated else second)
-            sigma = term.deviation * drift * (second if term.by_ratio else 1.0)
-            own = sigma**2 / (alpha if law.has_walk else 1.0)
-            if term.kind == "oscillation":  # alpha is 2 pi over its period
-                share = math.sqrt(1.0 - term.damping**2)
-                mean = 1.0 - (alpha * dt_s) ** 2 * (1.0 - 1.0 / block**2) / 12.0
-                pole = complex(term.damping, -share)
-                markov.append((own * mean * complex(1.0, -term.damping / share), alpha * dt_s * pole))
-                continue
+    for kind, own, alpha, damping in sized:
+        if kind == "oscillation":
+            share = math.sqrt(1.0 - damping**2)
+            mean = 1.0 - (alpha * dt_s) ** 2 * (1.0 - 1.0 / block**2) / 12.0
+            markov.append((own * mean * complex(1.0, -damping / share), alpha * dt_s * complex(damping, -share)))
+        elif kind == "markov":
             gain, without = averaged(alpha * dt_s, block)
             markov.append((own * gain, alpha * dt_s))
             lacking += own * without

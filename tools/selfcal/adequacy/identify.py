@@ -184,7 +184,7 @@ def _by_library(fed: _Fed, fixed: bool, advance: Callable[[], object]) -> list[A
     """The result of each choice of regressors by the C code."""
     from selfcal.bank.library import Bank
 
-    bank = Bank(fed.tables, fixed=fixed, offset=fed.offset)
+    bank = Bank(fed.tables, build="_fixed" if fixed else "_library32", offset=fed.offset)
     bank.push(fed.samples[:, None], fed.recording.missing_before, fed.columns if fed.regressors else None)
     results = []
     for choice in fed.choices:

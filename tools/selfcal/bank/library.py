@@ -48,28 +48,15 @@ def arguments(tables: Tables) -> tuple[Any, ...]:
 class Bank:
     """A bank over the axes of `tables`.
 
-    `double` picks the verification build, `dense` that for up to 64 nodes a dimension, `coarse` one with the cells of a
-    module's reports, `fixed` the integer kernels (SELFCAL_FIXED). The first three are compiled for tests alone, by
-    `make setup-dev`. `offset`: what the samples of the first axis are less than the readings; its reports have it
-    again.
+    `build`: the compiled module, `_fixed` that of the integer kernels (SELFCAL_FIXED). `make setup-dev` compiles others
+    for tests alone. `offset`: what the samples of the first axis are less than the readings; its reports have it again.
     """
 
-    def __init__(
-        self,
-        tables: Tables,
-        *,
-        double: bool = False,
-        dense: bool = False,
-        coarse: bool = False,
-        fixed: bool = False,
-        offset: float = 0.0,
-    ) -> None:
+    def __init__(self, tables: Tables, *, build: str = "_library32", offset: float = 0.0) -> None:
         self.tables = tables
         self.offset = offset
-        wanted = {"_fixed": fixed, "_dense": dense, "_library64": double, "_coarse": coarse}
-        name = next((build for build, meant in wanted.items() if meant), "")
-        build: Any = import_module(f"selfcal.{name}") if name else _library32
-        self.raw: Any = build.Bank(*arguments(tables))
+        library: Any = _library32 if build == "_library32" else import_module(f"selfcal.{build}")
+        self.raw: Any = library.Bank(*arguments(tables))
         if offset:
             self.raw.shift(0, -offset)
 
@@ -85,17 +72,6 @@ class Bank:
         missing = np.zeros(len(rows)) if missing_before is None else missing_before
         values = None if regressors is None else np.ascontiguousarray(regressors, dtype=np.float32)
         self.raw.push(rows, np.ascontiguousarray(missing, dtype=np.uint64), values)
-
-    def save(self) -> bytes:
-        """Everything the bank knows, in the format of lib/snapshot.c."""
-        return bytes(self.raw.save())
-
-    def restore(self, snapshot: bytes) -> None:
-        """Go on from `snapshot`. Unless it is a whole one of this model and build: UserError, and nothing changes."""
-        try:
-            self.raw.restore(snapshot)
-        except ValueError as error:  # std::invalid_argument
-            raise UserError(str(error)) from error
 
     def report(self, axis: int, mask: int = 0, ahead_s: float = 0.0) -> AxisResult:
         """Posterior of an axis, with the columns of `mask` in use, a bit each. The bias is at `ahead_s` after the

@@ -182,15 +182,12 @@ def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Fl
     at the drift and second parameters [m]."""
     taken: list[_Floats] = []
     gained = np.zeros(drift.size)
-    for term in of.terms:
-        if term.kind == "walk":
+    for kind, variance, rate, damping in of.sized(drift, second):
+        if kind == "walk":
             taken.append(np.ones(drift.size))
-            gained = gained + (term.deviation * drift) ** 2 * time_s
-            continue
-        rate = term.bandwidth * (1.0 if term.stated else second)
-        variance = (term.deviation * drift * (second if term.by_ratio else 1.0)) ** 2 / (rate if of.has_walk else 1.0)
-        if term.kind == "oscillation":
-            row = swing(2.0 * math.pi / term.bandwidth, term.damping, time_s)[0]
+            gained = gained + variance * time_s
+        elif kind == "oscillation":
+            row = swing(2.0 * math.pi / rate, damping, time_s)[0]
             taken += [np.full(drift.size, share) for share in row]
             gained = gained + variance * (1.0 - float(row @ row))
         else:
@@ -203,12 +200,8 @@ def _prior_sd(prior: Prior) -> float:
     """Standard deviation of ln(parameter) under its prior."""
     if prior.law != "uniform":
         return prior.ln_sd
-    a, b = math.log(prior.min), math.log(prior.max)
-    x = np.linspace(a, b, 4001)
-    density = np.exp(x - b)
-    density /= np.trapezoid(density, x)
-    mean = float(np.trapezoid(density * x, x))
-    return math.sqrt(float(np.trapezoid(density * (x - mean) ** 2, x)))
+    share = prior.min / prior.max
+    return math.sqrt(1.0 - share * (math.log(share) / (1.0 - share)) ** 2)
 
 
 # ------------------------------------------------------------------------------------------------- finding the modes

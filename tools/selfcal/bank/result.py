@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base import units
+from selfcal.base.grid import bisected
 from selfcal.model.laws import RATIOS
 
 #: Standard deviations from the middle of a normal to either end of its 90 % interval.
@@ -46,11 +47,8 @@ def of_mixture(
     spread = math.sqrt(float(weight @ (sd**2 + (mean - middle) ** 2)))
 
     def quantile(p: float) -> float:
-        low, high = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            low, high = (middle, high) if float(weight @ ndtr((middle - mean) / sd)) < p else (low, middle)
-        return 0.5 * (low + high)
+        ends = float((mean - 9.0 * sd).min()), float((mean + 9.0 * sd).max())
+        return 0.5 * sum(bisected(lambda x: float(weight @ ndtr((x - mean) / sd)) >= p, *ends))
 
     return middle, spread, quantile(0.05), quantile(0.5), quantile(0.95)
 

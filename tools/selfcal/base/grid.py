@@ -1,8 +1,11 @@
-"""Values on an even grid: runs of a mask and of equal values, counts of pieces, block means, noise of differences."""
+"""Values on an even grid: runs of a mask and of equal values, counts of pieces, block means, noise of differences; and
+the place where a condition begins to hold."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from itertools import accumulate, pairwise, starmap
 from typing import Any
 
 import numpy as np
@@ -16,12 +19,28 @@ Rows = NDArray[np.int64]
 MEDIAN_SD = 0.6745
 
 
-def runs(mask: Mask, apart: int = 0) -> list[tuple[int, int]]:
-    """First row and the row after the last of every run of true values of a mask [n]. Runs with a gap of at most
-    `apart` rows join."""
+def bisected(holds: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
+    """The ends of a span, halved 40 times, from where something does not hold to where it does."""
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if holds(middle) else (middle, high)
+    return low, high
+
+
+def slices(sizes: Sequence[int]) -> list[slice]:
+    """Slices of so many entries each, one behind the other."""
+    return list(starmap(slice, pairwise(accumulate(sizes, initial=0))))
+
+
+def weighted_quantiles(values: Array, weight: NDArray[Any], p: Sequence[float]) -> Array:
+    """Quantiles `p` of `values` [n] in ascending order, each of which stands for the middle of its `weight` [n]."""
+    total = np.cumsum(weight)
+    return np.interp(p, (total - 0.5 * weight) / total[-1], values)
+
+
+def runs(mask: Mask) -> list[tuple[int, int]]:
+    """First row and the row after the last of every run of true values of a mask [n]."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
-    near = 2 * np.flatnonzero(edges[2::2] - edges[1:-1:2] <= apart) + 1
-    edges = np.delete(edges, np.concatenate([near, near + 1]))
     return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))
 
 

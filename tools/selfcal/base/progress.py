@@ -28,7 +28,7 @@ class Doing:
         self.verb, self.text, self.terminal = verb, "", console.is_terminal
         self.progress = Progress(*columns, console=console, transient=True, disable=not self.terminal)
         self.task = self.progress.add_task(verb or "records", total=total, said="")
-        self.began = self.told = time.monotonic()
+        self.began = self.noted = time.monotonic()
 
     def now(self, text: str) -> None:
         """The work is this from now on."""
@@ -42,8 +42,8 @@ class Doing:
     def tell(self, text: str) -> None:
         """Write this line if the last was 10 s ago."""
         now = time.monotonic()
-        if self.verb and not self.terminal and now - self.told >= 10.0:
-            self.told = now
+        if self.verb and not self.terminal and now - self.noted >= 10.0:
+            self.noted = now
             note(f"{self.verb}: {text}")
 
     def __enter__(self) -> Self:

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.special import gammaln
 
 from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
@@ -37,7 +36,7 @@ from selfcal.model.regressors import coefficient_unit, offered
 OTHER_LAW = 12.0
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Most devices that a line names.
+#: Most devices that a line or a list names, and that have a page of their own.
 MOST_NAMED = 20
 #: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
 MOST_TIMES = 1000.0
@@ -358,6 +357,8 @@ def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]
     """Causes that a group's units have more often than chance gives it: Fisher's exact test, one-sided.
 
     FALSE_ALARM is shared among all groups and causes."""
+    from scipy.stats import hypergeom  # half a second to import
+
     causes = [{c for unit in units for axis in unit.axes for c in unit.causes(axis)} for units in devices.values()]
     named = sorted(set().union(*causes)) if causes else []
     tests = [
@@ -371,22 +372,11 @@ def _shared(devices: Mapping[str, Sequence[Unit]], groupings: Sequence[Grouping]
     for kind, group, names, cause in tests:
         inside = [cause in of for of, name in zip(causes, names, strict=True) if name == group]
         outside = [cause in of for of, name in zip(causes, names, strict=True) if name != group]
-        log_p = _fisher(sum(inside), len(inside), sum(outside), len(outside))
+        having = sum(inside) + sum(outside)
+        log_p = min(0.0, float(hypergeom.logsf(sum(inside) - 1, len(names), having, len(inside))))
         if log_p <= math.log(FALSE_ALARM / len(tests)) and sum(inside) > 0.5 * len(inside):
             shared.append(Shared(kind, group, cause, (sum(inside), len(inside)), (sum(outside), len(outside)), log_p))
     return sorted(shared, key=lambda cause: cause.log_p)
-
-
-def _fisher(a: int, n: int, b: int, m: int) -> float:
-    """ln of the probability of `a` or more of `n`, where a + b of n + m have it."""
-
-    def ln_choose(of: int, k: int) -> float:
-        return float(gammaln(of + 1) - gammaln(k + 1) - gammaln(of - k + 1))
-
-    total = ln_choose(n + m, a + b)
-    terms = [ln_choose(n, k) + ln_choose(m, a + b - k) - total for k in range(a, min(n, a + b) + 1) if a + b - k <= m]
-    high = max(terms)
-    return min(0.0, high + math.log(sum(math.exp(term - high) for term in terms)))
 
 
 # ---------------------------------------------------------------------------------------------------------- in words

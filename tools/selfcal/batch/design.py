@@ -128,7 +128,7 @@ def designed(
     while samples <= MOST:
         # A record whose drift must be fitted, and its structure found, knows less than was predicted.
         of_record = partial(drawn_rows, model, axis, experiment, bit_s, samples)
-        rows = spread(of_record, seeds, settings={}, scheduler=scheduler)
+        rows = spread(of_record, seeds, scheduler=scheduler)
         if np.mean([all(row[key] <= wish for key, wish in most.items()) for row in rows]) >= SHARE:
             return {"bit_s": bit_s, "duration_s": samples * dt}
         samples = math.ceil(LONGER * samples)

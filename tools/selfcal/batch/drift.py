@@ -19,11 +19,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, stdtr
 
-from selfcal.base.grid import Array
+from selfcal.base.grid import Array, bisected
 from selfcal.batch.population import FALSE_ALARM
-
-#: Halvings of the search for r^2.
-_HALVINGS = 40
 
 
 @dataclass(frozen=True)
@@ -108,13 +105,12 @@ def drifts_of(series: Iterable[Series]) -> list[Drift]:
 def _square(series: Sequence[Series]) -> float:
     """r^2 of them all: 0 where their errors are scatter enough."""
     freedom = sum(history.freedom for history in series)
-    low, high = 0.0, max((float(np.var(history.y)) * history.y.size for history in series), default=0.0)
-    if not freedom or sum(history.line(0.0)[2] for history in series) <= freedom:
-        return 0.0
-    for _ in range(_HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if sum(history.line(middle)[2] for history in series) > freedom else (low, middle)
-    return high
+    high = max((float(np.var(history.y)) * history.y.size for history in series), default=0.0)
+
+    def enough(square: float) -> bool:
+        return sum(history.line(square)[2] for history in series) <= freedom
+
+    return 0.0 if not freedom or enough(0.0) else bisected(enough, 0.0, high)[1]
 
 
 def _alike(series: Sequence[Series]) -> list[Series]:

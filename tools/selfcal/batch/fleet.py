@@ -6,13 +6,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from selfcal.base.output import print_lines
+from selfcal.batch.batch_summary import MOST_NAMED
 from selfcal.batch.fail_on import outcome
 from selfcal.batch.unit_table import Unit
 from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged
 
 SCHEMA = "selfcal.fleet/1"
-#: Most names of a kind in the output.
-MOST_NAMES = 40
 
 
 def judged_units(batch: Sequence[Unit], limits: Limits) -> list[Judged]:
@@ -91,7 +90,7 @@ def _lines(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _listed(what: str, devices: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    for device, reasons in list(devices.items())[:MOST_NAMES]:
+    for device, reasons in list(devices.items())[:MOST_NAMED]:
         yield f"{what}: {device}: {'; '.join(reasons)}"
-    if len(devices) > MOST_NAMES:
-        yield f"{what}: {len(devices) - MOST_NAMES} more: the table names them"
+    if len(devices) > MOST_NAMED:
+        yield f"{what}: {len(devices) - MOST_NAMED} more: the table names them"

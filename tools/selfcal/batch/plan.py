@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +28,7 @@ from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, short
-from selfcal.base.grid import Array
+from selfcal.base.grid import Array, bisected
 from selfcal.base.output import plotter, print_lines, save_picture
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
@@ -137,7 +137,6 @@ class Ensemble:
             rows = spread(
                 partial(rows_of, self.model, self.axis, tuple(self.wishes), samples),
                 self.seeds,
-                settings={},
                 scheduler=self.scheduler,
             )
             self.at[samples] = np.array([row["metrics"] for row in rows], np.float64)
@@ -211,7 +210,6 @@ def cycling(
             rows = spread(
                 partial(coefficient_rows, replace(model, regressors=(regressor,)), axis, samples, cycles, swing),
                 seeds,
-                settings={},
                 scheduler=scheduler,
             )
             # The information of a swing is as its square: each record's own swing by the one that it had.
@@ -297,31 +295,30 @@ def rates(
             if samples is None or law is None:
                 continue
             duration_s = samples / own
-            target = _half_interval(*law, wish.parameter, own, duration_s)
-            if target is None:
-                continue
-            low, high = math.log(1e-3), math.log(1e3)
-            for _ in range(40):
-                middle = 0.5 * (low + high)
-                half = _half_interval(*law, wish.parameter, rate, duration_s * math.exp(middle))
-                low, high = (low, middle) if half is not None and half <= target else (middle, high)
-            rows.append({"wish": wish.text, "rate_hz": rate, "duration_s": duration_s * math.exp(high)})
+            times = _times(partial(_half_interval, *law, wish.parameter), own, rate, duration_s)
+            rows += [{"wish": wish.text, "rate_hz": rate, "duration_s": duration_s * times}] if times else []
     return rows
 
 
-def _half_interval(
-    law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float
-) -> float | None:
-    """Half of the 90 % interval of ln of a parameter, by the Fisher information; None where the record has none."""
+def _times(half: Callable[[float, float], float], own_hz: float, rate_hz: float, duration_s: float) -> float:
+    """Length at another rate over this one for an equal interval, within a factor of 1000; 0 without an interval."""
+    target, far = half(own_hz, duration_s), math.log(1e3)
+    if target == math.inf:
+        return 0.0
+    return math.exp(bisected(lambda ln: half(rate_hz, duration_s * math.exp(ln)) <= target, -far, far)[1])
+
+
+def _half_interval(law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float) -> float:
+    """Half of the 90 % interval of ln of a parameter, by the Fisher information; infinite where the record has none."""
     n = duration_s * rate_hz
     if n < 8:
-        return None
+        return math.inf
     try:
         covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))
     except np.linalg.LinAlgError:
-        return None
+        return math.inf
     variance = float(covariance[law.parameters.index(parameter), law.parameters.index(parameter)])
-    return HALF_90 * math.sqrt(variance) if variance > 0.0 else None
+    return HALF_90 * math.sqrt(variance) if variance > 0.0 else math.inf
 
 
 def picture(document: Mapping[str, Any], path: Path | str) -> None:

@@ -23,10 +23,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, ndtri
+from scipy.special import log_ndtr, logsumexp, ndtri
 
 from selfcal.bank.result import HALF_90, of_mixture
-from selfcal.base.grid import Array
+from selfcal.base.grid import Array, weighted_quantiles
 
 #: Fewest units of a population and of a group.
 FEWEST, FEWEST_OF_GROUP = 5, 3
@@ -89,10 +89,7 @@ class Fit:
     @property
     def spread(self) -> Interval:
         """The population's standard deviation."""
-        total = np.cumsum(self.weight)
-        total = (total - 0.5 * self.weight) / float(total[-1])
-        q05, median, q95 = (float(np.interp(p, total, self.t)) for p in (0.05, 0.5, 0.95))
-        return Interval(median, q05, q95)
+        return Interval(*weighted_quantiles(self.t, self.weight, (0.5, 0.05, 0.95)).tolist())
 
     def shrunken(self, y: float, s: float, offset: float = 0.0) -> Interval:
         """A unit's quantity, by its recording and the population."""
@@ -133,10 +130,7 @@ def _on_grid(y: Array, s: Array, sides: NDArray[np.bool_]) -> tuple[Array, Array
 
 def _tail(weight: Array, off: Array) -> Array:
     """ln of the two-sided probability [...] of being `off` [..., p] standard deviations away, over weighted spreads."""
-    tail = math.log(2.0) + log_ndtr(-np.abs(off)) + np.log(np.maximum(weight, 1e-300))
-    high = tail.max(axis=-1)
-    mixed: Array = np.minimum(high + np.log(np.exp(tail - high[..., None]).sum(axis=-1)), 0.0)
-    return mixed
+    return np.asarray(np.minimum(math.log(2.0) + logsumexp(log_ndtr(-np.abs(off)), axis=-1, b=weight), 0.0))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from rich.progress import BarColumn, TextColumn
 
@@ -48,14 +48,39 @@ DEATHS = 4
 _KILLED = "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"
 
 
-class Keeper(Protocol):
-    """Where finished pieces are."""
+class Kept:
+    """A folder of finished pieces, a JSON file each, named by the hash of its jobs and of the settings.
 
-    def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
-        """The rows of piece `k`, None if it is to be made."""
+    `settings`: everything that decides the rows apart from the jobs; `key`: what of a job decides them. A piece with an
+    `error` is not kept: it is done again each time."""
 
-    def write(self, k: int, jobs: Sequence[Job], rows: Sequence[Row]) -> None:
-        """Keep the rows of piece `k`."""
+    def __init__(
+        self, folder: Path | str, settings: Mapping[str, Any], key: Callable[[Job], Any] = lambda job: job
+    ) -> None:
+        self.folder, self.settings, self.key = Path(folder), settings, key
+        try:
+            self.folder.mkdir(exist_ok=True)
+        except OSError as error:
+            raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
+
+    def place(self, jobs: Sequence[Job]) -> Path:
+        """The file of a piece."""
+        named = json.dumps([self.settings, [self.key(job) for job in jobs]], sort_keys=True, default=repr)
+        return self.folder / f"{hashlib.sha256(named.encode()).hexdigest()}.json"
+
+    def read(self, jobs: Sequence[Job]) -> list[Row] | None:
+        """The rows of a piece, None if it is to be made: it is not there, or damaged."""
+        try:
+            rows = json.loads(self.place(jobs).read_text(encoding="utf-8"))
+        except (OSError, ValueError):
+            return None
+        return rows if isinstance(rows, list) and all(isinstance(row, dict) for row in rows) else None
+
+    def write(self, jobs: Sequence[Job], rows: Sequence[Row]) -> None:
+        """Keep the rows of a piece."""
+        if not any("error" in row for row in rows):
+            with whole(self.place(jobs)) as temporary:
+                temporary.write_text(json.dumps(rows, default=lambda number: number.item()), encoding="utf-8")
 
 
 def record_seeds(records: int, seed: int) -> list[int]:
@@ -76,10 +101,10 @@ def spread(
     function: Callable[[Job], list[Row]],
     jobs: Sequence[Job],
     *,
-    settings: Mapping[str, Any],
+    settings: Mapping[str, Any] | None = None,
     piece: int = 8,
     scheduler: str | None = None,
-    results: Path | str | Keeper | None = None,
+    results: Path | str | Kept | None = None,
     count: int | None = None,
     lost: Callable[[Job], list[Row]] | None = None,
     weights: Sequence[float] | None = None,
@@ -87,29 +112,29 @@ def spread(
 ) -> list[Row]:
     """The rows of `function` for all `jobs`, in their order.
 
-    `settings`: everything that decides the rows apart from the jobs; a folder of other settings is refused. `piece`:
-    jobs that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this package.
-    `results`: the folder, or what keeps the pieces. `count`: workers here, by default as many as processors. `lost`:
-    the rows of a job whose workers die; without it such a job ends the work. `weights` [jobs]: the work of each, for
-    the remaining time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.
+    `piece`: jobs that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this
+    package. `results`: the folder that keeps finished pieces; `settings`: as `Kept` has them. `count`: workers here, by
+    default as many as processors. `lost`: the rows of a job whose workers die; without it such a job ends the work.
+    `weights` [jobs]: the work of each, for the remaining time. `verb`: who writes the progress on stderr where there is
+    no terminal; "": nobody.
     Raises UserError for a package that is absent and a scheduler that does not answer.
     """
     if count is not None and count < 1:
         raise UserError("--workers must be at least 1")
-    store: Keeper | None = Store(Path(results), settings) if isinstance(results, Path | str) else results
+    kept = Kept(results, settings or {}) if isinstance(results, Path | str) else results
     pieces = [list(jobs[start : start + piece]) for start in range(0, len(jobs), piece)]
     each = [1.0] * len(jobs) if weights is None else list(weights)
     finished: dict[int, list[Row]] = {}
-    if store is not None:
-        finished = {k: rows for k, work in enumerate(pieces) if (rows := store.read(k, work)) is not None}
+    if kept is not None:
+        finished = {k: rows for k, work in enumerate(pieces) if (rows := kept.read(work)) is not None}
     waiting = [(k, work) for k, work in enumerate(pieces) if k not in finished]
     with _Remaining(verb, [sum(each[k * piece : (k + 1) * piece]) for k in range(len(pieces))], pieces) as remaining:
         remaining.done(finished)
         done = _cluster(function, waiting, scheduler, lost) if scheduler else _here(function, waiting, count, lost)
         for k, rows in done:
             finished[k] = rows
-            if store is not None:
-                store.write(k, pieces[k], rows)
+            if kept is not None:
+                kept.write(pieces[k], rows)
             remaining.advance(k)
     return [row for k in range(len(pieces)) for row in finished[k]]
 
@@ -271,68 +296,3 @@ def _silent() -> Iterator[None]:
         yield
     finally:
         logging.disable(before)
-
-
-def check_results(folder: Path | str | None) -> None:
-    """Raises UserError where finished pieces cannot be kept."""
-    if folder is not None and importlib.util.find_spec("pyarrow") is None:
-        raise UserError(f"--results needs pyarrow: {install('pyarrow')}")
-
-
-def make_folder(folder: Path) -> None:
-    """Make a folder unless it is there. Raises UserError."""
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
-
-
-class Store:
-    """A folder of finished pieces, each a Parquet file that is whole or absent.
-
-    A table gives every row every column. `selfcal.keys` of its metadata has the keys of each row, in their order.
-    """
-
-    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        check_results(folder)
-        self.folder = folder
-        self.key = hashlib.sha256(json.dumps(settings, sort_keys=True, default=str).encode()).hexdigest()
-        make_folder(folder)
-
-    def place(self, k: int) -> Path:
-        return self.folder / f"part-{k:06}.parquet"
-
-    def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
-        """The rows of piece `k`, None if it is absent or was of fewer jobs. Raises UserError for other settings."""
-        from pyarrow import ArrowException, parquet
-
-        path = self.place(k)
-        if not path.exists():
-            return None
-        try:
-            table = parquet.read_table(path)
-        except (ArrowException, OSError) as error:
-            raise UserError(f"{path}: cannot be read ({first_line(error)}): delete it to have it made anew") from error
-        made = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
-        if made.get("selfcal.settings") != self.key:
-            raise UserError(f"{path}: is of other settings: give --results another folder")
-        if made.get("selfcal.jobs") != str(len(jobs)) or "selfcal.keys" not in made:
-            return None
-        keys = json.loads(made["selfcal.keys"])
-        rows = zip(table.to_pylist(), keys["rows"], strict=True)
-        return [{name: row[name] for name in keys["kinds"][kind]} for row, kind in rows]
-
-    def write(self, k: int, jobs: Sequence[Job], rows: Sequence[Row]) -> None:
-        """Keep the rows of piece `k`."""
-        import pyarrow
-        from pyarrow import parquet
-
-        names = dict.fromkeys(name for row in rows for name in row)
-        kinds = list(dict.fromkeys(tuple(row) for row in rows))
-        keys = {"kinds": kinds, "rows": [kinds.index(tuple(row)) for row in rows]}
-        table = pyarrow.table({name: [row.get(name) for row in rows] for name in names})
-        table = table.replace_schema_metadata(
-            {"selfcal.settings": self.key, "selfcal.jobs": str(len(jobs)), "selfcal.keys": json.dumps(keys)}
-        )
-        with whole(self.place(k)) as temporary:
-            parquet.write_table(table, temporary)

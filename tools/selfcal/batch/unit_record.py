@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import io
-import json
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
@@ -15,8 +13,8 @@ from typing import Any, NamedTuple
 
 from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.base.errors import UserError, first_line
-from selfcal.base.output import whole
-from selfcal.batch.spread import Job, Row, make_folder, spread
+from selfcal.batch.batch_summary import MOST_NAMED
+from selfcal.batch.spread import Job, Kept, Row, spread
 from selfcal.batch.unit_table import Unit
 from selfcal.readings.tests import TESTS
 
@@ -27,8 +25,7 @@ DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 FAR = 8.0
-#: Most devices with a page of their own, and the characters that its name lacks.
-MOST_PAGES = 20
+#: Characters that the name of a device's page lacks.
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 #: Error of a recording whose workers die.
 KILLED = "its worker process was killed each time, maybe for want of memory"
@@ -96,22 +93,22 @@ def own_pages(
     devices: Mapping[str, Sequence[Unit]],
     verbs: Verbs,
     options: Options,
-    keeper: ByContent,
+    kept: Kept,
     count: int | None,
 ) -> dict[str, str]:
-    """Write the page of `diagnose` of the last recording of each device, MOST_PAGES at most, into `folder`.
+    """Write the page of `diagnose` of the last recording of each device, MOST_NAMED at most, into `folder`.
 
     A page that is there of the same recording and options is not made anew. Returns where each is from the folder
     above."""
     pages = Path(folder)
     pages.mkdir(exist_ok=True)
     jobs = {}
-    for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_PAGES]:
+    for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_NAMED]:
         source = devices[name][-1].source
-        digest = keeper.place((source.path, source.content)).stem[:12]
+        digest = kept.place([(source.path, source.content)]).stem[:12]
         jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{digest}.html"))
     todo = [job for job in jobs.values() if not Path(job[1]).exists()]
-    spread(partial(_paged, verbs, options), todo, settings={}, piece=1, count=count, lost=lambda _: [{}], verb="pages")
+    spread(partial(_paged, verbs, options), todo, piece=1, count=count, lost=lambda _: [{}], verb="pages")
     return {name: f"{pages.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
 
 
@@ -142,37 +139,6 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     lattice = checks.get("lattice", {})
     stated = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= 8 else {}
     return {"marks": list(dict.fromkeys(marks)), **stated}
-
-
-class ByContent:
-    """A folder of finished recordings, a JSON file each, named by the hash of the recording and of the settings.
-
-    A changed file is another recording. A recording without a result is looked at again each time.
-    """
-
-    def __init__(self, folder: Path, settings: Mapping[str, Any]) -> None:
-        self.folder = folder
-        self.settings = json.dumps(settings, sort_keys=True, default=str)
-        make_folder(folder)
-
-    def place(self, job: Job) -> Path:
-        """The file of a recording."""
-        named = hashlib.sha256(f"{job[1]} {self.settings}".encode("utf-8", "surrogateescape"))
-        return self.folder / f"{named.hexdigest()}.json"
-
-    def read(self, k: int, jobs: Sequence[Job]) -> list[Row] | None:
-        """The row of a recording; None without a row, or with a damaged one."""
-        try:
-            row = json.loads(self.place(jobs[0]).read_text(encoding="utf-8"))
-        except (OSError, ValueError):
-            return None
-        return [row] if isinstance(row, dict) and "axes" in row else None
-
-    def write(self, k: int, jobs: Sequence[Job], rows: Sequence[Row]) -> None:
-        """Keep the row of a recording."""
-        if "error" not in rows[0]:
-            with whole(self.place(jobs[0])) as temporary:
-                temporary.write_text(json.dumps(rows[0]), encoding="utf-8")
 
 
 def settings_of(options: Options, model: str, version: str) -> dict[str, Any]:

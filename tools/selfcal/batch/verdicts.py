@@ -21,6 +21,7 @@ from typing import Any
 from selfcal.bank.result import HALF_90, bias_of, likeliest
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, shown
+from selfcal.base.grid import bisected
 from selfcal.base.output import check_writable, whole
 from selfcal.base.units import duration_words
 from selfcal.logs.recording import list_of
@@ -239,13 +240,9 @@ def _rest_s(
         left, moves = sd / math.sqrt(times), sd * math.sqrt(1.0 - 1.0 / times)
         return _normal((abs(middle) - HALF_90 * left) / moves) + _normal((-abs(middle) - HALF_90 * left) / moves)
 
-    low, high = 0.0, math.log(MOST_TIMES)
     if chance(MOST_TIMES) < CHANCE:
         return None
-    for _ in range(60):
-        half = 0.5 * (low + high)
-        low, high = (low, half) if half > 0.0 and chance(math.exp(half)) >= CHANCE else (half, high)
-    return duration_s * math.expm1(high)
+    return duration_s * math.expm1(bisected(lambda ln: chance(math.exp(ln)) >= CHANCE, 0.0, math.log(MOST_TIMES))[1])
 
 
 def _normal(x: float) -> float:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from selfcal.base.errors import UserError
-from selfcal.base.grid import Array, Mask
+from selfcal.base.grid import Array, Mask, slices
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import ACCEL, REST_S, Tumble
@@ -22,8 +22,10 @@ from selfcal.calibration.tumble_fit import FALSE_ALARM, Fit, Problem, fit
 BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
 #: sd of the square of the scale, s^2/m: 0.5 mg at 1 g. Data sheets' 0.1 to 0.5 % of a range of 2 to 16 g are 0.1 to 1.
 SQUARE_SD = 5e-5
-#: Places of the parameters.
-BIAS, SCALE, ANGLE, GRAVITY, THERMAL = slice(0, 3), slice(3, 6), slice(6, 9), 9, slice(10, 13)
+#: Numbers of the parameters, and their places; that of gravity's one is an index.
+SIZES = (3, 3, 3, 1, 3)
+BIAS, SCALE, ANGLE, _, THERMAL = slices(SIZES)
+GRAVITY = ANGLE.stop
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 2))
 #: sd of a parameter that the logs do not have: not 0, so that the prior has an inverse.
@@ -93,8 +95,8 @@ def forces(theta: Array, a: Array, warm: Array) -> tuple[Array, Array, Array]:
 def _prior(tumble: Tumble, place: Place) -> tuple[Array, Array]:
     """The prior's mean and covariance."""
     thermal = THERMAL_SD if tumble.has_temp else 0.0
-    sd = np.repeat([BIAS_SD, SCALE_SD, ANGLE_SD, place.sd / place.gravity, thermal], [3, 3, 3, 1, 3])
-    return np.repeat([0.0, 1.0, 0.0], [3, 3, 7]), np.diag(np.maximum(sd, NONE) ** 2)
+    sd = np.repeat([BIAS_SD, SCALE_SD, ANGLE_SD, place.sd / place.gravity, thermal], SIZES)
+    return np.repeat([0.0, 1.0, 0.0, 0.0, 0.0], SIZES), np.diag(np.maximum(sd, NONE) ** 2)
 
 
 def _problem(tumble: Tumble, place: Place, square_sd: float = SQUARE_SD) -> Problem:

@@ -20,7 +20,7 @@ from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from selfcal.base.errors import UserError
-from selfcal.base.grid import Array, Mask
+from selfcal.base.grid import Array, Mask, slices
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import ANGLE_SD, NONE, SCALE_SD, Accelerometer, forces, means_covariance, shaped
@@ -36,9 +36,11 @@ OF_ACCEL = accelerometer.THERMAL.stop
 #: Windows of a turn that show signs and units, s; largest error of a gyro's factor; least share of the most turned
 #: axis, or of a turn, that is judged; information that is added to every entry of the factors.
 WINDOW_S, WRONG, SHOWN, FAINT = 0.2, 0.3, 0.3, 1e-3
-#: Places of the parameters, behind the accelerometers'.
-BIAS, G, SCALE, ANGLE, THERMAL = (slice(a, b) for a, b in ((0, 3), (3, 12), (12, 15), (15, 21), (22, 25)))
-VERTICAL, LEVEL = 21, 25
+#: Numbers of the parameters, and their places behind the accelerometers'; the Earth's vertical rate has an index, its
+#: level parts follow for each chain of turns.
+SIZES = (3, 9, 3, 6, 1, 3)
+BIAS, G, SCALE, ANGLE, _, THERMAL = slices(SIZES)
+VERTICAL, LEVEL = ANGLE.stop, THERMAL.stop
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 
@@ -138,7 +140,7 @@ def calibrate(accel: Accelerometer, held: Mask | None = None) -> Gyroscope:
     thermal = THERMAL_SD if accel.tumble.has_temp else 0.0
     sd = np.repeat(
         [BIAS_SD, G_SD, SCALE_SD, ANGLE_SD, place.vertical_sd, thermal, place.level_sd],
-        [3, 9, 3, 6, 1, 3, 2 * (int(problem.chain[-1]) + 1)],
+        [*SIZES, 2 * (int(problem.chain[-1]) + 1)],
     )
     prior = block_diag(accel.fit.covariance, np.diag(np.maximum(sd, NONE) ** 2))
     mean = np.concatenate([accel.fit.theta, np.zeros(sd.size)])

@@ -93,17 +93,14 @@ def of_laws(
 ) -> tuple[Term, ...]:
     """Terms of a mixture of laws. `values`: by law and parameter the mean square and the median. An oscillation counts
     as a Gauss-Markov drift of its period."""
-    total, terms = sum(probability.values()), []
+    total, terms = sum(probability.values()), list[Term]()
     for name, share in probability.items():
         law, own = laws[name], values[name]
         if len(law.parameters) < 2 or not share > 0.0:
             continue
-        square = own[law.parameters[1]][0]
-        second = own[law.second][1] if law.second else 1.0
-        for term in law.terms:
-            size = share / total * square * (term.deviation * (second if term.by_ratio else 1.0)) ** 2
-            bandwidth = term.bandwidth * (1.0 if term.stated else second)
-            terms.append(Term(size) if term.kind == "walk" else Term(size, bandwidth))
+        square = share / total * own[law.parameters[1]][0]
+        sized = law.sized(math.sqrt(square), own[law.second][1] if law.second else 1.0)
+        terms += [Term(term.variance, term.rate) for term in sized]
     return tuple(terms)
 
 

@@ -20,6 +20,7 @@ from scipy.linalg import rq
 from selfcal.base.errors import UserError, remark
 from selfcal.base.grid import Array
 from selfcal.base.output import write_text
+from selfcal.base.templates import of_code
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer, matrix_of
@@ -131,26 +132,12 @@ def _head(mark: str, whole: Whole) -> str:
 def _c(accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]) -> str:
     """A header of constants."""
     whole = _whole(accel, gyro, document)
-
-    def vector(values: Array) -> str:
-        texts = (f"{value:.9g}" for value in values)
-        return f"{{{', '.join(f'{text}F' if set('.e') & set(text) else f'{text}.0F' for text in texts)}}}"
-
-    def matrix(values: Array) -> str:
-        return "{" + ", ".join(vector(row) for row in values) + "}"
-
-    text = "".join(f"/* {line.replace('*/', '* /')} */\n" for line in whole.lines)
-    text += "#ifndef SELFCAL_CALIBRATION_H\n#define SELFCAL_CALIBRATION_H\n\n"
-    text += "/* f = accel_matrix (a - accel_bias), m/s^2 */\n"
-    text += f"static const float accel_bias[3] = {vector(whole.bias)};\n"
-    text += f"static const float accel_matrix[3][3] = {matrix(whole.matrix)};\n"
+    numbers = {"accel_bias": whole.bias, "accel_matrix": whole.matrix}
     if whole.gyro is not None:
         gyro_bias, turned, G = whole.gyro
-        text += "/* w = gyro_matrix (y - gyro_bias - gyro_g f), rad/s; gyro_g in rad/s per m/s^2 */\n"
-        text += f"static const float gyro_bias[3] = {vector(gyro_bias)};\n"
-        text += f"static const float gyro_matrix[3][3] = {matrix(turned)};\n"
-        text += f"static const float gyro_g[3][3] = {matrix(G / STANDARD_GRAVITY)};\n"
-    return text + "\n#endif\n"
+        numbers |= {"gyro_bias": gyro_bias, "gyro_matrix": turned, "gyro_g": G / STANDARD_GRAVITY}
+    template = of_code(Path(__file__).parent / "templates").get_template("calibration.h.jinja")
+    return template.render(lines=whole.lines, numbers={name: values.tolist() for name, values in numbers.items()})
 
 
 def _lower(matrix: Array) -> tuple[Array, Array]:

@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich import box
-from rich.table import Table
 
+from selfcal.bank.result import HALF_90
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of, plotter, print_line, save_picture
+from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration.tumble_document import side_of
 
@@ -55,9 +54,9 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             line("the Earth's rate is in the intervals of bias and g-sensitivity: --latitude would take it off")
         if "bias_at_degC" in answer:
             line(f"bias at {answer['bias_at_degC']:.4g} degC")
-        table = Table(box=box.SIMPLE_HEAD)
-        for heading in ("", "", "median", "5 %", "95 %", "unit"):
-            table.add_column(heading, no_wrap=True, justify="right" if heading in ("median", "5 %", "95 %") else "left")
+        table = table_of(("", "", "median", "5 %", "95 %", "unit"))
+        for column in table.columns[2:5]:
+            column.justify = "right"
         for group in (key for of, key in SHEET if of == sensor and key in answer):
             word, unit, size, zero = SHEET[sensor, group]
             for name, entry in answer[group].items():
@@ -92,7 +91,7 @@ def plot(document: Mapping[str, Any], path: Path | str) -> None:
     places = np.arange(len(rests))
     residual, sd = (micro * np.array([rest[key] for rest in rests]) for key in ("residual", "sd"))
     axes.axhline(0.0, color="0.6", linewidth=0.8)
-    axes.errorbar(places, residual, 1.645 * sd, fmt="o", markersize=4, capsize=3, linewidth=1)
+    axes.errorbar(places, residual, HALF_90 * sd, fmt="o", markersize=4, capsize=3, linewidth=1)
     axes.set_xticks(places, [side_of(np.array(rest["up"])) for rest in rests], rotation=60, fontsize=8)
     axes.set_xlabel("side that is up, rest by rest")
     axes.set_ylabel("|f| - g, ug")

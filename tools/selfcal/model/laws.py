@@ -7,9 +7,10 @@ In C it is `selfcal_law_t` (lib/selfcal_tables.h).
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +53,16 @@ class Term:
     stated: bool = False
     by_ratio: bool = False
     damping: float = 0.0
+
+
+class Sized(NamedTuple):
+    """A term at values of its law's parameters, numbers or arrays: `variance` of a step in 1 s of a walk, at the `rate`
+    0, else the stationary one. Of an oscillation `rate` is 2 pi / period."""
+
+    kind: str
+    variance: Any
+    rate: Any
+    damping: float
 
 
 @dataclass(frozen=True)
@@ -122,6 +133,15 @@ class Law:
         """Drift and second parameter from values by name; 0 and 1 where the law has none."""
         drift, second = (*self.parameters[1:], "", "")[:2]
         return parameters[drift] if drift else 0.0, parameters[second] if second else 1.0
+
+    def sized(self, drift: Any, second: Any) -> Iterator[Sized]:
+        """Each term at the drift parameter and the second one, as `node` has them. Beside a walk the drift parameter is
+        K, and a term of rate w has the deviation K / sqrt(w)."""
+        for term in self.terms:
+            rate = self.bandwidth(term) * (1.0 if term.stated else second)
+            deviation = term.deviation * drift * (second if term.by_ratio else 1.0)
+            over = rate if self.has_walk and term.kind != "walk" else 1.0
+            yield Sized(term.kind, deviation**2 / over, rate, term.damping)
 
     def with_time(self, correlation_time_s: float) -> Law:
         """The law with a correlation time for the term whose stated bandwidth is left open (NaN)."""

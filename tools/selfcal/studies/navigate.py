@@ -107,14 +107,14 @@ def matched(now: float, near: float, far: float) -> dict[str, float]:
 def rows_of(job: Job) -> list[Row]:
     """A row a part: squared errors and the NEES by filter and time."""
     part = Part.of(job.law, job.seeds)
-    told = {
+    noises = {
         "sheet": [sheet_noise()] * len(job.seeds),
         "inflated": [sheet_noise(INFLATION)] * len(job.seeds),
         "identified": [identified_noise(rest / SCALE) for rest in part.rest],
         "true": [true_noise(job.law)] * len(job.seeds),
     }
     rows: list[Row] = [{"law": job.law, "seed": seed} for seed in job.seeds]
-    for name, noise in told.items():
+    for name, noise in noises.items():
         filters = Filters(Noise.of(noise), part)
         filters.rest()
         for time, (errors, covariance) in zip(TIMES, filters.fly(), strict=True):
@@ -132,15 +132,15 @@ def rows_of(job: Job) -> list[Row]:
 
 def summary(rows: Sequence[Row]) -> dict[str, Any]:
     """By filter and time: the rms of each error, the mean of the NEES."""
-    found: dict[str, Any] = {}
+    figures: dict[str, Any] = {}
     for name in TITLES:
-        found[name] = {}
+        figures[name] = {}
         for time in TIMES:
             means = {figure: float(np.mean([row[f"{name}.{time}.{figure}"] for row in rows])) for figure in FIGURES}
-            found[name][time] = {
+            figures[name][time] = {
                 figure: mean if figure == "nees" else math.sqrt(mean) for figure, mean in means.items()
             }
-    return found
+    return figures
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:

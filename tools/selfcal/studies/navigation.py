@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from selfcal.base.grid import slices
 from selfcal.base.units import STANDARD_GRAVITY, convert
 from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
 
@@ -43,14 +44,13 @@ TURN, TAKE_OFF_S, TURN_PERIOD_S = 10.0, 20.0, 60.0
 SI = {"deg/s": "rad/s", "m/s^2": "m/s^2"}
 SCALE = np.array([convert(np.ones(1), unit, SI[unit])[0] for unit in AXES.values()])
 _UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
-# Places in the error state: position, velocity, attitude, the biases' constants and drifts (gyros, accelerometers),
-# latency. What is judged has the sums of the constants and the drifts.
-_P, _V, _A, _CONSTANT, _DRIFT, _LATENCY = (
-    slice(a, b) for a, b in ((0, 3), (3, 6), (6, 9), (9, 15), (15, 21), (21, 22))
-)
-_STATES = 22
+#: Sizes of the error state: position, velocity, attitude, the biases' constants and drifts (gyros, accelerometers),
+#: latency. What is judged has the sums of the constants and the drifts.
+_SIZES = (3, 3, 3, 6, 6, 1)
+_P, _V, _A, _CONSTANT, _DRIFT, _LATENCY = slices(_SIZES)
+_STATES = _LATENCY.stop
 _JUDGED = np.delete(np.eye(_STATES), _DRIFT, axis=0)
-_JUDGED[_CONSTANT, _DRIFT] = np.eye(6)
+_JUDGED[_CONSTANT, _DRIFT] = np.eye(len(AXES))
 #: Errors that are judged: three of position, velocity and attitude, six biases, the latency.
 JUDGED = len(_JUDGED)
 

@@ -64,7 +64,7 @@ CANCELS = (
 
 
 @dataclass(frozen=True)
-class Told:
+class Known:
     """What a filter knows of an axis: its noise in the units of AXES, and the errors of its readings [s], means of 1 s
     in the same unit."""
 
@@ -77,29 +77,29 @@ def add_outages(
     model: Model,
     tree: Mapping[str, Any],
     record: Record,
-    found: Mapping[str, Diagnosed],
+    diagnosed: Mapping[str, Diagnosed],
     recording: Recording,
     second: Recording | None,
 ) -> None:
     """Put `navigation` into each material finding of the document, or None and `navigation_reason`; and into the
     document what they have in common, None without a flight. `tree`: the extended model file's."""
     flown = recording if second is None else second
-    names = [name for name in AXES if name in found and name in flown.columns]
+    names = [name for name in AXES if name in diagnosed and name in flown.columns]
     extended = {regressor.name: regressor for regressor in Model.of_tree(tree, model.path).regressors}
     terms: dict[str, list[tuple[str, Term]]] = {name: [] for name in names}
     reasons: dict[str, str] = {}
     for name in names:
-        for finding, entry in zip(found[name].by_gain, document["axes"][name]["findings"], strict=True):
-            term = term_of(found[name], finding, extended)
+        for finding, entry in zip(diagnosed[name].by_gain, document["axes"][name]["findings"], strict=True):
+            term = term_of(diagnosed[name], finding, extended)
             if isinstance(term, str):
                 reasons[entry["of"]] = term
             else:
                 terms[name].append((entry["of"], term))
 
     @cache
-    def told(name: str, without: str) -> Told:
+    def known(name: str, without: str) -> Known:
         own = [term for of, term in terms[name] if of != without]
-        return _told(model, record, found, name, own, recording, second)
+        return _known(model, record, diagnosed, name, own, recording, second)
 
     document["navigation"] = None
     for entry in document["findings"]:
@@ -111,9 +111,9 @@ def add_outages(
         try:
             if not acts:
                 raise UserError(reasons.get(event, f"nothing of it is in the bank's model of {', '.join(AXES)}"))
-            whole = {name: told(name, "") for name in names}
+            whole = {name: known(name, "") for name in names}
             _check(whole)
-            before, after = map(flights, ({**whole, **{name: told(name, event) for name in acts}}, whole))
+            before, after = map(flights, ({**whole, **{name: known(name, event) for name in acts}}, whole))
         except UserError as error:
             entry["navigation_reason"] = str(error)
             continue
@@ -131,24 +131,24 @@ def add_outages(
         }
 
 
-def _told(
+def _known(
     model: Model,
     record: Record,
-    found: Mapping[str, Diagnosed],
+    diagnosed: Mapping[str, Diagnosed],
     name: str,
     terms: Sequence[Term],
     recording: Recording,
     second: Recording | None,
-) -> Told:
+) -> Known:
     """Noise and errors of an axis by a model with these terms."""
-    own = with_terms(model, record, found, name, terms, [column for term in terms for column in term.columns])
+    own = with_terms(model, record, diagnosed, name, terms, [column for term in terms for column in term.columns])
     stays = {column.name for term in terms if why_stays(term.finding) for column in term.columns}
     anew = {column.name for term in terms if term.anew for column in term.columns} - stays
     values, columns, readings = _readings(own, name, recording)
     half = values.size // 2
     noise, c = _learned(own, name, readings, values, columns, half if second is None else values.size)
     if second is not None:
-        places = [one.name for one in offered(own, name) for _ in one.columns]
+        places = [regressor.name for regressor in offered(own, name) for _ in regressor.columns]
         kept = np.array([place not in stays | anew for place in places], bool)
         values, columns, readings = _readings(own, name, second)
         values = values - columns[:, kept] @ c[kept]
@@ -160,7 +160,7 @@ def _told(
     seconds = block_means(values - columns @ c, readings.missing_before, max(1, round(rate_hz)), group)
     factor = units.factor(group.unit, AXES[name])
     errors = np.concatenate([np.full(round(seconds.begin / rate_hz), np.nan), seconds.mean])
-    return Told(
+    return Known(
         {key: value if key == "alpha" else value * factor for key, value in noise.items()}, bridged(errors) * factor
     )
 
@@ -195,19 +195,19 @@ def _learned(
     return noise, np.array([mean for mean, _ in now.coefficients[now.best]])
 
 
-def flights(told: Mapping[str, Told]) -> dict[str, dict[str, Any]]:
+def flights(known: Mapping[str, Known]) -> dict[str, dict[str, Any]]:
     """By outage, s: rms error of the position, m, mean of its NEES and the 95 % band of it, in FLIGHTS of the second
     half. Raises UserError of errors that are too short."""
-    seconds = min(axis.errors.size for axis in told.values())
+    seconds = min(axis.errors.size for axis in known.values())
     first, last = seconds // 2, seconds - GPS_S - LONGEST_S
     if last < first:
         raise UserError(f"flights need a recording of {2 * (GPS_S + LONGEST_S)} s or more")
     white = _white(seconds)
     own, noise = [], []
     for name, unit in AXES.items():
-        alike = [known.noise["N"] ** 2 for other, known in told.items() if AXES[other] == unit]
+        alike = [axis.noise["N"] ** 2 for other, axis in known.items() if AXES[other] == unit]
         N = math.sqrt(sum(alike) / len(alike)) if alike else SHEET_N[unit]
-        axis = told.get(name, Told({"N": N}, N * white[name]))
+        axis = known.get(name, Known({"N": N}, N * white[name]))
         own.append(axis.errors[:seconds])
         noise.append(axis.noise)
     errors = np.stack(own, axis=1) * SCALE
@@ -218,17 +218,17 @@ def flights(told: Mapping[str, Told]) -> dict[str, dict[str, Any]]:
     filters = Filters(Noise.of([noise] * FLIGHTS), part)
     filters.rest()
     place = slice(0, COORDINATES)
-    found: dict[str, dict[str, Any]] = {}
+    by_outage: dict[str, dict[str, Any]] = {}
     for outage, (off, covariance) in zip(OUTAGES_S, filters.fly(OUTAGES_S), strict=True):
         squares = nees(off[:, place], covariance[:, place, place])
         apart = max(1, (seconds - first) // (GPS_S + outage))  # flights that share no reading
         band = stats.chi2.ppf([0.025, 0.975], COORDINATES * apart) / apart
-        found[f"{outage}"] = {
+        by_outage[f"{outage}"] = {
             "position_m": math.sqrt(float(np.mean(np.sum(off[:, place] ** 2, axis=1)))),
             "nees": float(squares.mean()),
             "nees_band_95": band.tolist(),
         }
-    return found
+    return by_outage
 
 
 def _white(seconds: int) -> dict[str, Floats]:
@@ -237,13 +237,13 @@ def _white(seconds: int) -> dict[str, Floats]:
     return {name: random.standard_normal(seconds) for name in AXES}
 
 
-def _check(told: Mapping[str, Told]) -> None:
+def _check(known: Mapping[str, Known]) -> None:
     """Raise UserError where flights with white noise alone, as the axes have it, are not as exact as they state: then
     the filter's own approximations show, not the axes."""
-    white = _white(max(axis.errors.size for axis in told.values()))
+    white = _white(max(axis.errors.size for axis in known.values()))
     ideal = {
-        name: Told({"N": axis.noise["N"]}, axis.noise["N"] * white[name][: axis.errors.size])
-        for name, axis in told.items()
+        name: Known({"N": axis.noise["N"]}, axis.noise["N"] * white[name][: axis.errors.size])
+        for name, axis in known.items()
     }
     side = flights(ideal)[f"{OUTAGE_S}"]
     if side["nees"] > side["nees_band_95"][1]:
@@ -252,11 +252,11 @@ def _check(told: Mapping[str, Told]) -> None:
 
 def words_of(before: Mapping[str, Any], after: Mapping[str, Any]) -> str:
     """What a finding means after OUTAGE_S, in a sentence."""
-    one, two = (f"{words.ratio(side['position_m'])} m" for side in (before, after))
+    without, with_it = (f"{words.ratio(side['position_m'])} m" for side in (before, after))
     sure = [_sure(side) for side in (before, after)]
-    if (one, sure[0]) == (two, sure[1]):
-        return f"With or without it {one} after {OUTAGE_S} s without GPS and {sure[0]}."
-    return f"Without it {one} after {OUTAGE_S} s without GPS and {sure[0]}; with it {two} and {sure[1]}."
+    if (without, sure[0]) == (with_it, sure[1]):
+        return f"With or without it {without} after {OUTAGE_S} s without GPS and {sure[0]}."
+    return f"Without it {without} after {OUTAGE_S} s without GPS and {sure[0]}; with it {with_it} and {sure[1]}."
 
 
 def _sure(side: Mapping[str, Any]) -> str:

@@ -11,10 +11,10 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +26,10 @@ from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
 from selfcal.base.grid import runs
-from selfcal.base.output import check_writable, console_of, table_of, write_json
+from selfcal.base.output import console_of, table_of
 from selfcal.base.progress import bar
 from selfcal.batch.spread import record_seeds, spread, workers
-from selfcal.logs.loaders import Reading
-from selfcal.logs.recording import Recording, load
+from selfcal.logs.recording import Recording
 from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
 from selfcal.studies.methods import RIVALS, Rival
@@ -51,34 +50,22 @@ WHOLE_WIDTH = 190
 
 
 def of_recording(
-    log: Path | str,
-    *,
-    axes: Sequence[str] = (),
-    model: Path | str | None = None,
-    decimate: float | None = None,
-    only: Sequence[str] = (),
-    json: Path | str | None = None,
-    **reading: Unpack[Reading],
+    recording: Recording, model: Model, axes: Sequence[str], decimate: float | None, chosen: Sequence[Rival]
 ) -> dict[str, Any]:
-    """Run the library and every other method of `selfcal.studies.methods` on the same block means of each axis.
+    """The document `selfcal.rivals/1`: the `chosen` methods on the same block means of each axis.
 
-    `only`: names of the methods to run, else all. Each runs in a process of its own, one after the other, so that its
-    time and its memory are its own. Returns the document `selfcal.rivals/1`; numbers are in the recording's units.
-    A method that fails, or whose package is absent, has its reason in its place: {"error": ...}.
+    Each runs in a process of its own, one after the other, so that its time and its memory are its own. Numbers are in
+    the recording's units. A method that fails, or whose package is absent, has its reason in its place: {"error": ...}.
     """
-    check_writable(json)
-    chosen = chosen_rivals(only)
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
-    loaded = Model.load(model)
-    recording = load(log, sensors=loaded.sensors, **reading)
-    names = chosen_axes(recording, loaded, axes)
-    loaded = for_record(loaded, recording, names)
+    names = chosen_axes(recording, model, axes)
+    model = for_record(model, recording, names)
     answers: dict[str, Any] = {}
     with bar() as progress:
         task = progress.add_task("rivals", total=len(names) * len(chosen))
         for name in names:
-            problem, left_out = problem_of(recording, name, loaded, decimate)
+            problem, left_out = problem_of(recording, name, model, decimate)
             entries = {}
             for rival in chosen:
                 progress.update(task, description=f"{name}: {rival.title}")
@@ -90,76 +77,55 @@ def of_recording(
                 "interval_s": problem.dt_s,
                 "rivals": entries,
             }
-    document = {"schema": SCHEMA, "recording": recording_entry(recording), "axes": answers}
-    write_json(document, json)
-    return document
+    return {"schema": SCHEMA, "recording": recording_entry(recording), "axes": answers}
 
 
-def ensemble(
-    records: int,
-    *,
-    samples: Sequence[int] = SAMPLES,
-    truth: str = "middle",
-    model: Path | str | None = None,
-    axis: str = "gx",
-    only: Sequence[str] = (),
-    seed: int = 1,
-    json: Path | str | None = None,
-    workers: int | None = None,
-    scheduler: str | None = None,
-    results: Path | str | None = None,
-) -> dict[str, Any]:
-    """Give every method the same simulated records, `records` of each law and number of `samples`.
+@dataclass(frozen=True)
+class Ensemble:
+    """Simulated records for every method, `records` of each law and number of `samples`.
 
-    `truth`: 'middle' has every record made with the middle of the priors' logarithms, 'prior' draws it for each. The
-    model is `models/ensemble.yaml` unless one is given. `workers`, `scheduler`, `results`: as for `montecarlo`.
-    Returns the document `selfcal.rivals_ensemble/1`.
-    """
-    check_writable(json)
-    chosen = chosen_rivals(only)
-    loaded = Model.load(ENSEMBLE if model is None else model)
-    for rival in chosen:
-        if rival.missing:
-            note(f"left out: {rival.title}: {rival.missing}")
-    chosen = [rival for rival in chosen if not rival.missing]
-    seeds = record_seeds(records, seed)
-    if truth not in ("middle", "prior"):
-        raise UserError(f"--truth is middle or prior, not '{truth}'")
-    if not all(FEWEST <= n <= MOST_ENSEMBLE for n in samples):
-        raise UserError(f"--samples must be {FEWEST} to {MOST_ENSEMBLE}")
-    if not set(loaded.hypotheses) <= set(PLAIN):
-        raise UserError(f"{loaded.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
-    cells = [Cell(law, n, one) for n in samples for one in seeds for law in loaded.hypotheses]
-    rows = spread(
-        partial(rows_of, loaded, axis, truth, chosen),
-        cells,
-        settings={
+    `truth`: 'middle' has every record made with the middle of the priors' logarithms, 'prior' draws it for each."""
+
+    model: Model
+    axis: str
+    truth: str
+    samples: Sequence[int]
+    records: int
+    seed: int
+
+    def document(
+        self, chosen: Sequence[Rival], workers: int | None, scheduler: str | None, results: Path | str | None
+    ) -> dict[str, Any]:
+        """The document `selfcal.rivals_ensemble/1`. Raises UserError for what no method takes."""
+        for rival in chosen:
+            if rival.missing:
+                note(f"left out: {rival.title}: {rival.missing}")
+        chosen = [rival for rival in chosen if not rival.missing]
+        seeds = record_seeds(self.records, self.seed)
+        if self.truth not in ("middle", "prior"):
+            raise UserError(f"--truth is middle or prior, not '{self.truth}'")
+        if not all(FEWEST <= n <= MOST_ENSEMBLE for n in self.samples):
+            raise UserError(f"--samples must be {FEWEST} to {MOST_ENSEMBLE}")
+        if not set(self.model.hypotheses) <= set(PLAIN):
+            raise UserError(f"{self.model.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
+        given = {"axis": self.axis, "truth": self.truth, "seed": self.seed}
+        more = {
             "schema": ENSEMBLE_SCHEMA,
-            "model": settings_of(loaded),
-            "axis": axis,
-            "truth": truth,
-            "samples": list(samples),
+            "model": settings_of(self.model),
+            "samples": list(self.samples),
             "rivals": [rival.name for rival in chosen],
-            "seed": seed,
-            "records": records if len(samples) > 1 else None,  # more of one length may be added
-        },
-        scheduler=scheduler,
-        results=results,
-        count=workers,
-    )
-    entries = summary(rows, loaded.group_of(axis))
-    document = {
-        "schema": ENSEMBLE_SCHEMA,
-        "model": str(loaded.path),
-        "axis": axis,
-        "truth": truth,
-        "seed": seed,
-        "records_per_law": records,
-        "cells": entries,
-        "choice": over_laws(entries),
-    }
-    write_json(document, json)
-    return document
+        }
+        rows = spread(
+            partial(rows_of, self.model, self.axis, self.truth, chosen),
+            [Cell(law, n, seed) for n in self.samples for seed in seeds for law in self.model.hypotheses],
+            settings=given | more,
+            scheduler=scheduler,
+            results=results,
+            count=workers,
+        )
+        entries = summary(rows, self.model.group_of(self.axis))
+        document = {"schema": ENSEMBLE_SCHEMA, "model": str(self.model.path), **given, "records_per_law": self.records}
+        return document | {"cells": entries, "choice": over_laws(entries)}
 
 
 def chosen_rivals(only: Sequence[str]) -> list[Rival]:

@@ -29,10 +29,7 @@ def codegen(
 ) -> Tables:
     """Write `selfcal_model.h`, `selfcal_model.c` and `selfcal_config.h` into the folder `output`; return the tables.
 
-    `target` picks the node counts; `rate` (Hz) is that of the samples (default: the sensor's in the model file); `axes`
-    is a subset of the model's. `start`: the file that `diagnose --json` wrote with the model; its posteriors become the
-    priors (warm.py). `hold`: a report rests on a copy of its axis's sums, so that no sample overtakes it. Says on
-    stderr what of the model is left out.
+    `axes` is a subset of the model's. Says on stderr what of the model is left out.
     Raises UserError for a bad model file, one that the target has no RAM for, or a folder that cannot be written.
     """
     from rich.console import Console

@@ -49,9 +49,7 @@ def compare(
     distance in standard deviations; the `verdicts` by recording and axis; and the `quantities` that were set beside
     each other, by recording, axis and name. An axis that two successive recordings do
     not both have, judged and in the same unit, is {"error": ..., "changes": [...]}.
-    `decimate`, `start_s`, `end_s`, `gate`, `reading`: as `diagnose` has them, of each recording. `fail_on`: see
-    fail_on.py; it is only checked here. `report`: file for a page with tables and pictures.
-    `limits`, `junit`, `verdicts`: as `identify` has them, of each recording.
+    `fail_on` is only checked here.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     from selfcal.base.ending import Held

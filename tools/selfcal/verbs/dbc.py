@@ -22,25 +22,22 @@ def dbc(
     """The DBC file of node `node` that runs the model file `model`, written to `output` or stdout.
 
     Its messages and signals have the model's names of hypotheses, parameters and regressor columns, with their units.
-    Raises UserError for a node that there is not, or a model that telemetry has no room or no messages for.
+    Raises UserError for a node that there is not, or a model that telemetry has no messages for.
     """
     from selfcal.base.output import check_writable, write_text
     from selfcal.model.file import Model
-    from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, check_node
+    from selfcal.wire.dbc_file import check_node
     from selfcal.wire.dbc_file import dbc as text_of
     from selfcal.wire.frames import AXES, axis_unit, carries, names_of
 
     check_node(node)
     check_writable(output)
     loaded = Model.load(model)
-    names = names_of(loaded)
-    if len(names.hypotheses) > HYPOTHESES or len(names.columns) > COLUMNS:
-        raise UserError(f"{loaded.path}: telemetry carries {HYPOTHESES} hypotheses and {COLUMNS} columns at most")
     axes = [axis for axis in loaded.axes if carries(axis, loaded.group_of(axis).unit)]
     if not axes:
         known = ", ".join(f"{axis} [{axis_unit(axis)}]" for axis in AXES)
         raise UserError(f"{loaded.path}: telemetry carries none of its axes in the unit they have (it carries {known})")
-    text = text_of(node, names, axes)
+    text = text_of(node, names_of(loaded), axes)
     if output is None or str(output) == "-":
         sys.stdout.write(text)
     else:

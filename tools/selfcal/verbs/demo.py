@@ -10,6 +10,13 @@ from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ
 from selfcal.verbs._shared import ModelFile
 
+#: Least interval of reports, s of module time, and largest speed. A host takes a report a second.
+REPORT_S, FASTEST = 10.0, 1000.0
+#: python-can's own group and port, so that its tools listen there without more.
+GROUP, PORT = "239.74.163.2", 43113
+#: Time that the firmware waits for a host, s: longer than anybody does.
+FOREVER_S = 999_999.0
+
 
 def demo(
     log: Annotated[Path | str | None, argument(f"Recording: {READ}; default: the shipped one", "[LOG]")] = None,
@@ -24,7 +31,6 @@ def demo(
     how to watch.
 
     On a pseudo-terminal the module's time stands still while nobody has its channel open, and hosts may come and go.
-    `node`: its number on its bus. `model`: file of the module's model.
     With `transport` can it goes on by itself, on the CAN device `channel` or over UDP within this machine.
     """
     import shlex
@@ -36,8 +42,8 @@ def demo(
     from selfcal.logs.recording import load
     from selfcal.model.file import Model
     from selfcal.wire.dbc_file import check_node
-    from selfcal.wire.demo import FASTEST, FOREVER_S, GROUP, PORT, REPORT_S, SHIPPED, wait
-    from selfcal.wire.replay import build, check_sent, running, write_rows
+    from selfcal.wire.frames import SHIPPED
+    from selfcal.wire.replay import build, running, write_rows
 
     if not 0.0 < speed <= FASTEST:
         raise UserError(f"--speed must be above 0 and at most {FASTEST:g}, not {speed:g}")
@@ -46,7 +52,6 @@ def demo(
     check_node(node)
     path = Path(log or SHIPPED)
     loaded = Model.load(model)
-    check_sent(loaded)
     recording = load(path)
     names = chosen_axes(recording, loaded, ())
     recording = recording.along(*names)
@@ -73,7 +78,7 @@ def demo(
                     flush=True,
                 )
             try:
-                complaint = (said + wait(module)).strip()
+                complaint = (said + module.communicate()[0]).strip()
             except KeyboardInterrupt:
                 return
             if module.returncode != 0:

@@ -62,14 +62,9 @@ def diagnose(
     of 1 s, whose findings go to stderr at once, then every sample. The second result is the final one, unless it shows
     nothing where the first one does. A further finding of the means stays in the axis' `only_in_means`. An axis that
     the second look did not finish without a result of its own has the first look's. `full_rate`: no first look.
-    `decimate`: look at block means at this rate alone, Hz.
-    `on`: a second recording, read as the first, on which each finding's gain is measured.
-    `navigate`: position errors of a GPS/INS filter without and with each finding that matters (studies/outage.py).
-    `report`: the page to write. `write_model`: where the extended model file goes; a file that `diagnose` did not
-    write is kept, by a UserError. `fail_on`: see fail_on.py; it is
-    only checked here. `limits`, `junit`, `verdicts`, `start_s`, `end_s`, `since_power_on_s`, `gate`: as `identify` has
-    them; `details` is for the command; times found are those of the whole recording.
-    Numbers are in the recording's units. Raises UserError for what the user can put right.
+    `on` is read as the first recording is. A file that `diagnose` did not write is no place for `write_model`.
+    `fail_on` is only checked here. Times are those of the whole recording, numbers in its units. Raises UserError for
+    what the user can put right.
 
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
     yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.

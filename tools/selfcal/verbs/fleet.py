@@ -58,22 +58,16 @@ def fleet(
     gate: shared.Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
-    """Identify every recording of the batch and write the table `output`, .csv or .parquet.
+    """Identify every recording of the batch and write the table `output`.
 
-    `patterns`: files, or patterns as 'logs/**/*.ulg'. `serial_from`: 'name', the file's; 'name:PATTERN', what a regular
-    expression finds in the path; 'field', the recording's metadata. `units_table`: a CSV of file, device, station, lot
-    and date. `diagnose`: the causes too. `fail_on`: see fail_on.py; a cause needs `diagnose`.
-    `limits`: a file of limits (verdicts.py), `junit` and `verdicts`: the files of their verdicts.
-    `workers`: processes here, one for each processor by default; `scheduler`: a Dask scheduler's address instead.
-    `results`: the folder that keeps finished recordings, OUTPUT.parts by default: a run that was stopped goes on, and a
-    changed file is done anew. The other options are those of `identify`, for each recording.
+    A cause as `fail_on` needs `diagnose`. By `results` a run that was stopped goes on, and a changed file is done anew.
     Returns the document `selfcal.fleet/1`, and writes it to `json`: by device what failed, what could not be judged,
     and the exit `code`; the `population`, each unit's estimates by it, and the units `unlike` it.
-    `report`: the page to write. With `diagnose`, devices that need a look have an own page in `report`.units.
-    `write_model`: the model file with the batch's priors (batch/prior_file.py).
+    With `diagnose`, devices that need a look have an own page in `report`.units.
     Raises UserError for what the user can put right; a broken recording is a row of the table.
     """
     from functools import partial
+    from operator import itemgetter
 
     import selfcal
     from selfcal.base.output import check_writable, write_json
@@ -82,8 +76,8 @@ def fleet(
     from selfcal.batch.fleet import document_with, judged_units
     from selfcal.batch.prior_file import lines_of as lines_of_priors
     from selfcal.batch.prior_file import write_model as write_priors
-    from selfcal.batch.spread import spread
-    from selfcal.batch.unit_record import KILLED, ByContent, Options, Verbs, examined, own_pages, settings_of
+    from selfcal.batch.spread import Kept, spread
+    from selfcal.batch.unit_record import KILLED, Options, Verbs, examined, own_pages, settings_of
     from selfcal.batch.unit_table import Unit, check_table, rows_of, write_table
     from selfcal.batch.verdicts import Limits, check_options, write
     from selfcal.model.file import Model
@@ -115,15 +109,14 @@ def fleet(
         {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
     )
     version = str(selfcal.__version__)
-    keeper = ByContent(folder, settings_of(options, model_settings_of(loaded), version))
+    kept = Kept(folder, settings_of(options, model_settings_of(loaded), version), key=itemgetter(1))  # its content
     sources = [source for source in named.sources if not source.copy_of]
     records = spread(
         partial(examined, verbs, options),
         [(str(Path(source.path).absolute()), source.content) for source in sources],
-        settings={},
         piece=1,
         scheduler=scheduler,
-        results=keeper,
+        results=kept,
         count=workers,
         lost=lambda _: [{"error": KILLED}],
         weights=[source.size + 1.0 for source in sources],
@@ -150,7 +143,7 @@ def fleet(
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
         pages: dict[str, str] = {}
         if diagnose:
-            pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, keeper, workers)
+            pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, kept, workers)
         write_page(report, document, summary, pages)
     return document
 

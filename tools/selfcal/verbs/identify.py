@@ -79,16 +79,8 @@ def identify(
 
     `engine`: 'library' (the firmware's C code in float, one bank an axis), 'fixed' (its form for parts without an FPU)
     or 'reference' (the textbook bank in double, its grid refined until the probabilities settle).
-    `decimate`: rate of the block means in Hz, else the model's.
-    `plot`: file for the picture of the Allan deviations; `datasheet`: in the units of data sheets.
-    `export`: a format of `show.export` and the file to write. `suspicion`: look at the axes that are not adequate once
-    more, for the cause that explains most. `fail_on`: see fail_on.py; it is only checked here.
-    `limits`: a file of limits (verdicts.py), `junit` and `verdicts`: the files of their verdicts.
-    `start_s`, `end_s`: the stretch of the recording to look at, s. `since_power_on_s`: from power-on to the recording's
-    beginning, s. `gate`: without the bank intervals in which the
-    model's stationary gate sees motion.
-    Numbers are in the recording's units. An axis without a result has its reason in its place: {"error": ...}. Raises
-    UserError for what the user can put right, and if no axis has a result.
+    `fail_on` is only checked here. Numbers are in the recording's units. An axis without a result has its reason in its
+    place: {"error": ...}. Raises UserError for what the user can put right, and if no axis has a result.
     """
     from selfcal.adequacy.checks import against
     from selfcal.adequacy.document import Identified, to_document

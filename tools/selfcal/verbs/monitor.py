@@ -49,16 +49,11 @@ def monitor(
     """Show what arrives by `channel`, or what the log `read` holds, until Ctrl-C, its end, or until `duration` (s) is
     over.
 
-    Several modules of a bus are shown one below the other; `node`: that one alone. `model`: file of a model beside
-    the default one, for the names of what a module sends; `start`: the diagnosis that its priors are from. A port
-    that vanishes is waited for, unless `once`. `speed`: how many times as fast as it came a log is played; default:
-    as fast as it is read. `log`: file for the raw frames as they arrive, damaged ones too; its suffix chooses
-    python-can's format, or MCAP, which takes the reports too; an older one is not written over. `stream`: where each
-    report goes as it comes, `udp-json` or `foxglove` with `:HOST:PORT` or without, or `jsonl` or `ros:HZ` on stdout.
-    `bitrate` of the CAN bus, bit/s, where the interface needs one. `json`: the last complete reports as a document
-    `selfcal.identify/1` in telemetry's units, without checks, with the `node`; of several modules a document
-    `selfcal.modules/1` that holds one for each. `plot`: the picture of the run; of several modules one each, whose name
-    ends in the node. Raises UserError for what the user can put right.
+    Several modules of a bus are shown one below the other. An older `log` is not written over. `stream`: `udp-json` or
+    `foxglove` with `:HOST:PORT` or without, or `jsonl` or `ros:HZ` on stdout. `json`: the last complete reports as a
+    document `selfcal.identify/1` in telemetry's units, without checks, with the `node`; of several modules a document
+    `selfcal.modules/1` that holds one for each. `plot`: of several modules one each, whose name ends in the node.
+    Raises UserError for what the user can put right.
     """
     from rich.console import Console
 

@@ -24,11 +24,8 @@ def montecarlo(
     """Simulate `records` records per law, at most BLOCK samples a bank interval, identify each with the library, and
     compare with the truth.
 
-    Parameters that no node of the grid has are drawn again: `without_nodes` is their share by law.
-
-    `workers`: processes here, one for each processor by default; `scheduler`: address of a Dask scheduler instead. The
-    numbers are the same. `results`: a folder that keeps finished records: a run that was stopped continues from them,
-    and one of more records adds to them.
+    Parameters that no node of the grid has are drawn again: `without_nodes` is their share by law. The numbers are the
+    same for any workers. A run of more records adds to those in `results`.
     Returns per law and parameter the share of 90 % intervals that hold the truth, actual and stated rms error; over all
     records the calculated and actual probability of false identification, with the sd of their difference.
     """

@@ -30,14 +30,11 @@ def paper(
 ) -> list[Reproduction]:
     """Write the page to `output`; returns its figures.
 
-    `data`: the folder of the real recordings, else the one that the tests use. Where they are absent, their figures say
-    so and a line says so too. `records`: of each law in Figs 1 and 2, 500 in the paper. `scheduler`, `results`: as for
-    `montecarlo`. `tracks`: a folder for the map errors of Section 4.2, a recording a track. All seeds follow from
-    `seed`.
+    Where the real recordings are absent, their figures and a line say so. All seeds follow from `seed`.
     """
     from selfcal.base.output import check_writable, write_text
     from selfcal.base.progress import bar
-    from selfcal.batch.spread import check_results, record_seeds
+    from selfcal.batch.spread import record_seeds
     from selfcal.model.file import Model
     from selfcal.studies.paper import DATA, EXPLAINED, page, with_reason
     from selfcal.studies.paper_figures import section3, section4, survey
@@ -45,7 +42,6 @@ def paper(
     from selfcal.verbs.diagnose import diagnose
 
     check_writable(output)
-    check_results(results)
     seeds = record_seeds(records, seed)
     folder = DATA if data is None else Path(data)
     if data is not None and not folder.is_dir():

@@ -39,9 +39,8 @@ def part(
 ) -> Model:
     """Write the model file of a part into `output`, and return the model.
 
-    `log`: a recording at rest; none: by the data sheet alone. `datasheet`: texts `N=0.012deg/sqrt(h)`, `accel.N=...`,
-    `gx.range=250deg/s`, of the keys in STATED and OF_PART. They go before the recording's numbers. `axes`: columns that
-    are axes, where they are not gx to az. The other options are `load`'s.
+    `datasheet`: texts `N=0.012deg/sqrt(h)`, `accel.N=...`, `gx.range=250deg/s`, of the keys in STATED and OF_PART. They
+    go before the recording's numbers.
     Raises UserError for a recording that moved, a text that is none of these, and a file that cannot be written.
     """
     from selfcal.adequacy.part import as_text, parse, tree_of

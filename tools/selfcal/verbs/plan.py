@@ -66,17 +66,15 @@ def plan(
 ) -> dict[str, Any]:
     """How long to record the part of a model file, so that SHARE of the records have each of the wishes `want`.
 
-    `model`: a model file, or a recording, of which the part is made as `part` makes it; `start_s`, `end_s` and the
-    other options are the recording's. `axis`: the first that the `simulate` entry states, else the first of all. A wish
-    of a parameter is of the records whose law has it. `plot`: a picture of what is reached over the length.
+    Of a recording the part is made as `part` makes it; `start_s`, `end_s` and the options of a log are of that. A wish
+    of a parameter is of the records whose law has it.
     `tumble`: how many rests of which length `selfcal tumble` takes: document `selfcal.plan_tumble/1`; wishes are those
     of `calibration/tumble_plan.py`.
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
     it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
     prior's sd.
-    `response`, `levels`, `input_lag_s`, `input`: the shortest record in which SHARE of the parts have a gain and a lag
-    as wanted, its input switched between the levels; `drive` has the set points. The document has `bit_s`,
-    `duration_s` and `set_points` then.
+    With `response`: the shortest record in which SHARE of the parts have a gain and a lag as wanted, its input switched
+    between the `levels`. The document has `bit_s`, `duration_s` and `set_points` then.
     Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
@@ -216,7 +214,7 @@ def _response(
     for wish in wishes:
         if wish.parameter not in sizes or not wish.text.endswith("%"):
             raise UserError(f"--want '{wish.text}': with --response takes 'gain within 5 %' and 'lag within 20 %'")
-    found = designed(model, axis, experiment, wishes, record_seeds(min(records, DRAWN), seed), scheduler)
+    design = designed(model, axis, experiment, wishes, record_seeds(min(records, DRAWN), seed), scheduler)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "model": str(model.path),
@@ -226,11 +224,11 @@ def _response(
         "rate_hz": model.bank_rate_hz,
         "levels": [low, high],
         "wishes": [wish.text for wish in wishes],
-        **found,
+        **design,
     }
-    if found["duration_s"] is not None:
-        at, points = experiment.set_points(found["bit_s"], found["duration_s"])
-        rows = [*zip(at.tolist(), points.tolist(), strict=True), (found["duration_s"], float(points[-1]))]
+    if design["duration_s"] is not None:
+        at, points = experiment.set_points(design["bit_s"], design["duration_s"])
+        rows = [*zip(at.tolist(), points.tolist(), strict=True), (design["duration_s"], float(points[-1]))]
         document["set_points"] = [{"time_s": time_s, "value": value} for time_s, value in rows]
         if drive is not None:
             text = "".join(f"{time_s:.10g},{value:.10g}\n" for time_s, value in rows)

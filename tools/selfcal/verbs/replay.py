@@ -42,16 +42,11 @@ def replay(
 ) -> Identification:
     """Run the firmware over a recording; returns the document of contract `selfcal.identify/1`, written to `json`.
 
-    `start`: the file that `diagnose --json` wrote with the model; its posteriors are the module's priors.
-    `target`: this process, or a processor emulated by QEMU; its firmware is compiled if it is not there yet.
-    `transport` compiles a program for this machine too. Its frames leave by `slcan` over a pseudo-terminal, or by
-    `can`: UDP within this machine at the pace of a bus of 500 kbit/s, or the CAN device `channel`.
-    `report_every`: seconds of the recording between reports, one bank interval at least (default: a hundredth of it on
-    the host, a tenth on the cortex-m4f, all of it on the cortex-m0).
-    `gate`: only rest counts, as the model's stationary gate sees it; while the sensor moves time passes as a gap.
-    `start_s`, `end_s`: the stretch of the recording to play, s; the firmware's clock begins with it.
-    `since_power_on_s`: from power-on to the recording's beginning, s. `plot`: file for the picture of the run.
-    Numbers are in the recording's units. Raises UserError for what the user can put right.
+    A firmware is compiled if it is not there yet. The frames of a program for this machine leave by `slcan` over a
+    pseudo-terminal, or by `can`: UDP within this machine at the pace of a bus of 500 kbit/s, or the CAN device
+    `channel`. `report_every` is one bank interval at least. With `gate`, time passes as a gap while the sensor moves.
+    The firmware's clock begins at `start_s`. Numbers are in the recording's units. Raises UserError for what the user
+    can put right.
     """
     from selfcal.adequacy.identify import chosen_axes
     from selfcal.bank.priors import add_sources, for_record
@@ -65,7 +60,7 @@ def replay(
     from selfcal.show.results import Identification
     from selfcal.wire.frames import names_of
     from selfcal.wire.on_wire import places, sent
-    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, check_sent, document_of, run
+    from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, document_of, run
 
     if target not in TARGETS:
         raise UserError(f"--target {target}: no such target (there are {', '.join(TARGETS)})")
@@ -82,7 +77,6 @@ def replay(
     loaded_model = Model.load(model)
     say_once(loaded_model.left_out)
     known = None if start is None else load_start(start, loaded_model)
-    check_sent(loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = recording.later(since_power_on_s).between(start_s, end_s)
     known_s = recording.start_s

@@ -36,9 +36,8 @@ def response(
     """The answer of the axis `output` to the column `input`: temperature, supply or another axis. Of several, each
     answer is beside those to the others.
 
-    Returns the document `selfcal.response/1` and writes it to `json`; `plot`: its picture, of one input. `decimate`:
-    rate of the block means, Hz; default: every sample of 20 000, means of a longer record. `start_s`, `end_s`, `gate`,
-    `reading`: as `identify` has them. Raises UserError for what the user can put right.
+    Returns the document `selfcal.response/1` and writes it to `json`; `plot` is of one input. Raises UserError for what
+    the user can put right.
     """
     from selfcal.adequacy.document import recording_entry
     from selfcal.adequacy.identify import stretch_of
@@ -88,7 +87,7 @@ def response(
     inputs = {name: inputs_of(recording, record, name) for name in names}
     state = record.axes[output]
     # The model file may state an input's influence: it is the question here.
-    state = state.refit(regressors=tuple(one for one in state.regressors if one.entry.get("column") not in names))
+    state = state.refit(regressors=tuple(known for known in state.regressors if known.entry.get("column") not in names))
     parts = [
         {
             "input": {

@@ -34,29 +34,28 @@ def rivals(
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Run the library and every other method on the same block means of each axis of `log`: the document
-    `selfcal.rivals/1`. Or give all the same simulated records, `records` of each law and number of
-    `samples`, of the first of the `axes`: the document `selfcal.rivals_ensemble/1`. See `studies/rivals.py`.
+    `selfcal.rivals/1`. Or give all the same simulated records, `records` of each law and number of `samples`, of the
+    first of the `axes`: the document `selfcal.rivals_ensemble/1`.
     """
-    from selfcal.studies.rivals import SAMPLES, ensemble, of_recording
+    from selfcal.base.output import check_writable, write_json
+    from selfcal.logs.recording import load
+    from selfcal.model.file import Model
+    from selfcal.studies import rivals as study
 
     if (log is None) == (records is None):
         raise UserError(f"rivals takes a recording, or --records N for simulated ones: {called()} rivals LOG")
+    check_writable(json)
+    chosen = study.chosen_rivals(only)
     if log is not None:
-        return of_recording(log, axes=axes, model=model, decimate=decimate, only=only, json=json, **reading)
-    assert records is not None
-    return ensemble(
-        records,
-        samples=samples or SAMPLES,
-        truth=truth,
-        model=model,
-        axis=axes[0] if axes else "gx",
-        only=only,
-        seed=seed,
-        json=json,
-        workers=workers,
-        scheduler=scheduler,
-        results=results,
-    )
+        loaded = Model.load(model)
+        document = study.of_recording(load(log, sensors=loaded.sensors, **reading), loaded, axes, decimate, chosen)
+    else:
+        assert records is not None
+        loaded = Model.load(study.ENSEMBLE if model is None else model)
+        ensemble = study.Ensemble(loaded, axes[0] if axes else "gx", truth, samples or study.SAMPLES, records, seed)
+        document = ensemble.document(chosen, workers, scheduler, results)
+    write_json(document, json)
+    return document
 
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:

@@ -14,9 +14,6 @@ from selfcal.verbs._shared import End, Json, ModelFile, Start, to_stderr
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
 
-#: Logs at most: a log a position.
-MOST_LOGS = 200
-
 
 def tumble(
     logs: Annotated[
@@ -49,11 +46,8 @@ def tumble(
 ) -> dict[str, Any]:
     """Calibrate the accelerometers and gyros of a part by its rests in several positions and the turns between them.
 
-    `logs`: one recording, or a sequence of one a position, in order of time. `model`: the part's own model file: its
-    law, noise and range; without one the law is of a rest of 20 min in the log, else the default model's prior.
-    `latitude`, `height`, `gravity`: see `calibration/earth.py`. `output`: the YAML file; `export`: a format of
-    `tumble_export.py` and its file; `plot`: a picture of the residuals. `start_s`, `end_s`: the stretch to look at, s.
-    `fail_on`: `inadequate`; it is only checked here.
+    Several `logs` are in order of time. `model`: the part's own law, noise and range; without one the law is of a rest
+    of 20 min in the log, else the default model's prior. `fail_on` is only checked here.
     Returns the document `selfcal.tumble/1` and writes it to `json`; gyros without an answer have an `error` there.
     Raises UserError for what the user can put right: fewer than three rests, a place that is none, logs that are not of
     accelerometers.
@@ -62,7 +56,7 @@ def tumble(
     from selfcal.batch.fail_on import INADEQUATE
     from selfcal.calibration import accelerometer, gyroscope
     from selfcal.calibration.earth import place
-    from selfcal.calibration.rests import tumble_of
+    from selfcal.calibration.rests import MOST, tumble_of
     from selfcal.calibration.tumble_document import document_of
     from selfcal.calibration.tumble_export import FORMS, write
     from selfcal.calibration.tumble_show import plot as picture
@@ -70,8 +64,8 @@ def tumble(
     from selfcal.model.file import Model
 
     each = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
-    if not 1 <= len(each) <= MOST_LOGS:
-        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST_LOGS} at most")
+    if not 1 <= len(each) <= MOST:
+        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST} at most")
     files = [path for log in each for path in list_of(log)]
     check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
     check_picture(plot)
@@ -82,10 +76,10 @@ def tumble(
     where = place(latitude, height, gravity)
     loaded = Model.load(model)
     recordings = [load(log, sensors=loaded.sensors, **reading).between(start_s, end_s) for log in each]
-    found = tumble_of(recordings, loaded, part_stated=model is not None)
-    accel = accelerometer.calibrate(found, where)
+    tumbled = tumble_of(recordings, loaded, part_stated=model is not None)
+    accel = accelerometer.calibrate(tumbled, where)
     gyro, failed = None, None
-    if found.has_gyro:
+    if tumbled.has_gyro:
         try:
             gyro = gyroscope.calibrate(accel)
         except UserError as error:

@@ -53,7 +53,6 @@ def worth(
     else:
         jobs = [study.Job(law, rest, record_seed) for law in LAWS for rest in study.RESTS_S for record_seed in seeds]
         settings = {"schema": study.SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
-        settings["records"] = str(records)  # the jobs' order has it
         rows = spread(
             partial(study.simulated, loaded), jobs, settings=settings, piece=32, scheduler=scheduler, results=results
         )

@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from selfcal import _library32
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import whole
@@ -94,7 +92,7 @@ def write_tables(model: Model, tables: Tables, folder: Path, target: str, start:
     except OSError as error:
         raise UserError(f"{folder}: cannot write the tables: {error.strerror}") from error
     templates = of_code(Path(__file__).parent / "templates")
-    templates.filters |= {"f": _f, "remark": remark, "flag": lambda flag: str(flag).lower()}
+    templates.filters |= {"remark": remark, "flag": lambda flag: str(flag).lower()}
     templates.filters["grid"] = lambda grid: f"&grid_{grid.nodes}" if grid else "NULL"
     for name in ("selfcal_config.h", "selfcal_model.h", "selfcal_model.c"):
         text = templates.get_template(f"{name}.jinja").render(_values(model, tables, target, start, hold))
@@ -199,13 +197,3 @@ def coarsest_exponent(axis: AxisTable, dt_s: float) -> int:
     sigma = max(least, min(most, span / math.sqrt(2.0)))
     # SELFCAL_FIXED_LIMIT in selfcal_parts.h, and SIGMA_BITS in bank_kernel_fixed.c.
     return max(math.ceil(math.log2(span / (3 * 2**25))), math.floor(math.log2(sigma) + 1e-5) - 20)
-
-
-def _f(value: float) -> str:
-    """A literal that reads back as the float32 nearest to `value`, which the package's builds take."""
-    if math.isinf(value):
-        return "INFINITY"
-    text = f"{value:.9g}"
-    if np.float32(text) != np.float32(value):  # rounded twice
-        text = f"{np.float32(value):.9g}"
-    return f"{text}{'' if any(c in text for c in '.en') else '.0'}F"

@@ -8,13 +8,19 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from copy import copy
+from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple, cast
 
 from selfcal.base.errors import UserError, remark
 from selfcal.base.templates import of_code
 from selfcal.base.units import parameter_unit
 from selfcal.model.file import MOST_COLUMNS, MOST_HYPOTHESES
+
+if TYPE_CHECKING:
+    from cantools.database.can import Database
+    from cantools.database.can.signal import Signal
 
 PATTERN = Path(__file__).parent / "frames.dbc"
 
@@ -32,28 +38,14 @@ REASON = "reason"
 LONGEST = 32
 
 
-@dataclass(frozen=True)
-class Signal:
-    """One signal of a message: `before` and `after` its unit as the DBC writes them."""
-
-    name: str
-    before: str
-    unit: str
-    after: str
-    comment: str = ""
-    choices: str = ""
-    is_float: bool = False
-
-
-@dataclass
-class Pattern:
-    """One message of the pattern."""
+class Written(NamedTuple):
+    """One message of the file, made from one of the pattern."""
 
     id: int
     name: str
     sender: str
-    signals: list[Signal] = field(default_factory=list)
-    comment: str = ""
+    signals: Sequence[Signal]
+    comment: str
 
 
 @dataclass(frozen=True)
@@ -93,53 +85,18 @@ def identifier(node: int, offset: int) -> int:
     return BASE + NODE_IDS * node + offset
 
 
-def _patterns(text: str) -> tuple[list[str], dict[str, Pattern], str]:
-    """The lines before the first message, the messages by name, and the comment of the whole file."""
-    head: list[str] = []
-    messages: dict[int, Pattern] = {}
-    of: Pattern | None = None
-    whole = ""
-
-    def change(id_: str, name: str, **changes: object) -> None:
-        signals = messages[int(id_)].signals
-        index = next(index for index, signal in enumerate(signals) if signal.name == name)
-        signals[index] = replace(signals[index], **changes)  # type: ignore[arg-type]
-
-    for line in text.splitlines():
-        if match := re.match(r"BO_ (\d+) (\w+): 8 (\w+)", line):
-            of = messages[int(match[1])] = Pattern(int(match[1]), match[2], match[3])
-        elif of is None:
-            head.append(line)
-        elif match := re.match(r' SG_ (\w+)( .*)"(.*)"( .*)', line):
-            of.signals.append(Signal(match[1], match[2], match[3], match[4]))
-        elif match := re.match(r'CM_ BO_ (\d+) "(.*)";', line):
-            messages[int(match[1])].comment = match[2]
-        elif match := re.match(r'CM_ SG_ (\d+) (\w+) "(.*)";', line):
-            change(match[1], match[2], comment=match[3])
-        elif match := re.match(r"VAL_ (\d+) (\w+) (.*) ;", line):
-            change(match[1], match[2], choices=match[3])
-        elif match := re.match(r"SIG_VALTYPE_ (\d+) (\w+) : 1;", line):
-            change(match[1], match[2], is_float=True)
-        elif line.startswith("CM_"):
-            whole = line
-    words = next(signal.choices for message in messages.values() for signal in message.signals if signal.name == REASON)
-    for message in messages.values():
-        message.signals = [
-            replace(signal, choices=words) if signal.name.startswith(f"{REASON}_") else signal
-            for signal in message.signals
-        ]
-    return head, {message.name: message for message in messages.values()}, whole
-
-
-def _renamed(pattern: Pattern, id_: int, name: str, change: Callable[[Signal], Signal | None], comment: str) -> Pattern:
-    changed = (change(signal) for signal in pattern.signals)
-    return Pattern(id_, name, pattern.sender, [signal for signal in changed if signal is not None], comment)
+def _changed(signal: Signal, **changes: object) -> Signal:
+    """A copy of a signal with other attributes."""
+    other = copy(signal)
+    for name, value in changes.items():
+        setattr(other, name, value)
+    return other
 
 
 def _in_unit(unit: str) -> Callable[[Signal], Signal]:
     """Readings of the axis gx become those of an axis that reads in `unit`."""
     units = {"deg/s": unit, parameter_unit("N", "deg/s"): parameter_unit("N", unit)}
-    return lambda signal: replace(signal, unit=units.get(signal.unit, signal.unit))
+    return lambda signal: _changed(signal, unit=units.get(signal.unit or "", signal.unit))
 
 
 def _hypothesis(names: Names, k: int, reading: str) -> Callable[[Signal], Signal | None]:
@@ -154,13 +111,13 @@ def _hypothesis(names: Names, k: int, reading: str) -> Callable[[Signal], Signal
             return None
         parameter = names.parameters[k][index]
         unit = "" if statistic == "flags" else parameter_unit(parameter, reading)
-        comment = signal.comment
+        comment = str(signal.comment)
         if names.known:
             words = ("the drift parameter, at place 1", "the bandwidth or ratio, at place 2")
             for word in words:
                 comment = comment.replace(word, parameter).replace(word[0].upper() + word[1:], parameter)
         unit = "" if unit == "1" else unit
-        return replace(signal, name=f"{symbol(parameter)}_{statistic}", unit=unit, comment=comment)
+        return _changed(signal, name=f"{symbol(parameter)}_{statistic}", unit=unit, comment=comment)
 
     return change
 
@@ -177,8 +134,8 @@ def _coefficients(names: Names, reading: str) -> Callable[[Signal], Signal | Non
             return None
         name, of = names.columns[int(match[1])]
         unit = f"{reading}/{remark(of)}" if of and match[2] != "probability" else ""
-        comment = signal.comment.replace(f"column {match[1]}", f"column {remark(name)}")
-        return replace(signal, name=f"{symbols[int(match[1])]}_{match[2]}", unit=unit, comment=comment)
+        comment = str(signal.comment).replace(f"column {match[1]}", f"column {remark(name)}")
+        return _changed(signal, name=f"{symbols[int(match[1])]}_{match[2]}", unit=unit, comment=comment)
 
     return change
 
@@ -203,49 +160,51 @@ def _different(names: Iterable[str]) -> list[str]:
 def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS_UNITS)) -> str:
     """The DBC file of a node, whose model has these names and axes. Messages of node 0 have no prefix; those of node 3
     begin with `M3_`, so that files of several nodes go together."""
-    head, patterns, whole = _patterns(PATTERN.read_text(encoding="utf-8"))
-    prefix = f"M{node}_" if node else ""
-    sender = f"MODULE{node}" if node else "MODULE"
-    messages: list[Pattern] = []
+    from cantools.database import load_file
 
-    def add(pattern: str, offset: int, name: str, change: Callable[[Signal], Signal | None], comment: str) -> None:
-        messages.append(_renamed(patterns[pattern], identifier(node, offset), prefix + name, change, comment))
+    pattern = cast("Database", load_file(PATTERN, sort_signals=None))
+    reasons = pattern.get_message_by_name("GX_ADEQUACY").get_signal_by_name(REASON).choices
+    prefix = f"M{node}_" if node else ""
+    messages: list[Written] = []
 
     def same(signal: Signal) -> Signal:
-        return signal
+        return _changed(signal, choices=reasons) if signal.name.startswith(f"{REASON}_") else signal
 
-    def offset(pattern: str) -> int:
-        return patterns[pattern].id - BASE
+    def add(
+        of: str, name: str = "", change: Callable[[Signal], Signal | None] = same, more: int = 0, **words: str
+    ) -> None:
+        """A message like `of` of the pattern, `more` identifiers behind it, with other words in its comment."""
+        like = pattern.get_message_by_name(of)
+        comment = like.comment or ""
+        for theirs, ours in words.items():
+            comment = comment.replace(theirs.replace("_", " "), ours)
+        signals = [signal for signal in map(change, like.signals) if signal is not None]
+        id_ = identifier(node, like.frame_id - BASE + more)
+        messages.append(Written(id_, prefix + (name or of), like.senders[0], signals, comment))
 
-    add("STATUS", offset("STATUS"), "STATUS", same, patterns["STATUS"].comment)
+    add("STATUS")
     for axis in axes:
-        index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
-        add("GX", offset("GX") + index, big, _in_unit(unit), patterns["GX"].comment.replace("gx", axis))
+        add("GX", axis.upper(), _in_unit(AXIS_UNITS[axis]), list(AXIS_UNITS).index(axis), gx=axis)
     for name in ("CORRECTED", "COMMAND", "ANSWER", "TUMBLE"):
-        add(name, offset(name), name, same, patterns[name].comment)
+        add(name)
     small = [name.lower() for name in _different(names.hypotheses)]
     for axis in axes:
         index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
         if names.columns:
-            comment = patterns["GX_COEFFICIENTS"].comment.replace("gx", axis)
-            change = _coefficients(names, unit)
-            add("GX_COEFFICIENTS", offset("GX_COEFFICIENTS") + index, f"{big}_COEFFICIENTS", change, comment)
-        comment = patterns["GX_ADEQUACY"].comment.replace("gx", axis)
-        add("GX_ADEQUACY", offset("GX_ADEQUACY") + index, f"{big}_ADEQUACY", same, comment)
+            add("GX_COEFFICIENTS", f"{big}_COEFFICIENTS", _coefficients(names, unit), index, gx=axis)
+        add("GX_ADEQUACY", f"{big}_ADEQUACY", same, index, gx=axis)
         for k, hypothesis in enumerate(names.hypotheses):
-            comment = patterns["GX_H0"].comment.replace("gx", axis)
-            comment = comment.replace(
-                "hypothesis 0", f"hypothesis {k}{f', {remark(hypothesis)}' if names.known else ''}"
-            )
-            where = offset("GX_H0") + HYPOTHESES * index + k
-            add("GX_H0", where, f"{big}_{small[k].upper()}", _hypothesis(names, k, unit), comment)
-    said: set[tuple[str, str]] = set()
+            known_as = f"hypothesis {k}{f', {remark(hypothesis)}' if names.known else ''}"
+            change = _hypothesis(names, k, unit)
+            add("GX_H0", f"{big}_{small[k].upper()}", change, HYPOTHESES * index + k, gx=axis, hypothesis_0=known_as)
+    commented: set[tuple[str, str | None]] = set()
 
     def first_with(signal: Signal) -> bool:
         """Whether this is the first signal of its name with its comment."""
-        before = len(said)
-        said.update([(signal.name, signal.comment)] if signal.comment else [])
-        return len(said) > before
+        before = len(commented)
+        commented.update([(signal.name, str(signal.comment))] if signal.comment else [])
+        return len(commented) > before
 
-    values = {"head": head, "messages": messages, "whole": whole, "sender": sender, "first_with": first_with}
+    values = {"pattern": pattern, "messages": messages, "first_with": first_with}
+    values["sender"] = f"MODULE{node}" if node else "MODULE"
     return of_code(Path(__file__).parent / "templates").get_template("module.dbc.jinja").render(values)

@@ -21,7 +21,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
-from selfcal import _library32
+from selfcal import _firmware, _library32
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, install
 from selfcal.model.file import Model
@@ -45,6 +45,8 @@ RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is
 #: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
 TREE = Path(__file__).resolve().parents[1] / "tree"
 ROOT = TREE if TREE.is_dir() else TREE.parents[2]
+#: The recording that ships.
+SHIPPED = ROOT / "tests" / "data" / "simulated_adis16405.npz"
 
 
 @lru_cache(maxsize=1)
@@ -133,30 +135,11 @@ def status_text(signal: str, value: float) -> str:
     return f"{int(value)}" if value == int(value) and not entry.unit else f"{value:g} {entry.unit or ''}".strip()
 
 
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte << 4
-        for _ in range(8):
-            crc = (crc << 1) ^ (0xF13 if crc & 0x800 else 0)
-        table.append(crc & 0xFFF)
-    return tuple(table)
-
-
-_CRC = _crc_table()
-
-
-def crc12(data: bytes) -> int:
-    """CRC-12/CDMA2000: polynomial 0xF13, initial value 0xFFF, most significant bit first; "123456789" gives 0xD4D."""
-    crc = 0xFFF
-    for byte in data:
-        crc = ((crc << 8) & 0xFFF) ^ _CRC[(crc >> 4) ^ byte]
-    return crc
-
-
 def frame_crc(frame_id: int, data: bytes) -> int:
     """Checksum of a frame with this id and these 8 bytes: its bits 52 to 63."""
-    return crc12(bytes((frame_id >> 8, frame_id & 0xFF, len(data))) + data[:6] + bytes((data[6] & 0x0F,)))
+    return int(
+        _firmware.crc12(bytes((frame_id >> 8, frame_id & 0xFF, len(data))) + data[:6] + bytes((data[6] & 0x0F,)))
+    )
 
 
 @dataclass
@@ -439,9 +422,9 @@ class Decoder:
         self.statistics.lost = self._sent - self.statistics.received
         if "time_ms" in values:
             # A report may have been begun, and a corrected sample read, 5 min before what was sent before it.
-            told_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else 300_000)
+            begun_ms = self._advance(int(values["time_ms"]), 0 if name == STATUS else 300_000)
         else:
-            told_ms = self._begun(second)
+            begun_ms = self._begun(second)
         if name == STATUS:
             self._take_status(values)
             return self.flush()
@@ -460,7 +443,7 @@ class Decoder:
             return self.flush()
         order = _order(kind, item)
         named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
-        return self._assemble(kind.axis, order, jump, second, told_ms / 1000.0, named)
+        return self._assemble(kind.axis, order, jump, second, begun_ms / 1000.0, named)
 
     def _refused(self) -> list[AxisReport]:
         self.statistics.refused += 1

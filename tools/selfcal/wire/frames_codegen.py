@@ -5,12 +5,9 @@ python -m selfcal.wire.frames_codegen    write lib/selfcal.dbc, lib/selfcal_fram
 
 from __future__ import annotations
 
-import argparse
 import re
 import textwrap
-from dataclasses import dataclass
 from functools import partial
-from operator import attrgetter
 from pathlib import Path
 
 from cantools.database.can import Database, Message
@@ -19,16 +16,13 @@ from jinja2 import Template
 
 from selfcal.base.errors import UserError
 from selfcal.base.templates import of_code
-from selfcal.base.units import parameter_unit
-from selfcal.wire.dbc_file import AXIS_UNITS, COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, dbc
+from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, dbc
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc
 
 #: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 #: Messages of an axis, by what follows its name, and the name of their items in C; alike for all axes.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
-#: Messages that modules send.
-SENT = ("", "_H0", "_COEFFICIENTS", "_ADEQUACY")
 #: Headings of lib/WIRE.md, by what follows an axis's name or by message.
 HEADINGS = {
     "": "Axis",
@@ -46,36 +40,20 @@ MARK = "<!-- The rest is generated: python -m selfcal.wire.frames_codegen -->\n"
 LATER = re.compile(r"c[1-9]_")
 
 
-@dataclass(frozen=True)
-class Field:
-    """One signal of an item: bits `start` to `start + length - 1` of the 32-bit value."""
+def _bits(signal: Signal) -> str:
+    """Where a signal lies, if it does not fill the value."""
+    if signal.length == 32:
+        return ""
+    last = signal.start + signal.length - 1
+    return f", bit {last}" if signal.length == 1 else f", bits {signal.start} to {last}"
 
-    name: str
-    item: int
-    start: int
-    length: int
-    kind: str  # uint, int or float
-    scale: float
-    unit: str
-    meaning: str
 
-    @property
-    def macro(self) -> str:
-        """Name in C, less the prefix."""
-        return self.name.upper()
+def _kind(signal: Signal) -> str:
+    return f"{'float' if signal.is_float else 'int' if signal.is_signed else 'uint'}{signal.length}"
 
-    @property
-    def shape(self) -> str:
-        """Kind, scale and bits in words."""
-        return f"{self.kind}{self.length}" + (f" × {self.scale:g}" if self.scale != 1.0 else "") + self.bits
 
-    @property
-    def bits(self) -> str:
-        """Where it lies, if it does not fill the value."""
-        if self.length == 32:
-            return ""
-        last = self.start + self.length - 1
-        return f", bit {last}" if self.length == 1 else f", bits {self.start} to {last}"
+def _item(signal: Signal) -> int:
+    return (signal.multiplexer_ids or [-1])[0]
 
 
 def _as_elsewhere(signal: Signal) -> bool:
@@ -90,89 +68,45 @@ def _meaning(signal: Signal) -> str:
     return (signal.comment or "").rstrip(".") + (f": {words}" if words else "")
 
 
-def _field(message: Message, signal: Signal) -> Field:
-    where = f"{message.name}.{signal.name}"
-    items = signal.multiplexer_ids
-    if signal.multiplexer_signal != "item" or items is None or len(items) != 1:
-        raise UserError(f"selfcal.dbc: {where}: must belong to one item")
-    if signal.byte_order != "little_endian" or signal.start + signal.length > 32:
-        raise UserError(f"selfcal.dbc: {where}: must be little-endian and within bits 0 to 31")
-    if signal.is_float and (signal.start, signal.length) != (0, 32):
-        raise UserError(f"selfcal.dbc: {where}: a float must fill bits 0 to 31")
-    if signal.conversion.offset != 0:
-        raise UserError(f"selfcal.dbc: {where}: an offset is not supported")
-    return Field(
-        name=signal.name,
-        item=items[0],
-        start=signal.start,
-        length=signal.length,
-        kind="float" if signal.is_float else "int" if signal.is_signed else "uint",
-        scale=float(signal.conversion.scale),
-        unit=signal.unit or "",
-        meaning=_meaning(signal),
-    )
-
-
-def fields(message: Message) -> list[Field]:
-    """The item fields of a message, by item and bit. Raises UserError where the DBC leaves the common layout."""
+def fields(message: Message) -> list[Signal]:
+    """The items' signals of a message, by item and bit. Raises UserError where the DBC leaves the common layout."""
     if message.length != 8 or message.is_extended_frame or message.frame_id > 0x7FF:
         raise UserError(f"selfcal.dbc: {message.name}: must have 8 bytes and a standard id")
     for name, bits in COMMON.items():
         signal = message.get_signal_by_name(name)
         if (signal.start, signal.length) != bits or signal.is_signed or signal.byte_order != "little_endian":
             raise UserError(f"selfcal.dbc: {message.name}.{name}: must be bits {bits[0]} to {sum(bits) - 1}, unsigned")
-    members = [_field(message, signal) for signal in message.signals if signal.name not in COMMON]
-    return sorted(members, key=lambda field: (field.item, field.start))
-
-
-#: Members that are alike in all axis messages: everything but unit and comment.
-_shape = attrgetter("name", "item", "start", "length", "kind", "scale")
+    members = [signal for signal in message.signals if signal.name not in COMMON]
+    for signal in members:
+        within = signal.byte_order == "little_endian" and signal.start + signal.length <= 32
+        whole = not signal.is_float or (signal.start, signal.length) == (0, 32)
+        if signal.multiplexer_signal != "item" or len(signal.multiplexer_ids or ()) != 1 or not (within and whole):
+            wanted = "C packs what is of one item, little-endian within bits 0 to 31, which a float fills"
+            raise UserError(f"selfcal.dbc: {message.name}.{signal.name}: {wanted}")
+    return sorted(members, key=lambda signal: (_item(signal), signal.start))
 
 
 def _first(database: Database, suffix: str) -> Message:
     return database.get_message_by_name(AXES[0].upper() + suffix)
 
 
-def check(database: Database) -> None:
-    """Raise UserError unless the messages of all axes and hypotheses are alike, have the identifiers that C works out,
-    and are in the units of their axes."""
-    columns = [field.item for field in fields(_first(database, "_COEFFICIENTS"))]
+def header(database: Database) -> str:
+    """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack: messages of other axes
+    and hypotheses are made from the first one's (dbc_file.py)."""
+    columns = [_item(signal) for signal in fields(_first(database, "_COEFFICIENTS"))]
     if columns != list(range(3 * COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
-    suffixes = [*OF_AXIS, *(f"_H{k}" for k in range(1, HYPOTHESES))]
-    for index, axis in enumerate(AXES):
-        for suffix in suffixes:
-            pattern = _first(database, "_H0" if suffix.startswith("_H") else suffix)
-            message = database.get_message_by_name(axis.upper() + suffix)
-            k = int(suffix[2:]) if suffix.startswith("_H") else None
-            if message.frame_id != pattern.frame_id + (index if k is None else HYPOTHESES * index + k):
-                raise UserError(f"selfcal.dbc: {message.name}: identifier {message.frame_id:#x} is out of line")
-            mine = fields(message)
-            if [_shape(field) for field in mine] != [_shape(field) for field in fields(pattern)]:
-                raise UserError(f"selfcal.dbc: {message.name}: differs from {pattern.name}")
-            for field in mine:
-                parameter = "bias" if field.name.startswith("bias_") else field.name.partition("_")[0]
-                if parameter not in ("bias", PLACE_NAMES[0]) or field.name.endswith("_flags"):
-                    continue
-                unit = parameter_unit(parameter, AXIS_UNITS[axis])
-                if field.unit != unit:
-                    raise UserError(f"selfcal.dbc: {message.name}.{field.name}: unit '{field.unit}', not '{unit}'")
-
-
-def header(database: Database) -> str:
-    """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack."""
-    check(database)
     status, corrected, command, answer, tumble = map(
         database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE)
     )
     values = {
         "version": int(database.version or 0),
-        "of_axis": {OF_AXIS[suffix]: _first(database, suffix) for suffix in SENT},
+        "of_axis": {name: _first(database, suffix) for suffix, name in OF_AXIS.items()},
         "of_node": [status, corrected],
         "command": command,
         "of_host": [answer, tumble],
-        "members_of": lambda message: [field for field in fields(message) if not LATER.match(field.name)],
-        "later_of": lambda message: any(LATER.match(field.name) for field in fields(message)),
+        "members_of": lambda message: [signal for signal in fields(message) if not LATER.match(signal.name)],
+        "later_of": lambda message: any(LATER.match(signal.name) for signal in fields(message)),
         "choices_of": _choices,
         "COMMON": COMMON,
         **{"NODES": NODES, "NODE_IDS": NODE_IDS, "AXES": AXES, "HYPOTHESES": HYPOTHESES},
@@ -190,14 +124,13 @@ def _choices(message: Message) -> list[tuple[str, int, str]]:
 
 def table(database: Database) -> str:
     """Every signal of every message for lib/WIRE.md, as Markdown lists."""
-    check(database)
     status, command = map(database.get_message_by_name, (STATUS, COMMAND))
-    messages: list[tuple[str, str, list[Field], dict[str, str]]] = []
+    messages: list[tuple[str, str, list[Signal], dict[str, str | None]]] = []
     for suffix in OF_AXIS:
         first, *_, last = of_axes = [database.get_message_by_name(axis.upper() + suffix) for axis in AXES]
         ids = ", ".join(f"`0x{message.frame_id:X}` {message.name}" for message in of_axes)
         more = f"; `_H1` to `_H{HYPOTHESES - 1}` follow each" if suffix == "_H0" else ""
-        units = {field.name: field.unit for field in fields(last)}
+        units = {signal.name: signal.unit for signal in fields(last)}
         messages.append((HEADINGS[suffix], ids + more, fields(first), units))
     for message in map(database.get_message_by_name, (STATUS, CORRECTED, ANSWER, TUMBLE)):
         messages.append((HEADINGS[message.name], f"`0x{message.frame_id:X}` {message.name}", fields(message), {}))
@@ -214,6 +147,7 @@ def table(database: Database) -> str:
 def _template(name: str) -> Template:
     templates = of_code(Path(__file__).parent / "templates")
     wrap = partial(textwrap.fill, width=120, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    templates.filters |= {"bits": _bits, "kind": _kind, "item": _item, "meaning": _meaning}
     templates.filters |= {"entry": lambda text: wrap(f"- {text}"), "wrapped": partial(textwrap.fill, width=120)}
     return templates.get_template(name)
 
@@ -226,18 +160,8 @@ def page(text: str, database: Database) -> str:
     return head + mark + "\n" + table(database)
 
 
-def main() -> None:
-    """Write DBC file, header and page."""
-    parser = argparse.ArgumentParser(prog="python -m selfcal.wire.frames_codegen", description=__doc__)
-    parser.parse_args()
-    try:
-        wire = ROOT / "lib" / "WIRE.md"
-        (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")  # first: the others are made from it
-        wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
-        (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")
-    except UserError as error:
-        parser.exit(2, f"selfcal: error: {error}\n")
-
-
 if __name__ == "__main__":
-    main()
+    wire = ROOT / "lib" / "WIRE.md"
+    (ROOT / "lib" / "selfcal.dbc").write_text(dbc(), encoding="utf-8")  # first: the others are made from it
+    wire.write_text(page(wire.read_text(encoding="utf-8"), load_dbc()), encoding="utf-8")
+    (ROOT / "lib" / "selfcal_frames.h").write_text(header(load_dbc()), encoding="utf-8")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from contextlib import suppress
 from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
@@ -13,7 +13,7 @@ from selfcal.base.errors import UserError
 from selfcal.diagnosis.warm import Start, warmed
 from selfcal.diagnosis.warm import load as load_start
 from selfcal.model.file import Model
-from selfcal.model.tables import Tables, make_tables
+from selfcal.model.tables import make_tables
 from selfcal.wire.dbc_file import BY_PLACE, Names
 from selfcal.wire.frames import AXES, names_of
 
@@ -54,31 +54,7 @@ def _ids(model: Model, start: Start | None, interval_s: float, block: int) -> It
         return
     sent = [axis for axis in model.axes if axis in AXES]
     for target in model.nodes:
-        try:
-            tables = make_tables(model, block / interval_s, tuple(sent), target, 1.0 / interval_s)
-            tables = warmed(tables, start)
-        except UserError:  # an interval that the model has no tables for
-            continue
         for count in range(len(sent), 0, -1):
-            for chosen in combinations(range(len(sent)), count):
-                yield _chosen(tables, chosen).id
-
-
-def _chosen(tables: Tables, axes: tuple[int, ...]) -> Tables:
-    """The tables of some of the axes."""
-    return replace(
-        tables,
-        axes=tuple(tables.axes[k] for k in axes),
-        hypotheses=tuple(
-            replace(h, priors=tuple(h.priors[k] for k in axes)) if h.priors else h for h in tables.hypotheses
-        ),
-        regressors=tuple(
-            replace(
-                column,
-                coefficient_sd=tuple(column.coefficient_sd[k] for k in axes),
-                ln_odds=tuple(column.ln_odds[k] for k in axes),
-                coefficient_mean=tuple(column.coefficient_mean[k] for k in axes if column.coefficient_mean),
-            )
-            for column in tables.regressors
-        ),
-    )
+            for axes in combinations(sent, count):
+                with suppress(UserError):  # an interval that the model has no tables for
+                    yield warmed(make_tables(model, block / interval_s, axes, target, 1.0 / interval_s), start).id

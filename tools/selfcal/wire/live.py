@@ -35,8 +35,8 @@ from selfcal.wire.frames import (
 )
 
 #: Status fields that this view omits.
-UNTOLD = {"time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent"}
-UNTOLD |= {f"reason_{axis}" for axis in AXES}
+OMITTED = {"time_ms", "wire_version", "model_id", "bank_interval", "bank_block", "state", "report", "frames_sent"}
+OMITTED |= {f"reason_{axis}" for axis in AXES}
 #: Least change of the temperature for a coefficient, degC: ArduPilot's rule (TCAL).
 TEMPERATURE_NEEDED = 10.0
 #: States that need the user.
@@ -345,7 +345,7 @@ class View:
         lines += self._sufficiency(last)
         if last:
             names = self.names(module.decoder.status)
-            count = max((report.hypotheses or told_of(report) for report, _ in last.values()), default=0)
+            count = max((report.hypotheses or hypotheses_seen(report) for report, _ in last.values()), default=0)
             named = (names.hypotheses if count <= len(names.hypotheses) else BY_PLACE.hypotheses)[:count]
             lines.append(_line(_heading(named, _bar_cells(len(named), width))))
             blocks = self._blocks(module, last, names, len(named), width)
@@ -407,7 +407,7 @@ class View:
         """What the status says that is not 0, by its signals' names (port/README.md); trouble first."""
         said: list[Text] = []
         for name, value in list(module.decoder.status.items()):
-            if name not in UNTOLD and value != 0.0:
+            if name not in OMITTED and value != 0.0:
                 text = status_text(name, value)
                 trouble = TROUBLE.get(name) == text or name in ("sensor_fault", "axes_retired", "state_refused")
                 said.insert(0 if trouble else len(said), Text(f"{name} {text}", "red" if trouble else "dim"))
@@ -473,7 +473,7 @@ def frame_counts(streams: Streams | Decoder, source: Source) -> str:
     return f"{counted(streams.statistics)}, {source.malformed} malformed"
 
 
-def told_of(report: AxisReport) -> int:
+def hypotheses_seen(report: AxisReport) -> int:
     """Fewest hypotheses of a report, by its values."""
     return max((k + 1 for k in range(len(BY_PLACE.hypotheses)) if f"h{k}_probability" in report.values), default=0)
 
@@ -482,7 +482,7 @@ def most_probable(report: AxisReport, names: Names = BY_PLACE) -> int | None:
     """The hypothesis with the greatest probability; None if a missing probability, or NaN, could be
     greater. If the report lacks their number, a model's `names` have it."""
     count = report.hypotheses or (len(names.hypotheses) if names.known else None)
-    signals = {k: f"h{k}_probability" for k in range(told_of(report))}
+    signals = {k: f"h{k}_probability" for k in range(hypotheses_seen(report))}
     probabilities = {k: report.values[signal] for k, signal in signals.items() if signal in report.values}
     if not probabilities or len(probabilities) != count:
         return None

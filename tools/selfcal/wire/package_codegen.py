@@ -5,7 +5,6 @@ python -m selfcal.wire.package_codegen    write lib/default/, the versions in li
 
 from __future__ import annotations
 
-import argparse
 import re
 import shutil
 from pathlib import Path
@@ -46,15 +45,5 @@ def write(library: Path) -> None:
     shutil.copyfile(ROOT / "LICENSE", library / "LICENSE")
 
 
-def main() -> None:
-    """Write the files of lib/."""
-    parser = argparse.ArgumentParser(prog="python -m selfcal.wire.package_codegen", description=__doc__)
-    parser.parse_args()
-    try:
-        write(ROOT / "lib")
-    except UserError as error:
-        parser.exit(2, f"selfcal: error: {error}\n")
-
-
 if __name__ == "__main__":
-    main()
+    write(ROOT / "lib")

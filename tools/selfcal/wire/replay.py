@@ -44,7 +44,6 @@ from selfcal.model.tables import Tables, bank_block, make_tables
 from selfcal.readings.readings import look
 from selfcal.wire.ahead import error_ahead, of_report
 from selfcal.wire.c_tables import check_forms, write_tables
-from selfcal.wire.dbc_file import HYPOTHESES
 from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
 from selfcal.wire.live import View, frame_counts
 
@@ -99,15 +98,6 @@ TARGETS = {
 def tables_of(model: Model, rate_hz: float, axes: Sequence[str], target: str, start: Start | None) -> Tables:
     """Tables of a firmware, with measured priors from `start`."""
     return warmed(make_tables(model, rate_hz, tuple(axes), target), start)
-
-
-def check_sent(model: Model) -> None:
-    """Raise UserError for a model with more hypotheses than telemetry carries."""
-    if len(model.hypotheses) > HYPOTHESES:
-        raise UserError(
-            f"{model.path}: telemetry carries {HYPOTHESES} hypotheses at most, and this model has "
-            f"{len(model.hypotheses)}; take `identify`"
-        )
 
 
 def build(

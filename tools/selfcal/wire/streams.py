@@ -27,7 +27,7 @@ from selfcal.base.units import parameter_unit
 from selfcal.logs.framelog import FRAMES
 from selfcal.wire.dbc_file import PLACE_NAMES, Names
 from selfcal.wire.frames import AXES, STATISTICS, AxisReport, axis_unit
-from selfcal.wire.live import told_of
+from selfcal.wire.live import hypotheses_seen
 from selfcal.wire.ros_messages import diagnostics, imu
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def content(report: AxisReport, names: Names) -> dict[str, Any]:
     if "count" in v:
         entry["averages"] = int(v["count"])
     laws: dict[str, Any] = {}
-    for k in range(report.hypotheses or told_of(report)):
+    for k in range(report.hypotheses or hypotheses_seen(report)):
         named = k < len(names.hypotheses)
         law: dict[str, Any] = {}
         if f"h{k}_probability" in v:

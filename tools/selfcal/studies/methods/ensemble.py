@@ -90,7 +90,7 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
                     parameter: _errors(mine, by_rival.get(REFERENCE), parameter, group.priors[parameter])
                     for parameter in NAMED[law].parameters
                 }
-                entry["choice"] = {one: _choice(mine, one, law) for one in _criteria(mine)}
+                entry["choice"] = {criterion: _choice(mine, criterion, law) for criterion in _criteria(mine)}
                 entries.append(entry)
     return entries
 
@@ -157,7 +157,7 @@ def _ratio(ours: Floats, theirs: Floats) -> tuple[float, float, float]:
 def _choice(rows: Sequence[Row], criterion: str, law: str) -> dict[str, float]:
     """How often the true law has the greatest weight; mean of the ln of its weight, with the standard error."""
     laws = sorted({key.split(".")[2] for row in rows for key in row if key.startswith(f"weight.{criterion}.")})
-    weight = np.array([_column(rows, f"weight.{criterion}.{one}") for one in laws])
+    weight = np.array([_column(rows, f"weight.{criterion}.{weighed}") for weighed in laws])
     true = weight[laws.index(law)]
     score = np.log(np.maximum(np.nan_to_num(true), LEAST_WEIGHT))
     hit: NDArray[np.bool_] = true >= np.nan_to_num(weight).max(axis=0)

@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Prior
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, probabilities
@@ -33,8 +34,7 @@ def grid(problem: Problem) -> Answer:
         estimates[law] = {}
         for name, ln_value in zip(NAMED[law].parameters, at, strict=True):
             values, index = np.unique(ln_value, return_inverse=True)
-            mass = np.bincount(index, weight)
-            low, high = np.interp([0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)
+            low, high = weighted_quantiles(values, np.bincount(index, weight), (0.05, 0.95))
             estimates[law][name] = Value(math.exp(float(weight @ ln_value)), math.exp(low), math.exp(high))
     return Answer(estimates, probabilities(ln_evidence))
 

@@ -63,17 +63,13 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
 
 def kalman_filter(problem: Problem, law: str, theta: Floats) -> KalmanFilter:
     """Level and drift at one node."""
-    dt = problem.dt_s
     kalman = KalmanFilter(dim_x=2, dim_z=1)
     kalman.H = np.ones((1, 2))
-    kalman.R = np.array([[theta[0] ** 2 / dt]])
+    kalman.R = np.array([[theta[0] ** 2 / problem.dt_s]])
     kalman.P = np.diag([(LEVEL_SD * float(problem.y.std())) ** 2, 0.0])
-    kalman.Q = np.zeros((2, 2))
-    if law == "random_walk":
-        kalman.Q[1, 1] = theta[1] ** 2 * dt
-    elif law == "gauss_markov":
-        kalman.F = np.diag([1.0, math.exp(-theta[2] * dt)])
-        kalman.Q[1, 1] = theta[1] ** 2 * -math.expm1(-2.0 * theta[2] * dt)
+    phi, variance = problem.step(law, np.log(theta))
+    kalman.F, kalman.Q = np.diag([1.0, float(phi)]), np.diag([0.0, float(variance)])
+    if law == "gauss_markov":
         kalman.P[1, 1] = theta[1] ** 2
     return kalman
 

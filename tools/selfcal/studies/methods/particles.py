@@ -82,21 +82,10 @@ def step(
 ) -> tuple[Floats, Floats]:
     """ln likelihood of a reading [particles], and the state, whose drift is drawn."""
     level, drift = state
-    phi, variance = transition(problem, law, ln_theta)
+    phi, variance = problem.step(law, ln_theta)
     drift = phi * drift + np.sqrt(variance) * rng.standard_normal(PARTICLES)
     noise = np.exp(2.0 * ln_theta[0]) / problem.dt_s
     return -0.5 * ((value - level - drift) ** 2 / noise + np.log(2.0 * math.pi * noise)), np.stack([level, drift])
-
-
-def transition(problem: Problem, law: str, ln_theta: Floats) -> tuple[Floats, Floats]:
-    """What remains of the drift after a sample, and the variance of what is added, at parameters [d, m]."""
-    ones = np.ones(ln_theta.shape[1:])
-    if law == "random_walk":
-        return ones, np.exp(2.0 * ln_theta[1]) * problem.dt_s
-    if law == "gauss_markov":
-        rate = np.exp(ln_theta[2]) * problem.dt_s
-        return np.exp(-rate), np.exp(2.0 * ln_theta[1]) * -np.expm1(-2.0 * rate)
-    return ones, 0.0 * ones
 
 
 def _draw(prior: Prior, rng: np.random.Generator) -> Floats:

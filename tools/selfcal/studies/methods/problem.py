@@ -12,6 +12,7 @@ from scipy import optimize
 
 from selfcal.adequacy.allan import Terms, overlapping, terms_of
 from selfcal.bank.result import HALF_90
+from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Group, Prior
 from selfcal.model.laws import NAMED
 
@@ -44,6 +45,16 @@ class Problem:
         """The law at the logarithms of its parameters."""
         theta = dict(zip(NAMED[law].parameters, np.exp(ln_theta).tolist(), strict=True))
         return terms_of(NAMED[law], theta, self.dt_s)
+
+    def step(self, law: str, ln_theta: Floats) -> tuple[Floats, Floats]:
+        """What remains of the drift after a sample, and the variance of what is added, at ln parameters [d, ...]."""
+        ones = np.ones(ln_theta.shape[1:])
+        if law == "random_walk":
+            return ones, np.exp(2.0 * ln_theta[1]) * self.dt_s
+        if law == "gauss_markov":
+            rate = np.exp(ln_theta[2]) * self.dt_s
+            return np.exp(-rate), np.exp(2.0 * ln_theta[1]) * -np.expm1(-2.0 * rate)
+        return ones, 0.0 * ones
 
     def starts(self, law: str) -> list[Floats]:
         """Where a search begins: moments of the record, and for Gauss-Markov three correlation times."""
@@ -105,8 +116,8 @@ def weighted(names: Sequence[str], ln_theta: Floats, weight: Floats) -> dict[str
     parameters = {}
     for name, column in zip(names, ln_theta, strict=True):
         values, index = np.unique(column, return_inverse=True)
-        mass = np.bincount(index, weight)
-        parameters[name] = Value(*np.exp(np.interp([0.5, 0.05, 0.95], np.cumsum(mass) - 0.5 * mass, values)).tolist())
+        quantiles = weighted_quantiles(values, np.bincount(index, weight), (0.5, 0.05, 0.95))
+        parameters[name] = Value(*np.exp(quantiles).tolist())
     return parameters
 
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from selfcal.studies.methods.particles import PARTICLES, answer, transition
+from selfcal.studies.methods.particles import PARTICLES, answer
 from selfcal.studies.methods.problem import Answer, Floats, Problem
 
 
@@ -32,7 +32,7 @@ def step(
 ) -> tuple[Floats, Floats]:
     """ln likelihood of a reading [particles], and the state after it. Nothing is drawn."""
     level, drift, level_variance, drift_variance, both = state
-    phi, added = transition(problem, law, ln_theta)
+    phi, added = problem.step(law, ln_theta)
     drift, drift_variance, both = phi * drift, phi**2 * drift_variance + added, phi * both
     level_gain, drift_gain = level_variance + both, both + drift_variance
     variance = level_gain + drift_gain + np.exp(2.0 * ln_theta[0]) / problem.dt_s

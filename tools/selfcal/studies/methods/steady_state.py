@@ -22,19 +22,14 @@ def steady_state(problem: Problem) -> Answer:
 
 def ln_likelihood(problem: Problem, law: str, ln_theta: Floats) -> float:
     """Of all samples but the first, or about the best constant where the law has a mean."""
-    y, dt = problem.y, problem.dt_s
-    theta = np.exp(ln_theta)
-    r = theta[0] ** 2 / dt
+    y = problem.y
+    r = math.exp(2.0 * ln_theta[0]) / problem.dt_s
+    phi, q = map(float, problem.step(law, ln_theta) if law != "constant" else (0.0, 0.0))
     if law == "random_walk":
-        q = theta[1] ** 2 * dt
         p = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
         g = p / (p + r)
         e = signal.lfilter([1.0], [1.0, -(1.0 - g)], np.diff(y))
         return float(-0.5 * e.size * math.log(p + r) - 0.5 * (e @ e) / (p + r))
-    phi, q = 0.0, 0.0
-    if law == "gauss_markov":
-        phi = math.exp(-theta[2] * dt)
-        q = theta[1] ** 2 * -math.expm1(-2.0 * theta[2] * dt)
     b = (1.0 - phi * phi) * r - q
     p = 0.5 * (-b + math.sqrt(b * b + 4.0 * q * r))
     g = p / (p + r)

@@ -88,7 +88,7 @@ def ensemble(
     model: Model, seeds: Sequence[int], seed: int, scheduler: str | None, results: Path | str | None
 ) -> list[Row]:
     """The rows of a record of each law and seed; `seed`: they follow from it."""
-    jobs = [(law, one) for one in seeds for law in model.hypotheses]
+    jobs = [(law, record_seed) for record_seed in seeds for law in model.hypotheses]
     settings = {"schema": "selfcal.paper/2", "model": settings_of(model), "seed": seed, "marks": MARKS}
     return spread(partial(rows_of, model), jobs, settings=settings, scheduler=scheduler, results=results)
 

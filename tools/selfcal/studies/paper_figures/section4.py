@@ -177,7 +177,9 @@ def _far_off(titles: Iterable[str], last_of: Mapping[str, Sequence[Estimate]]) -
     still have medians far apart."""
     said = []
     for name, estimates in last_of.items():
-        times = np.array([estimate.median for estimate in estimates]) / np.median([one.median for one in estimates])
+        times = np.array([estimate.median for estimate in estimates]) / np.median(
+            [estimate.median for estimate in estimates]
+        )
         k = int(np.argmax(np.abs(np.log(times))))
         if max(times[k], 1.0 / times[k]) > FAR_OFF:
             factor = f"{times[k]:.2g} times" if times[k] > 1.0 else f"1/{1.0 / times[k]:.2g} of"
@@ -286,7 +288,7 @@ def figures_5_and_6(model: Model, records: Mapping[str, Array], real_ones: bool,
             rms_figures,
             f"The computed rms falls over time, to {PAPER_N_SD:g} (m/s²)/√Hz of N and 6e-5 (m/s³)/√Hz of K.",
             "; ".join(said)
-            + f". At the end the rms is {'consistent' if max(*own, *(1 / one for one in own)) < NEAR else 'off'}.",
+            + f". At the end the rms is {'consistent' if max(*own, *(1 / ratio for ratio in own)) < NEAR else 'off'}.",
             "agrees" if float(sd["N"].max()) < 2.0 * PAPER_N_SD else "differs",
             f"N of n readings has an sd of N/√(2n), {PAPER_N / math.sqrt(2.0 * DURATION):.1e} of {DURATION} means of "
             f"1 s: the paper's {PAPER_N_SD:g} needs {0.5 * (PAPER_N / PAPER_N_SD) ** 2:.2g} readings.",
