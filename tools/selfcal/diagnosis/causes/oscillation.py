@@ -49,7 +49,7 @@ def _line(state: State, record: Record, found: Swing) -> list[Look]:
     damping. Of the band in which oscillations are looked for."""
     period, _, _ = found.numbers
     width = 1.0 / (state.y.size * state.dt)
-    tried = [1.0 / period + move * width for move in np.linspace(-1.0, 1.0, 17)]
+    tried = (1.0 / period + width * np.linspace(-1.0, 1.0, 17)).tolist()
     gains = state.scores([np.array([*periodic.pair(f, record).values()]) for f in tried])
     line = periodic.at(state, record, (tried[int(np.argmax(gains))],))
     if line.gain < found.gain - ALIKE:
