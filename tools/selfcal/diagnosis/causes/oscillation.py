@@ -18,17 +18,18 @@ from selfcal.diagnosis.causes import periodic
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.statistics import swinging
+from selfcal.diagnosis.statistics import states_of
 from selfcal.diagnosis.swing import Swing
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import ALIKE, Look, State, net, of_parameter
-from selfcal.likelihood.statemodel import PERIOD_LIMITS, Array
+from selfcal.likelihood.statemodel import PERIOD_LIMITS, Array, Matrices
 from selfcal.model.file import Model
 from selfcal.model.laws import DAMPING_LIMITS, RATIO_LIMITS
 from selfcal.model.laws import swing as turned
 
 #: The prior of the size in the model file, over the size found.
 RATIOS = (0.1, 10.0)
+
 
 def looks(state: State, record: Record) -> list[Look]:
     """The oscillator that gains most, the drift fitted with it."""
@@ -77,7 +78,8 @@ def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     """From sample to sample by the exact transition."""
     t = channels.time_s
     F = turned(keys["period_s"], keys["damping"], float(t[1] - t[0]))
-    return float(keys["sd"]) * swinging(F, np.eye(2) - F @ F.T, np.eye(2), t.size, channels.random)
+    law = Matrices(F, np.eye(2) - F @ F.T, np.array([float(keys["sd"]), 0.0]), np.eye(2), 0.0)
+    return states_of(law, np.ones(t.size), channels.random)
 
 
 def _extend(at: Extension) -> None:
