@@ -51,8 +51,8 @@ def _held(record: Record) -> Mask:
     for state in record.axes.values():
         same = np.zeros(record.present.size, bool)
         same[1:] = np.diff(state.y) == 0.0
-        if state.axis in record.unclipped:
-            same &= record.unclipped[state.axis] == state.y  # a clipped reading repeats for being clipped
+        if state.axis in record.redrawn:
+            same &= record.redrawn[state.axis] == state.y  # a clipped reading repeats for being clipped
         repeats.append(same)
     if not repeats or any(state.redrawn for state in record.axes.values()):
         return none  # means of blocks repeat by chance: a held reading shows at the recording's own rate
@@ -156,61 +156,51 @@ def _averaged(steps: float) -> bool:
     return 1.5 < steps < AVERAGED_MOST + 0.5 and abs(steps - round(steps)) < 0.002 * steps
 
 
-def quantization(state: State) -> Look | None:
-    """A lattice that the model file does not state and that is coarse against the white noise."""
-    q = state.lsb
-    stated = state.stated_lsb
+def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
+    """Readings are clipped at a limit."""
+    state, readings = record.axes[axis], record.readings.get(axis)
+    if readings is None or readings.clipped is None or state.below_lattice:
+        return None
+    clipped = readings.clipped
+    sd = readings.lattice.step / 4.0 if readings.lattice is not None else 1e-6 * abs(clipped.limit)
+    estimate = {"limit": interval(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
+    return _anew(record, axis, Look("saturation", clipped.nats, clipped.nats, estimate, {}))
+
+
+def quantization(record: Record, axis: str) -> tuple[Look, State] | None:
+    """Codes that are not alike; or a lattice that the model file does not state and that is coarse against the white
+    noise."""
+    state, readings = record.axes[axis], record.readings.get(axis)
+    found = None if readings is None or readings.clipped is not None else readings.uneven
+    if readings is not None and found is not None and not state.below_lattice:
+        step = 0.0 if readings.lattice is None else readings.lattice.step
+        lsb = {"lsb": interval(step, step * 1e-3, state.unit)} if step > 0.0 else {}
+        estimate: dict[str, Any] = {**lsb, "misread": interval(found.share, found.sd, "1")}
+        if found.value is not None and found.width is not None:
+            estimate["value"] = interval(found.value, 0.0, state.unit)
+            estimate["width"] = interval(found.width, 0.0, state.unit)
+        changes = {"stated_lsb": step} if lsb else {}
+        return _anew(record, axis, Look("quantization", found.nats, found.nats, estimate, changes))
+    q, stated = state.lsb, state.stated_lsb
     if q <= 0.0 or (stated > 0.0 and abs(q / stated - 1.0) < 0.02) or _averaged(stated / q):
         return None
     sigma = state.best.sigma
     white = math.sqrt(max(sigma**2 - q * q / 12.0, 1e-12 * sigma**2))
     if q / white < LATTICE_LEAST:
         return None
-    n = state.best.n
     # Continuous readings would fall within 1/1000 of a lattice by chance: ln 1000 nats each.
-    gain = n * math.log(max(q / white, 1.0) * 10.0)
-    return Look(
-        "quantization",
-        gain,
-        gain,
-        {"lsb": interval(q, q * 1e-3, state.unit)},
-        {"stated_lsb": q},
-    )
+    gain = state.best.n * math.log(max(q / white, 1.0) * 10.0)
+    look = Look("quantization", gain, gain, {"lsb": interval(q, q * 1e-3, state.unit)}, {"stated_lsb": q})
+    return look, replace(state, stated_lsb=q)
 
 
-def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
-    """Readings are clipped at a limit. In a record at the recording's own rate they are drawn anew beyond the limit, so
-    that the rest is judged as if it had not been clipped. Means are of those from the start."""
-    state, readings = record.axes[axis], record.readings.get(axis)
-    if readings is None or readings.clipped is None:
-        return None
-    clipped = readings.clipped
-    sd = readings.lattice.step / 4.0 if readings.lattice is not None else 1e-6 * abs(clipped.limit)
-    estimate = {"limit": interval(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
-    look = Look("saturation", clipped.nats, clipped.nats, estimate, {})
-    if axis not in record.unclipped:
+def _anew(record: Record, axis: str, look: Look) -> tuple[Look, State]:
+    """In a record at the recording's own rate the readings concerned are drawn anew, so that the rest is judged as if
+    they were sound. Means are of such from the start."""
+    state = record.axes[axis]
+    if axis not in record.redrawn:
         return look, state
-    y = np.where(np.isfinite(state.y), record.unclipped[axis], np.nan)
-    return look, state.refit(y=y, redrawn=True)
-
-
-def uneven(record: Record, axis: str) -> tuple[Look, State] | None:
-    """Codes that are not alike. In a record at the recording's own rate each reading is drawn anew among the codes that
-    it may come from."""
-    state, readings = record.axes[axis], record.readings.get(axis)
-    found = None if readings is None else readings.uneven
-    if readings is None or found is None:
-        return None
-    step = 0.0 if readings.lattice is None else readings.lattice.step
-    lsb = {"lsb": interval(step, step * 1e-3, state.unit)} if step > 0.0 else {}
-    estimate: dict[str, Any] = {**lsb, "misread": interval(found.share, found.sd, "1")}
-    if found.value is not None and found.width is not None:
-        estimate["value"] = interval(found.value, 0.0, state.unit)
-        estimate["width"] = interval(found.width, 0.0, state.unit)
-    look = Look("quantization", found.nats, found.nats, estimate, {"stated_lsb": step} if lsb else {})
-    if axis not in record.alike:
-        return look, state
-    y = np.where(np.isfinite(state.y), record.alike[axis], np.nan)
+    y = np.where(np.isfinite(state.y), record.redrawn[axis], np.nan)
     return look, state.refit(y=y, redrawn=True, **look.changes)
 
 

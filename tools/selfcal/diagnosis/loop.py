@@ -187,23 +187,11 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
         if name in gone:
             one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
-        clipped = None if states[name].below_lattice else integrity.saturation(replace(record, axes=states), name)
-        if clipped is not None:
-            if name in found:
-                found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
-            states[name] = clipped[1]
-        spoilt_codes = clipped is None and not states[name].below_lattice
-        uneven = integrity.uneven(replace(record, axes=states), name) if spoilt_codes else None
-        if uneven is not None:
-            if name in found:
-                found[name].findings.append(Finding(uneven[0], 0, states[name], uneven[1]))
-            states[name] = uneven[1]
-        lattice = integrity.quantization(states[name])
-        if lattice is not None and uneven is None:
-            before = states[name]
-            states[name] = replace(before, stated_lsb=before.lsb)
-            if name in found:
-                found[name].findings.append(Finding(lattice, 0, before, states[name]))
+        for test in (integrity.saturation, integrity.quantization):
+            told = test(replace(record, axes=states), name)
+            if told is not None and name in found:
+                found[name].findings.append(Finding(told[0], 0, states[name], told[1]))
+            states[name] = states[name] if told is None else told[1]
         if name in found:
             found[name].state = states[name]
     return replace(record, axes=states)
