@@ -16,10 +16,9 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from conftest import CALLED, run
-from generator import CAUSES, CLEAN, Record, draw
 from scipy.optimize import minimize
 from scipy.signal import lfilter
+
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
@@ -41,6 +40,9 @@ from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
 from selfcal.verbs.simulate import simulate
+
+from conftest import CALLED, run
+from generator import CAUSES, CLEAN, Record, draw
 
 SEED = 4100
 RATE_HZ = 2.0
