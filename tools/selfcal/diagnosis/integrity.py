@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,6 @@ from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, Look, State, interval
 from selfcal.likelihood.statemodel import Mask
-from selfcal.readings.readings import Readings
 
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
@@ -95,60 +95,40 @@ def rate_changes(record: Record) -> list[Look]:
     ]
 
 
-def held_samples(record: Record, axis: str) -> Look | None:
-    """The logger asks oftener than the part measures, always or in stretches."""
+def of_readings(record: Record, axis: str) -> Iterator[Look]:
+    """What the readings of an axis show by themselves."""
     readings = record.readings.get(axis)
     if readings is None:
-        return None
-    if readings.held_hz is None:
-        return _slower(readings) if readings.slower else None
-    # Each reading that is asked for again repeats; by chance one in 100 would at most.
-    nats = min(1e6, readings.values.size * math.log(100.0))
-    return Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
+        return
+    n, time_s = readings.values.size, readings.recording.time_s
+    if (changed := readings.misread) is not None:  # by a map of the firmware or the logger
+        fraction = interval(changed.share, math.sqrt(changed.share / n), "1")
+        yield Look("misread", changed.nats, changed.nats, {"kind": changed.kind, "fraction": fraction}, {})
+    if readings.held_hz is not None:  # the logger asks oftener than the part measures, always or in stretches
+        # Each reading that is asked for again repeats; by chance one in 100 would at most.
+        nats = min(1e6, n * math.log(100.0))
+        yield Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
+    elif readings.slower:
+        surest = max(readings.slower, key=lambda one: one.nats)
+        rate_hz = interval(readings.recording.rate_hz / surest.ratio, 0.0, "Hz")
+        nats = min(1e6, sum(one.nats for one in readings.slower))
+        yield _of_stretches("held_samples", nats, readings.slower_intervals, rate_hz=rate_hz)
+    if readings.intervals:
+        yield _of_stretches("stuck", readings.stuck_nats, readings.intervals)
+    if (common := readings.recurring) is not None:  # one value too often
+        mask, share = common.mask, common.share
+        times = time_s[mask if mask.any() else readings.values == common.value]
+        when = (float(times[0]), float(times[-1]))
+        estimate = {
+            "fraction": interval(share, math.sqrt(share / mask.size), "1"),
+            "time_s": interval(when[0], 0.0, "s"),
+        }
+        yield Look("outliers", common.nats, common.nats, estimate, {}, when=when)
 
 
-def _slower(readings: Readings) -> Look:
-    """Stretches in which each reading is held; the rate is that of the surest."""
-    surest = max(readings.slower, key=lambda one: one.nats)
-    nats = min(1e6, sum(one.nats for one in readings.slower))
-    intervals = readings.slower_intervals
-    rate_hz = readings.recording.rate_hz / surest.ratio
-    estimate = {"rate_hz": interval(rate_hz, 0.0, "Hz"), "intervals": intervals}
-    return Look("held_samples", nats, nats, estimate, {}, when=(intervals[0][0], intervals[-1][1]))
-
-
-def recurring(record: Record, axis: str) -> Look | None:
-    """Readings that are one value too often."""
-    readings = record.readings.get(axis)
-    if readings is None or readings.recurring is None:
-        return None
-    mask, nats, share = readings.recurring.mask, readings.recurring.nats, readings.recurring.share
-    times = readings.recording.time_s[mask if mask.any() else readings.values == readings.recurring.value]
-    estimate = {
-        "fraction": interval(share, math.sqrt(share / mask.size), "1"),
-        "time_s": interval(float(times[0]), 0.0, "s"),
-    }
-    return Look("outliers", nats, nats, estimate, {}, when=(float(times[0]), float(times[-1])))
-
-
-def misread(record: Record, axis: str) -> Look | None:
-    """Readings that a map of the firmware or the logger has changed."""
-    readings = record.readings.get(axis)
-    if readings is None or readings.misread is None:
-        return None
-    found = readings.misread
-    share = interval(found.share, math.sqrt(found.share / readings.values.size), "1")
-    return Look("misread", found.nats, found.nats, {"kind": found.kind, "fraction": share}, {})
-
-
-def stuck(record: Record, axis: str) -> Look | None:
-    """Stretches of equal readings that are no chance."""
-    readings = record.readings.get(axis)
-    if readings is None or not readings.intervals:
-        return None
-    intervals = readings.intervals
-    nats = readings.stuck_nats
-    return Look("stuck", nats, nats, {"intervals": intervals}, {}, when=(intervals[0][0], intervals[-1][1]))
+def _of_stretches(cause: str, nats: float, intervals: Sequence[Sequence[float]], **more: Any) -> Look:
+    estimate = {**more, "intervals": intervals}
+    return Look(cause, nats, nats, estimate, {}, when=(intervals[0][0], intervals[-1][1]))
 
 
 def _averaged(steps: float) -> bool:
