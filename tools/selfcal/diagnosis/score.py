@@ -64,7 +64,7 @@ def gain(
     joint = cause.score.together is not None and partner is not None
     if before is after and not joint:
         return HeldOut(None, "the readings are left out before and after: the model of the noise is the same")
-    if cause.score.onset and look.when is not None:
+    if cause.score.trained is not None and look.when is not None:
         place = round(look.when[0] * record.rate_hz)
         if place > split - max(20, n // 20):
             split = place + max(20, (n - place) // 4)

@@ -331,7 +331,7 @@ def worth(state: State, one: Tried) -> float:
     return net(gain, own + len(one.structure.shape), LN_STRUCTURES + own * LN_SLOW)
 
 
-def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterior:
+def posterior(state: State, drive: Drive, one: Tried) -> Posterior:
     """Draws over coefficients, the filter's numbers, and the drift: every near one, and its parameters."""
     structure = one.structure
     drifts = [
@@ -359,7 +359,7 @@ def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterio
             means.append(c[-k:])
             roots.append(vectors * np.sqrt(np.maximum(values, 0.0)))
             places.append(place)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     weight = np.exp(np.array(ln_weight) - max(ln_weight))
     drawn = random.choice(weight.size, DRAWS, p=weight / weight.sum())
     z = random.standard_normal((DRAWS, k))

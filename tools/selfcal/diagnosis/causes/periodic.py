@@ -283,14 +283,15 @@ def _advice(look: Look, record: Record) -> str:
         beside = "" if "temperature" in record.channels else ", with the temperature at the sensor"
         return f"Record longer{beside}: {turns:.1f} turns hardly tell a line from a drift."
     few = record.recorded_hz < 4.0 * _hz(look)
-    return "Record at another rate: a line that moves is an alias." if few else ""
+    if few:
+        return "Record at another rate: a line that moves is an alias."
+    return "Look for what turns or switches at this frequency."
 
 
 CAUSE = Cause(
     "periodic",
     "A periodic disturbance of one frequency is in the readings.",
-    "Look for what turns or switches at this frequency.",
-    advice=_advice,
+    _advice,
     source="surroundings",
     looks=looks,
     at=at,

@@ -233,7 +233,6 @@ CAUSE = Cause(
     score=Scored(
         once="a change of the noise is an event of its recording",
         no_carry=lambda look: "" if look.when else "the bank's noise level follows no channel",
-        onset=True,
         trained=_trained,
     ),
     written=Written(extend=_extend),
