@@ -165,7 +165,7 @@ def test_the_scan_is_the_fit_at_every_place() -> None:
     for terms, theta in (
         (Terms(walk=True), [-3.0]),
         (Terms(markov=True, color="ma"), [-1.0, -3.0, 0.3]),
-        (Terms(walk=True, flicker=True, color="ar", bands=((0.1, 0.01, -0.5),)), [-3.0, -2.0, 0.4]),
+        (Terms(walk=True, flicker=True, color="ar", bands=((10.0, 0.1, -0.5),)), [-3.0, -2.0, 0.4]),
     ):
         y = random.standard_normal(n) + 0.05 * random.standard_normal(n).cumsum()
         y[100:130] = y[400] = np.nan

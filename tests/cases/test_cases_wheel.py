@@ -114,7 +114,7 @@ y[200:207] = np.nan
 r = np.where(np.arange(1500) < 900, 1.0, 2.0)
 series = Series(y, 0.5, r, np.array([np.ones(1500), noise[2], np.arange(1500.0)]))
 some = [Terms(walk=True), Terms(walk=True, color="ma"), Terms(markov=True, flicker=True, oscillation=True)]
-some += [Terms(flicker=True, oscillation=True, color="ar", bands=((0.2, 0.01, 0.1), (0.3, 0.02, -1.0)) * 3)]
+some += [Terms(flicker=True, oscillation=True, color="ar", bands=((5.0, 0.05, 0.1), (3.0, 0.07, -1.0)) * 3)]
 for terms in some:
     theta = np.array(terms.limits(0.5)).mean(axis=1) + 0.1
     numbers = [*passed(series, terms, theta, [700, 1500], True)]

@@ -22,8 +22,16 @@ from scipy.signal import lfilter
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
-from selfcal.diagnosis.causes.periodic import BANDS_MOST
-from selfcal.likelihood.fit import COLUMNS_MOST, Series, finish, fit, ln_likelihood, shifts, slopes
+from selfcal.diagnosis.swing import MOST as BANDS_MOST
+from selfcal.likelihood.fit import (
+    COLUMNS_MOST,
+    Series,
+    finish,
+    fit,
+    ln_likelihood,
+    shifts,
+    slopes,
+)
 from selfcal.likelihood.fit import run as run_filter
 from selfcal.likelihood.statemodel import Terms, matrices
 from selfcal.logs.recording import save
@@ -53,7 +61,7 @@ def written(record: Record, path: Path) -> Path:
         Terms(walk=True),
         Terms(markov=True, color="ma"),
         Terms(walk=True, markov=True, flicker=True),
-        Terms(walk=True, color="ar", bands=((0.1, 0.01, -0.5),), trial=0.2),
+        Terms(walk=True, oscillation=True, color="ar", bands=((10.0, 0.1, -0.5),)),
     ],
 )
 def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms, block: int) -> None:
@@ -67,8 +75,9 @@ def test_the_likelihood_is_that_of_the_joint_normal(terms: Terms, block: int) ->
     y[[11, 12, 40]] = np.nan
     r = np.where(np.arange(n) < 280, 1.0, 2.5)
     columns = np.vstack([np.ones(n), np.linspace(-1.0, 1.0, n)])
-    guess = {"ln_rho": -1.5, "ln_markov": 0.2, "ln_alpha": -2.5, "ln_flicker": -1.05, "color": 0.3, "ln_band": -0.4}
-    theta = np.array([guess.get(name, -3.0 if name == "ln_width" else 0.02) for name in terms.names])
+    guess = {"ln_rho": -1.5, "ln_markov": 0.2, "ln_alpha": -2.5, "ln_flicker": -1.05, "color": 0.3, "ln_swing": -0.4}
+    guess |= {"ln_period": 1.6, "ln_damping": -2.0}
+    theta = np.array([guess[name] for name in terms.names])
     series = Series(y, dt, r, columns, block=block)
     m = matrices(terms, theta, dt, series.duration_s, block)
     assert (m.lost > 0.0) == (block > 1 and (terms.walk or terms.markov or terms.flicker))
@@ -166,7 +175,7 @@ SLOPED = [
     (Terms(markov=True), [-2.0, -3.0]),
     (Terms(walk=True, flicker=True, color="ma"), [-4.0, -2.0, 0.3]),
     (Terms(markov=True, color="ar"), [-1.0, -3.0, -0.2]),
-    (Terms(walk=True, markov=True, bands=((0.1, 0.01, -0.5),), trial=0.2), [-4.0, -2.0, -3.0, -1.0, -3.0, 0.02]),
+    (Terms(walk=True, markov=True, oscillation=True, bands=((10.0, 0.1, -0.5),)), [-4.0, -2.0, -3.0, -1.0, 1.6, -1.4]),
 ]
 
 

@@ -178,7 +178,7 @@ def test_a_finding_reads_as_it_is_said() -> None:
     [
         (1.0 / 940.0, 2600, False, "Record longer, with the temperature at the sensor: 2.8 turns"),
         (1.0 / 510.0, 3000, True, "Record longer: 5.9 turns"),
-        (0.07, 3000, False, ""),
+        (0.07, 3000, False, "Look for what turns"),
         (0.41, 3000, False, "Record at another rate"),
     ],
 )
@@ -187,7 +187,7 @@ def test_a_line_is_advised_by_its_frequency(hz: float, samples: int, temperature
     channels = {"temperature": np.zeros(samples)} if temperature else {}
     record = Record(1.0, {}, channels, {}, np.ones(samples, bool))
     advice = CAUSES["periodic"].advice(Look("periodic", 20.0, 10.0, line(hz), {}), record)
-    assert advice.startswith(told) and bool(advice) == bool(told)
+    assert advice.startswith(told)
 
 
 def test_numbers_that_move_the_other_way_are_told() -> None:

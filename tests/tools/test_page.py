@@ -113,9 +113,9 @@ def outliers(y: Array) -> Finding:
 
 def a_lattice(y: Array) -> Finding:
     state = state_of(np.rint(y / 2.0) * 2.0, lsb=2.0)
-    look = integrity.quantization(state)
-    assert look is not None
-    return Finding(look, 0, state, replace(state, stated_lsb=2.0))
+    told = integrity.quantization(replace(record_of(y), axes={"gx": state}), "gx")
+    assert told is not None
+    return Finding(told[0], 0, state, told[1])
 
 
 #: Cause: how a finding is made, which of its figures shows it, by how many points outside the band at least.

@@ -25,6 +25,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import regressor_key
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
+from selfcal.likelihood.heldout import HeldOut
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import Model, Regressor
@@ -36,14 +37,6 @@ from selfcal.readings.readings import Readings, look
 PIECES = 12
 #: Bank samples of the second recording at least: the bank reports on five and more, and each piece has as many.
 LEAST = 5 * PIECES
-
-
-@dataclass(frozen=True)
-class Carried:
-    """One finding on the second recording: the contract's `gain_on`, or None with the `reason`."""
-
-    gain: dict[str, Any] | None
-    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -59,7 +52,7 @@ class Term:
 
 def gains(
     model: Model, tree: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], second: Recording
-) -> dict[str, tuple[list[Carried], Carried]]:
+) -> dict[str, tuple[list[HeldOut], HeldOut]]:
     """By axis one entry for each finding of `found`, by gain, and one of all together. `tree`: the extended model
     file's."""
     return {name: _of_axis(model, tree, record, found, name, second) for name in found}
@@ -72,35 +65,35 @@ def _of_axis(
     found: Mapping[str, Diagnosed],
     name: str,
     second: Recording,
-) -> tuple[list[Carried], Carried]:
+) -> tuple[list[HeldOut], HeldOut]:
     findings = found[name].by_gain
     if name not in second.columns:
-        none = Carried(None, f"{second.path} has no axis {name}")
+        none = HeldOut(None, f"{second.path} has no axis {name}")
         return [none] * len(findings), none
     extended: dict[str, Regressor] = {one.name: one for one in Model.of_tree(tree, model.path).regressors}
     terms: dict[int, Term] = {}
-    results: dict[int, Carried] = {}
+    results: dict[int, HeldOut] = {}
     for k, finding in enumerate(findings):
         term = why_stays(finding) or term_of(found[name], finding, extended)
         if isinstance(term, str):
-            results[k] = Carried(None, term)
+            results[k] = HeldOut(None, term)
         else:
             terms[k] = term
     try:
         readings = look(second.along(name), name, model.group_of(name))
         if not terms:
-            return [results[k] for k in range(len(findings))], Carried(None, "no finding is in the bank's model")
+            return [results[k] for k in range(len(findings))], HeldOut(None, "no finding is in the bank's model")
         whole = _evidence(model, record, found, name, readings, [*terms.values()])
-        together = Carried(_compared(_evidence(model, record, found, name, readings, []), whole))
+        together = HeldOut(_compared(_evidence(model, record, found, name, readings, []), whole))
         for k, term in terms.items():
             try:
                 others = [one for one in terms.values() if one is not term]
                 without = _evidence(model, record, found, name, readings, others)
-                results[k] = Carried(_compared(without, whole))
+                results[k] = HeldOut(_compared(without, whole))
             except UserError as error:
-                results[k] = Carried(None, str(error))
+                results[k] = HeldOut(None, str(error))
     except UserError as error:
-        none = Carried(None, str(error))
+        none = HeldOut(None, str(error))
         return [results.get(k, none) for k in range(len(findings))], none
     return [results[k] for k in range(len(findings))], together
 

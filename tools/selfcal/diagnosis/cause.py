@@ -122,8 +122,8 @@ class Scored:
     once      why another recording has it not: an event of its time, or of its read-out. "": it may have it.
     no_carry  why the bank cannot weigh a look on another recording that has it; "": it can.
     anew      its size belongs to one recording: another one weighs it anew under its prior.
-    onset     scored from its on-line detection, `Look.when[0]`.
-    trained   look, states before and after, record and split: the state after as the first `split` samples show it.
+    trained   look, states before and after, record and split: the state after as the first `split` samples show it. An
+              event is scored from its on-line detection, `Look.when[0]`.
     together  nats a sample that two axes gain, and their sd: residuals of both, spacing, s, split and the estimate.
     """
 
@@ -131,7 +131,6 @@ class Scored:
     once: str = ""
     no_carry: Callable[[Look], str] = field(default=lambda look: "")
     anew: bool = False
-    onset: bool = False
     trained: Callable[[Look, State, State, Record, int], State] | None = None
     together: Callable[[Array, Array, float, int, Mapping[str, Any]], tuple[float, float]] | None = None
 
@@ -183,8 +182,8 @@ class Simulated:
 class Cause:
     """Everything about one cause.
 
-    id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of it.
-    advice    the advice to a look instead, where its size asks for another; "": record_next.
+    id, words, record_next  of the JSON; words is one sentence, record_next the advice that makes sure of any look, or
+              by the look.
     unsure    words instead where the estimate has `source`: which axis is the source is not shown.
     source    where it comes from: surroundings, handling, sensor, read-out or model.
     looks     candidates that a round of the loop tries on an axis; None: found before the rounds or after all axes.
@@ -197,8 +196,7 @@ class Cause:
 
     id: str
     words: str
-    record_next: str
-    advice: Callable[[Look, Record], str] = field(default=lambda look, record: "")
+    record_next: str | Callable[[Look, Record], str]
     unsure: str = ""
     source: str = "model"
     looks: Looks | None = None
@@ -216,6 +214,10 @@ class Cause:
         """The look at it with the shape `theta`."""
         assert self.at is not None, self.id
         return self.at(state, record, theta)
+
+    def advice(self, look: Look, record: Record) -> str:
+        """What makes sure of a look."""
+        return self.record_next if isinstance(self.record_next, str) else self.record_next(look, record)
 
     def effect(self, look: Look) -> dict[str, Any] | None:
         """Keys of `--effect` for a finding; None: the simulator cannot make it."""

@@ -21,7 +21,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.document import to_document
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
-from selfcal.diagnosis.record import Record, carried, why_left_out
+from selfcal.diagnosis.record import Record, carried
 from selfcal.diagnosis.verdict import of_checks
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import Array
@@ -146,10 +146,10 @@ def show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequ
         note(line)
 
 
-def why_not(recording: Recording, model: Model, record: Record, name: str) -> str:
+def why_not(record: Record, name: str) -> str:
     """Why an axis has no result."""
-    if name not in record.axes:
-        return why_left_out(recording, model, name)
+    if name in record.left_out:
+        return record.left_out[name]
     if not below_lattice(record, name):
         return INTERRUPTED
     return OF_COUNTER if carried(record, name) else BELOW_LATTICE

@@ -128,7 +128,7 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str, final: 
         "when": later(list(look.when), record.start_s) if look.when else None,
         "found_in_round": finding.round,
         "also_possible": list(dict.fromkeys((*finding.also_possible, *look.others))),
-        "record_next": words.planned(planned, cause.advice(look, record) or cause.record_next),
+        "record_next": words.planned(planned, cause.advice(look, record)),
         "next_record": planned,
         "gain": held_out,
         **({} if reason is None else {"gain_reason": reason}),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +14,6 @@ from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, Look, State, interval
 from selfcal.likelihood.statemodel import Mask
-from selfcal.readings.readings import Readings
 
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
@@ -51,8 +51,8 @@ def _held(record: Record) -> Mask:
     for state in record.axes.values():
         same = np.zeros(record.present.size, bool)
         same[1:] = np.diff(state.y) == 0.0
-        if state.axis in record.unclipped:
-            same &= record.unclipped[state.axis] == state.y  # a clipped reading repeats for being clipped
+        if state.axis in record.redrawn:
+            same &= record.redrawn[state.axis] == state.y  # a clipped reading repeats for being clipped
         repeats.append(same)
     if not repeats or any(state.redrawn for state in record.axes.values()):
         return none  # means of blocks repeat by chance: a held reading shows at the recording's own rate
@@ -95,60 +95,40 @@ def rate_changes(record: Record) -> list[Look]:
     ]
 
 
-def held_samples(record: Record, axis: str) -> Look | None:
-    """The logger asks oftener than the part measures, always or in stretches."""
+def of_readings(record: Record, axis: str) -> Iterator[Look]:
+    """What the readings of an axis show by themselves."""
     readings = record.readings.get(axis)
     if readings is None:
-        return None
-    if readings.held_hz is None:
-        return _slower(readings) if readings.slower else None
-    # Each reading that is asked for again repeats; by chance one in 100 would at most.
-    nats = min(1e6, readings.values.size * math.log(100.0))
-    return Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
+        return
+    n, time_s = readings.values.size, readings.recording.time_s
+    if (changed := readings.misread) is not None:  # by a map of the firmware or the logger
+        fraction = interval(changed.share, math.sqrt(changed.share / n), "1")
+        yield Look("misread", changed.nats, changed.nats, {"kind": changed.kind, "fraction": fraction}, {})
+    if readings.held_hz is not None:  # the logger asks oftener than the part measures, always or in stretches
+        # Each reading that is asked for again repeats; by chance one in 100 would at most.
+        nats = min(1e6, n * math.log(100.0))
+        yield Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
+    elif readings.slower:
+        surest = max(readings.slower, key=lambda one: one.nats)
+        rate_hz = interval(readings.recording.rate_hz / surest.ratio, 0.0, "Hz")
+        nats = min(1e6, sum(one.nats for one in readings.slower))
+        yield _of_stretches("held_samples", nats, readings.slower_intervals, rate_hz=rate_hz)
+    if readings.intervals:
+        yield _of_stretches("stuck", readings.stuck_nats, readings.intervals)
+    if (common := readings.recurring) is not None:  # one value too often
+        mask, share = common.mask, common.share
+        times = time_s[mask if mask.any() else readings.values == common.value]
+        when = (float(times[0]), float(times[-1]))
+        estimate = {
+            "fraction": interval(share, math.sqrt(share / mask.size), "1"),
+            "time_s": interval(when[0], 0.0, "s"),
+        }
+        yield Look("outliers", common.nats, common.nats, estimate, {}, when=when)
 
 
-def _slower(readings: Readings) -> Look:
-    """Stretches in which each reading is held; the rate is that of the surest."""
-    surest = max(readings.slower, key=lambda one: one.nats)
-    nats = min(1e6, sum(one.nats for one in readings.slower))
-    intervals = readings.slower_intervals
-    rate_hz = readings.recording.rate_hz / surest.ratio
-    estimate = {"rate_hz": interval(rate_hz, 0.0, "Hz"), "intervals": intervals}
-    return Look("held_samples", nats, nats, estimate, {}, when=(intervals[0][0], intervals[-1][1]))
-
-
-def recurring(record: Record, axis: str) -> Look | None:
-    """Readings that are one value too often."""
-    readings = record.readings.get(axis)
-    if readings is None or readings.recurring is None:
-        return None
-    mask, nats, share = readings.recurring.mask, readings.recurring.nats, readings.recurring.share
-    times = readings.recording.time_s[mask if mask.any() else readings.values == readings.recurring.value]
-    estimate = {
-        "fraction": interval(share, math.sqrt(share / mask.size), "1"),
-        "time_s": interval(float(times[0]), 0.0, "s"),
-    }
-    return Look("outliers", nats, nats, estimate, {}, when=(float(times[0]), float(times[-1])))
-
-
-def misread(record: Record, axis: str) -> Look | None:
-    """Readings that a map of the firmware or the logger has changed."""
-    readings = record.readings.get(axis)
-    if readings is None or readings.misread is None:
-        return None
-    found = readings.misread
-    share = interval(found.share, math.sqrt(found.share / readings.values.size), "1")
-    return Look("misread", found.nats, found.nats, {"kind": found.kind, "fraction": share}, {})
-
-
-def stuck(record: Record, axis: str) -> Look | None:
-    """Stretches of equal readings that are no chance."""
-    readings = record.readings.get(axis)
-    if readings is None or not readings.intervals:
-        return None
-    intervals = readings.intervals
-    nats = readings.stuck_nats
-    return Look("stuck", nats, nats, {"intervals": intervals}, {}, when=(intervals[0][0], intervals[-1][1]))
+def _of_stretches(cause: str, nats: float, intervals: Sequence[Sequence[float]], **more: Any) -> Look:
+    estimate = {**more, "intervals": intervals}
+    return Look(cause, nats, nats, estimate, {}, when=(intervals[0][0], intervals[-1][1]))
 
 
 def _averaged(steps: float) -> bool:
@@ -156,61 +136,51 @@ def _averaged(steps: float) -> bool:
     return 1.5 < steps < AVERAGED_MOST + 0.5 and abs(steps - round(steps)) < 0.002 * steps
 
 
-def quantization(state: State) -> Look | None:
-    """A lattice that the model file does not state and that is coarse against the white noise."""
-    q = state.lsb
-    stated = state.stated_lsb
+def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
+    """Readings are clipped at a limit."""
+    state, readings = record.axes[axis], record.readings.get(axis)
+    if readings is None or readings.clipped is None or state.below_lattice:
+        return None
+    clipped = readings.clipped
+    sd = readings.lattice.step / 4.0 if readings.lattice is not None else 1e-6 * abs(clipped.limit)
+    estimate = {"limit": interval(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
+    return _anew(record, axis, Look("saturation", clipped.nats, clipped.nats, estimate, {}))
+
+
+def quantization(record: Record, axis: str) -> tuple[Look, State] | None:
+    """Codes that are not alike; or a lattice that the model file does not state and that is coarse against the white
+    noise."""
+    state, readings = record.axes[axis], record.readings.get(axis)
+    found = None if readings is None or readings.clipped is not None else readings.uneven
+    if readings is not None and found is not None and not state.below_lattice:
+        step = 0.0 if readings.lattice is None else readings.lattice.step
+        lsb = {"lsb": interval(step, step * 1e-3, state.unit)} if step > 0.0 else {}
+        estimate: dict[str, Any] = {**lsb, "misread": interval(found.share, found.sd, "1")}
+        if found.value is not None and found.width is not None:
+            estimate["value"] = interval(found.value, 0.0, state.unit)
+            estimate["width"] = interval(found.width, 0.0, state.unit)
+        changes = {"stated_lsb": step} if lsb else {}
+        return _anew(record, axis, Look("quantization", found.nats, found.nats, estimate, changes))
+    q, stated = state.lsb, state.stated_lsb
     if q <= 0.0 or (stated > 0.0 and abs(q / stated - 1.0) < 0.02) or _averaged(stated / q):
         return None
     sigma = state.best.sigma
     white = math.sqrt(max(sigma**2 - q * q / 12.0, 1e-12 * sigma**2))
     if q / white < LATTICE_LEAST:
         return None
-    n = state.best.n
     # Continuous readings would fall within 1/1000 of a lattice by chance: ln 1000 nats each.
-    gain = n * math.log(max(q / white, 1.0) * 10.0)
-    return Look(
-        "quantization",
-        gain,
-        gain,
-        {"lsb": interval(q, q * 1e-3, state.unit)},
-        {"stated_lsb": q},
-    )
+    gain = state.best.n * math.log(max(q / white, 1.0) * 10.0)
+    look = Look("quantization", gain, gain, {"lsb": interval(q, q * 1e-3, state.unit)}, {"stated_lsb": q})
+    return look, replace(state, stated_lsb=q)
 
 
-def saturation(record: Record, axis: str) -> tuple[Look, State] | None:
-    """Readings are clipped at a limit. In a record at the recording's own rate they are drawn anew beyond the limit, so
-    that the rest is judged as if it had not been clipped. Means are of those from the start."""
-    state, readings = record.axes[axis], record.readings.get(axis)
-    if readings is None or readings.clipped is None:
-        return None
-    clipped = readings.clipped
-    sd = readings.lattice.step / 4.0 if readings.lattice is not None else 1e-6 * abs(clipped.limit)
-    estimate = {"limit": interval(clipped.limit, sd, state.unit), "clipped": int(clipped.mask.sum())}
-    look = Look("saturation", clipped.nats, clipped.nats, estimate, {})
-    if axis not in record.unclipped:
+def _anew(record: Record, axis: str, look: Look) -> tuple[Look, State]:
+    """In a record at the recording's own rate the readings concerned are drawn anew, so that the rest is judged as if
+    they were sound. Means are of such from the start."""
+    state = record.axes[axis]
+    if axis not in record.redrawn:
         return look, state
-    y = np.where(np.isfinite(state.y), record.unclipped[axis], np.nan)
-    return look, state.refit(y=y, redrawn=True)
-
-
-def uneven(record: Record, axis: str) -> tuple[Look, State] | None:
-    """Codes that are not alike. In a record at the recording's own rate each reading is drawn anew among the codes that
-    it may come from."""
-    state, readings = record.axes[axis], record.readings.get(axis)
-    found = None if readings is None else readings.uneven
-    if readings is None or found is None:
-        return None
-    step = 0.0 if readings.lattice is None else readings.lattice.step
-    lsb = {"lsb": interval(step, step * 1e-3, state.unit)} if step > 0.0 else {}
-    estimate: dict[str, Any] = {**lsb, "misread": interval(found.share, found.sd, "1")}
-    if found.value is not None and found.width is not None:
-        estimate["value"] = interval(found.value, 0.0, state.unit)
-        estimate["width"] = interval(found.width, 0.0, state.unit)
-    look = Look("quantization", found.nats, found.nats, estimate, {"stated_lsb": step} if lsb else {})
-    if axis not in record.alike:
-        return look, state
-    y = np.where(np.isfinite(state.y), record.alike[axis], np.nan)
+    y = np.where(np.isfinite(state.y), record.redrawn[axis], np.nan)
     return look, state.refit(y=y, redrawn=True, **look.changes)
 
 

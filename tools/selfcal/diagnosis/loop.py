@@ -32,8 +32,6 @@ LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cau
 QUICK: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks and not cause.of_means)
 #: Those of causes that are of one axis: all axes together have nothing to say of them.
 OWN = {cause.looks for cause in CAUSES.values() if cause.looks and cause.grouping.settle is None}
-#: What the readings of an axis show by themselves.
-READ = (integrity.misread, integrity.held_samples, integrity.stuck, integrity.recurring)
 #: Why an axis is not done.
 INTERRUPTED = "interrupted before it was done"
 SPENT = "its work was bounded (tools/pages/diagnose.md): there may be more causes"
@@ -178,32 +176,18 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
     states = dict(record.axes)
     changed = integrity.rate_changes(record)
     for name, one in found.items():
-        one.findings.extend(Finding(look, 0, one.state, one.state) for look in changed)
-        for found_at in (look(record, name) for look in READ):
-            if found_at is not None:
-                one.findings.append(Finding(found_at, 0, one.state, one.state))
+        read = (*changed, *integrity.of_readings(record, name))
+        one.findings.extend(Finding(look, 0, one.state, one.state) for look in read)
         if name in handled:  # the motion that is left out already spoilt the first state
             one.findings.append(Finding(motion.look_of(handled[name]), 0, one.first, states[name]))
         if name in gone:
             one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
-        clipped = None if states[name].below_lattice else integrity.saturation(replace(record, axes=states), name)
-        if clipped is not None:
-            if name in found:
-                found[name].findings.append(Finding(clipped[0], 0, states[name], clipped[1]))
-            states[name] = clipped[1]
-        spoilt_codes = clipped is None and not states[name].below_lattice
-        uneven = integrity.uneven(replace(record, axes=states), name) if spoilt_codes else None
-        if uneven is not None:
-            if name in found:
-                found[name].findings.append(Finding(uneven[0], 0, states[name], uneven[1]))
-            states[name] = uneven[1]
-        lattice = integrity.quantization(states[name])
-        if lattice is not None and uneven is None:
-            before = states[name]
-            states[name] = replace(before, stated_lsb=before.lsb)
-            if name in found:
-                found[name].findings.append(Finding(lattice, 0, before, states[name]))
+        for test in (integrity.saturation, integrity.quantization):
+            told = test(replace(record, axes=states), name)
+            if told is not None and name in found:
+                found[name].findings.append(Finding(told[0], 0, states[name], told[1]))
+            states[name] = states[name] if told is None else told[1]
         if name in found:
             found[name].state = states[name]
     return replace(record, axes=states)

@@ -58,8 +58,10 @@ class Record:
     [n] in degC and V, bridged where samples are missing; `channel_names` their columns. `present` [n]: where the grid
     has samples, those left out for motion among them. `missing`: by axis, at its own rate. `recorded_hz`: the rate of
     the recording. `start_s`: where in the recording the grid begins, s; every time here counts from it.
-    `roughness` [n] of each axis: variance of its noise by differences of the samples as recorded. `moving` [n]: the raw
-    readings of an axis show that the sensor moved. `since_power_on_s`: of the recording."""
+    `redrawn` [n]: readings of an axis with those drawn anew that are clipped, or of uneven codes. `left_out`: why an
+    axis of the model is not here. `roughness` [n] of each axis: variance of its noise by differences of the samples as
+    recorded. `moving` [n]: the raw readings of an axis show that the sensor moved. `since_power_on_s`: of the
+    recording."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -70,8 +72,8 @@ class Record:
     recorded_hz: float = 1.0
     readings: Mapping[str, Readings] = field(default_factory=dict)
     changes: tuple[RateChange, ...] = ()
-    unclipped: Mapping[str, Array] = field(default_factory=dict)
-    alike: Mapping[str, Array] = field(default_factory=dict)
+    redrawn: Mapping[str, Array] = field(default_factory=dict)
+    left_out: Mapping[str, str] = field(default_factory=dict)
     start_s: float = 0.0
     roughness: Mapping[str, Array] = field(default_factory=dict)
     moving: Mask = field(default_factory=lambda: np.zeros(0, bool))
@@ -191,9 +193,12 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
     recording, held = thinned(recording, tuple(name for name in known if recording.columns[name].clock is None))
     grid = _grid_of(recording, decimate, axes)
     kept: dict[str, _Axis] = {}
+    left_out = {name: "every reading is the same" for name in model.axes if name not in known}
     for name in known:
         axis = _axis_of(recording, model, name, grid, held, tuple(kept))
-        if axis is not None:
+        if isinstance(axis, str):
+            left_out[name] = axis
+        else:
             kept[name] = axis
     present = np.isfinite(grid.means(grid.base, np.zeros(grid.base.missing_before.size))[0])
     channels: dict[str, Array] = {}
@@ -214,8 +219,8 @@ def of_recording(recording: Recording, model: Model, decimate: float | None = No
         recorded_hz=grid.base.rate_hz,
         readings={name: axis.readings for name, axis in kept.items()},
         changes=changes,
-        unclipped={name: axis.unclipped for name, axis in kept.items() if axis.unclipped is not None},
-        alike={name: axis.alike for name, axis in kept.items() if axis.alike is not None},
+        redrawn={name: axis.redrawn for name, axis in kept.items() if axis.redrawn is not None},
+        left_out=left_out,
         start_s=recording.start_s,
         roughness={name: axis.roughness for name, axis in kept.items()},
         moving=np.any([np.zeros(grid.n, bool), *(axis.moving for axis in kept.values())], axis=0),
@@ -231,19 +236,21 @@ class _Axis:
     readings: Readings
     roughness: Array
     moving: Mask
-    unclipped: Array | None
-    alike: Array | None
+    redrawn: Array | None
 
 
 def _axis_of(
     recording: Recording, model: Model, name: str, grid: _Grid, held: Held | None, before: tuple[str, ...]
-) -> _Axis | None:
-    """An axis on the grid; None where it has too few readings, or is a copy of an axis `before` it."""
+) -> _Axis | str:
+    """An axis on the grid, or why it is not there. `before`: axes of which it may be a copy."""
     clock, group = recording.clock_of(name), model.group_of(name)
     each = round(clock.rate_hz * grid.dt)
     values = recording.in_unit(name, group.unit)
-    if _beyond(values, group) or clock.rate_hz * grid.dt < SLOWEST or copied(recording, name, before):
-        return None
+    slow = clock.rate_hz * grid.dt < SLOWEST
+    own = f"{clock.rate_hz:g}"
+    late = f"its samples come at {own} Hz: give --decimate {own} or less, or --axis {name} alone" if slow else ""
+    if why := _beyond(values, group) or late or copied(recording, name, before):
+        return why
     recorded = clock
     whole = recording.columns[name].clock is None and bool(np.isfinite(values).all())
     rows = own_rows(recording, name) if whole and held is None else None
@@ -268,7 +275,7 @@ def _axis_of(
 
     y, r = grid.means(clock, spread(readings.values if each == 1 else readings.drawn))
     if np.isfinite(y).sum() < LEAST:
-        return None
+        return "too few of its readings are none that stick or are clipped"
     moving = np.zeros(grid.n, bool)
     if readings.moving.any():
         # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
@@ -278,8 +285,8 @@ def _axis_of(
     level = float(np.nanmedian(y))
     alone = recording.along(name)
     rough = variance_of(alone.in_unit(name, group.unit), alone.missing_before)
-    clipped = each == 1 and readings.clipped is not None
-    uneven = readings.uneven if each == 1 and not clipped else None
+    anew = None if readings.uneven is None else readings.uneven.undone
+    anew = anew if readings.clipped is None else readings.drawn
     state = State(
         axis=name,
         unit=group.unit,
@@ -299,8 +306,7 @@ def _axis_of(
         readings=readings,
         roughness=grid.means(replace(alone.clock, start_s=recorded.start_s), rough)[0],
         moving=moving,
-        unclipped=grid.means(clock, spread(readings.drawn))[0] - level if clipped else None,
-        alike=None if uneven is None or uneven.undone is None else grid.means(clock, spread(uneven.undone))[0] - level,
+        redrawn=None if anew is None or each > 1 else grid.means(clock, spread(anew))[0] - level,
     )
 
 
@@ -327,22 +333,6 @@ def carried(record: Record, name: str) -> bool:
     """Whether the readings are increments of a counter."""
     readings = record.readings.get(name)
     return readings is not None and readings.lattice is not None and readings.lattice.carried > 0.0
-
-
-def why_left_out(recording: Recording, model: Model, name: str) -> str:
-    """Why an axis that was asked for is not in the record."""
-    group = model.group_of(name)
-    values = recording.in_unit(name, group.unit)
-    if told := _beyond(values, group):
-        return told
-    own = recording.clock_of(name).rate_hz
-    if own < SLOWEST * recording.rate_hz:
-        return f"its samples come at {own:g} Hz: give --decimate {own:g} or less, or --axis {name} alone"
-    if told := copied(recording, name, [axis for axis in model.axes if axis in recording.columns and axis != name]):
-        return told
-    if _varies(values):
-        return "too few of its readings are none that stick or are clipped"
-    return "every reading is the same"
 
 
 def _varies(values: Array) -> bool:

@@ -64,7 +64,7 @@ def gain(
     joint = cause.score.together is not None and partner is not None
     if before is after and not joint:
         return HeldOut(None, "the readings are left out before and after: the model of the noise is the same")
-    if cause.score.onset and look.when is not None:
+    if cause.score.trained is not None and look.when is not None:
         place = round(look.when[0] * record.rate_hz)
         if place > split - max(20, n // 20):
             split = place + max(20, (n - place) // 4)
@@ -78,8 +78,7 @@ def gain(
     if cause.score.together is not None and partner is not None:
         # The joint log score of two axes less the other one's own is the first one's given the other.
         old = _sequential(before, cut.marks, {})
-        one, two = (_residual(state, split) for state in (before, partner))
-        more, sd = cause.score.together(one, two, before.dt, split, look.estimate)
+        more, sd = cause.score.together(before.whitened, partner.whitened, before.dt, split, look.estimate)
         scores = cut.scores(old[0])
         return _held_out(cut, scores, scores + more, sd, before.unit, {})
     horizons = _horizons(before.dt, n, split)
@@ -197,23 +196,6 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
         for horizon, places in horizons.items()
     }
     return logsumexp(ln_evidence, axis=0), predicted
-
-
-def _residual(state: State, split: int) -> Array:
-    """Innovations [n] over the white noise, by the parameters and coefficients that the first samples show best."""
-    series, prior = state.series, _prior(state)
-
-    best = (-math.inf, state.best, state.best.theta, np.zeros(0), 1.0)
-    for fit, theta, ln_share in state.drifts():
-        G, D, n, _, _, _ = passed(series, fit.terms, theta, [split])
-        value, c = _posterior(G, D, n, prior)
-        direction = np.array([1.0, *-c[0]])
-        if value[0] + ln_share > best[0]:
-            sigma = math.sqrt(direction @ G[0] @ direction / n[0])
-            best = (float(value[0]) + ln_share, fit, theta, direction, sigma)
-    _, fit, theta, direction, sigma = best
-    white = run(series, fit.terms, theta, innovations=True)[1]
-    return np.asarray(white @ direction / sigma)
 
 
 def _errors(

@@ -311,49 +311,27 @@ def _counted(y: Array, fit: Fit, random: np.random.Generator, *, means: bool) ->
 
 
 def states_of(m: Matrices, level: Array, random: np.random.Generator) -> Array:
-    """h x over n steps; `level` [n] scales white noise with memory. Small blocks: each is filtered by itself."""
+    """h x over n steps; `level` [n] scales white noise with memory. In the coordinates of F the states are processes of
+    the first order, each filtered by itself. A moving average has none: e_i and e_(i-1)."""
     from scipy.signal import lfilter
 
-    F, Q, h, P0 = m.F, m.Q, m.h, m.P0
-    d, n = len(F), level.size
-    out = np.zeros(n)
-    k = 0
-    while k < d:
-        paired = k + 1 < d and (F[k, k + 1] != 0.0 or F[k + 1, k] != 0.0)
-        if not paired:
-            start = math.sqrt(max(P0[k, k], 0.0)) * random.standard_normal()
-            noise = math.sqrt(max(Q[k, k], 0.0)) * random.standard_normal(n)
-            noise[0] = start
-            if k == m.driver:
-                noise *= level
-            out += h[k] * lfilter([1.0], [1.0, -F[k, k]], noise)
-            k += 1
-            continue
-        f = F[k : k + 2, k : k + 2]
-        if f[0, 0] == 0.0:  # the moving average: e_i and e_(i-1)
-            e = math.sqrt(Q[k, k]) * random.standard_normal(n + 1) * np.append(level[0], level)
-            out += h[k] * e[1:] + h[k + 1] * e[:-1]
-        else:
-            pair = slice(k, k + 2)
-            out += h[k] * swinging(f, Q[pair, pair], P0[pair, pair], n, random)
-        k += 2
+    e = _half(m.Q) @ random.standard_normal((len(m.F), level.size))
+    e[:, 0] = _half(m.P0) @ random.standard_normal(len(m.F))
+    rest, out = np.ones(len(m.F), bool), np.zeros(level.size)
+    if m.driver >= 0:
+        e[m.driver] *= level
+        if m.F[m.driver, m.driver] == 0.0:
+            now, before = m.driver, m.driver + 1
+            rest[[now, before]] = False
+            out += m.h[now] * e[now] + m.h[before] * np.append(e[before, 0], e[now, :-1])
+    poles, vectors = np.linalg.eig(m.F[np.ix_(rest, rest)])
+    for pole, weight, row in zip(poles, m.h[rest] @ vectors, np.linalg.solve(vectors, e[rest]), strict=True):
+        out += (weight * lfilter([1.0], [1.0, -pole], row)).real
     return out
 
 
-def swinging(F: Array, Q: Array, P0: Array, n: int, random: np.random.Generator) -> Array:
-    """[n]: the first of two states that turn, [2, 2] each. In the coordinates of F they are two conjugate processes of
-    the first order: one is filtered."""
-    from scipy.signal import lfilter
-
-    poles, vectors = np.linalg.eig(F)
-    first = np.linalg.inv(vectors)[0]
-    e = np.asarray((first @ _half(Q)) @ random.standard_normal((2, n)))
-    e[0] = (first @ _half(P0)) @ random.standard_normal(2)
-    return np.asarray(2.0 * (vectors[0, 0] * lfilter([1.0], [1.0, -poles[0]], e)).real)
-
-
 def _half(covariance: Array) -> Array:
-    """[2, 2]: a root of a covariance, which may be nearly singular."""
+    """[d, d]: a root of a covariance, which may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 

@@ -21,7 +21,7 @@ from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
 from selfcal.diagnosis.forms import LONGEST_LAG, agreement
-from selfcal.likelihood.columns import LN_SLOW, NODES_MOST, POSSIBLE, nodes, top
+from selfcal.likelihood.columns import LN_SLOW, nodes, top
 from selfcal.likelihood.fit import Fit, Sums, left, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
 from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
@@ -36,10 +36,8 @@ PROBABILITY = 0.9
 STIFF, ROUGH = (-10.0, 25.0), 30
 #: Factors between a filter's numbers that are tried first, beside 2.
 COARSE = {"pure_delay_s": 1.6, "damping": 3.0}
-#: Draws of a posterior. A drift whose weight is less by so many nats than the likeliest's is none of them.
-DRAWS, WEIGHTY = 4000, 5.0
-#: Steps of the drift's parameters at least and at most.
-NODE_STEPS = (0.05, 0.7)
+#: Draws of a posterior.
+DRAWS = 4000
 #: Price of a number of a structure beside half BIC, nats: several structures have one more than a lag, each another.
 LN_CHOICE = 1.0
 #: ln of the number of independent looks: the structures and their numbers.
@@ -333,22 +331,27 @@ def worth(state: State, one: Tried) -> float:
     return net(gain, own + len(one.structure.shape), LN_STRUCTURES + own * LN_SLOW)
 
 
-def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterior:
+def posterior(state: State, drive: Drive, one: Tried) -> Posterior:
     """Draws over coefficients, the filter's numbers, and the drift: every near one, and its parameters."""
     structure = one.structure
-    drifts = _drifts(state, one.columns, one.fit)
-    far = [max(drifts, key=lambda node: node[3]), max(drifts, key=lambda node: node[2])]
+    drifts = [
+        (fit, theta, ln_share + _flat(fit, theta)) for fit, theta, ln_share in state.possible(one.columns, rich=True)
+    ]
+    likely = [
+        ln_share + _ln_weight(next(state.sums(fit.terms, theta, [one.columns]))) for fit, theta, ln_share in drifts
+    ]
+    far = [drifts[int(np.argmax(likely))], max(drifts, key=lambda node: node[2])]
 
     def scores(some: Array) -> Array:
         each = drive.each(structure, some)
-        return np.array([state.scores(each, replace(fit, theta=theta)) for fit, theta, _, _ in far])
+        return np.array([state.scores(each, replace(fit, theta=theta)) for fit, theta, _ in far])
 
     # At the likeliest drift, and at the largest, which leaves most possible.
     points, steps = nodes(scores, one.point, drive.limits(structure))
     blocks = drive.each(structure, np.exp(points))
     k = len(one.columns)
     ln_weight, means, roots, places = [], [], [], []
-    for fit, theta, ln_share, _ in drifts:
+    for fit, theta, ln_share in drifts:
         for place, sums in enumerate(state.sums(fit.terms, theta, blocks)):
             c, inverse, rss = sums.coefficients()
             values, vectors = np.linalg.eigh(rss / sums.n * inverse[-k:, -k:])
@@ -356,7 +359,7 @@ def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterio
             means.append(c[-k:])
             roots.append(vectors * np.sqrt(np.maximum(values, 0.0)))
             places.append(place)
-    random = np.random.default_rng(seed)
+    random = np.random.default_rng(1)
     weight = np.exp(np.array(ln_weight) - max(ln_weight))
     drawn = random.choice(weight.size, DRAWS, p=weight / weight.sum())
     z = random.standard_normal((DRAWS, k))
@@ -367,50 +370,18 @@ def posterior(state: State, drive: Drive, one: Tried, seed: int = 1) -> Posterio
     return Posterior(structure, c[:, : len(structure.keys)], shape)
 
 
+def _flat(fit: Fit, theta: Array) -> float:
+    """ln of a prior flat in the sizes of the drift over Jeffreys' for a weak walk, about a fit: a drift that quick
+    errors of a structure make smaller would leave slow coefficients too narrow an interval."""
+    sizes = [name in DRIFT_SIZES for name in fit.terms.names]
+    return 0.5 * float((theta - fit.theta)[sizes].sum())
+
+
 def _ln_weight(sums: Sums) -> float:
     """ln likelihood with every coefficient integrated out. At its maximum, columns like a drift would leave too little
     of the drift."""
     _, inverse, rss = sums.coefficients()
     return ln_likelihood(sums) + 0.5 * ln_det(rss / sums.n * inverse)
-
-
-def _drifts(state: State, block: Array, known: Fit) -> list[tuple[Fit, Array, float, float]]:
-    """Parameters of every drift that the record leaves possible beside columns [k, n], on a lattice about each
-    fit, ln of the prior share of each and ln of its weight. `known`: the structure's; of two terms it is taken alone.
-
-    A size is as likely as any other up to the largest. Uniform in its logarithm, most weight would be on no drift at
-    all wherever the record hardly shows one, and intervals of slow coefficients would be too narrow."""
-    fits = [state.fitted_with(terms, block) for terms in state.bases()]
-    fits = fits if known.terms in state.bases() else [known]
-    walk = max(one.ln_likelihood for one in fits if one.terms.walk)
-    kept: list[tuple[Fit, Array, float, float]] = []
-    for fit in fits:
-        terms = fit.terms
-        if not terms.walk and fit.ln_likelihood < walk + ALIKE:
-            continue  # it would forget: of two that fit alike the walk leaves slow coefficients the wider interval
-        low, high = np.array(terms.limits(state.dt)).reshape(-1, 2).T
-        steps = np.clip(np.linalg.norm(fit.spread, axis=1), *NODE_STEPS)
-        is_size = np.array([name in DRIFT_SIZES for name in terms.names])
-        volume = float(np.log(steps / np.where(is_size, 1.0, high - low)).sum()) + 0.5 * math.log(fit.n) * terms.walk
-        found: dict[tuple[int, ...], float] = {}
-        waiting = [(0,) * steps.size]
-        while waiting and len(found) < NODES_MOST:
-            place = waiting.pop(0)
-            theta = fit.theta + steps * place
-            if place in found or np.any((theta < low - 1e-9) | (theta > high + 1e-9)):
-                continue
-            sums = next(iter(state.sums(terms, theta, [block])))
-            found[place] = _ln_weight(sums) + float(theta[is_size].sum())
-            if found[place] > max(found.values()) - POSSIBLE:
-                moves = [(j, way) for j in range(steps.size) for way in (1, -1)]
-                waiting += [tuple(x + way * (i == j) for i, x in enumerate(place)) for j, way in moves]
-        most = max(found.values())
-        for place, value in found.items():
-            if value > most - POSSIBLE:
-                theta = fit.theta + steps * place
-                kept.append((fit, theta, volume + float(theta[is_size].sum()), volume + value))
-    most = max(node[3] for node in kept)
-    return [node for node in kept if node[3] > most - WEIGHTY]
 
 
 def held_out(state: State, one: Tried) -> float:

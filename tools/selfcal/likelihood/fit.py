@@ -52,7 +52,7 @@ LARGER = (
     (("ln_markov", "ln_alpha"), -5.0, ((-5.0, -7.0), (-5.0, -5.0), (-5.0, -3.0), (-5.0, -1.7))),
 )
 #: Parameters that are logarithms of sizes.
-SIZES = (*DRIFT_SIZES, "ln_swing", "ln_band")
+SIZES = (*DRIFT_SIZES, "ln_swing")
 
 
 @dataclass(frozen=True)

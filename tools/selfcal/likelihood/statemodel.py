@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.model.laws import lost_of, swing
+from selfcal.model.laws import DAMPING_LIMITS, lost_of, swing
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -23,9 +23,8 @@ Mask = NDArray[np.bool_]
 ALPHA_LIMITS = (2e-4, 0.2)
 #: Sizes relative to the white noise of one sample.
 SIZE_LIMITS = (1e-5, 1e2)
-#: A drift that oscillates keeps within these periods, s, and samples a period at least: faster ones are a band.
-#: ... and within these damping ratios: above, no turn shows.
-PERIOD_LIMITS, SAMPLES_LEAST, DAMPING_LIMITS = (20.0, 3000.0), 8.0, (0.003, 0.7)
+#: A drift that oscillates keeps within these periods, s: faster ones are a band.
+PERIOD_LIMITS = (20.0, 3000.0)
 #: Parameters that size a term of the drift.
 DRIFT_SIZES = ("ln_rho", "ln_markov", "ln_flicker")
 
@@ -33,10 +32,10 @@ DRIFT_SIZES = ("ln_rho", "ln_markov", "ln_flicker")
 @dataclass(frozen=True)
 class Terms:
     """The terms of a noise model beside white noise: the drift's, 1/f noise, a damped oscillator that white noise
-    drives, the colour of the white noise, and narrow bands (rotations driven by noise).
+    drives, and the colour of the white noise.
 
-    `bands`: those found, each with its frequency in Hz, half width in Hz and ln of its size, all fixed: refitting them
-    with every later cause would cost much and change little. `trial`, Hz: one more, whose numbers are fitted."""
+    `bands`: further oscillators, each with its period in s, damping and ln of its size, all fixed: refitting them with
+    every later cause would cost much and change little."""
 
     walk: bool = False
     markov: bool = False
@@ -44,7 +43,6 @@ class Terms:
     oscillation: bool = False
     color: Literal["", "ma", "ar"] = ""
     bands: tuple[tuple[float, float, float], ...] = ()
-    trial: float | None = None
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -55,7 +53,6 @@ class Terms:
         names += ["ln_flicker"] if self.flicker else []
         names += ["ln_swing", "ln_period", "ln_damping"] if self.oscillation else []
         names += ["color"] if self.color else []
-        names += ["ln_band", "ln_width", "shift"] if self.trial is not None else []
         return tuple(names)
 
     def limits(self, dt: float) -> list[tuple[float, float]]:
@@ -66,16 +63,11 @@ class Terms:
             if name == "ln_alpha":
                 found.append((math.log(ALPHA_LIMITS[0]), math.log(ALPHA_LIMITS[1])))
             elif name == "ln_period":
-                low, high = max(PERIOD_LIMITS[0], SAMPLES_LEAST * dt), PERIOD_LIMITS[1]
-                found.append((math.log(low), math.log(max(high, 2.0 * low))))
+                found.append((math.log(2.1 * dt), math.log(max(PERIOD_LIMITS[1], 20.0 * dt))))
             elif name == "ln_damping":
-                found.append((math.log(DAMPING_LIMITS[0]), math.log(DAMPING_LIMITS[1])))
+                found.append((math.log(1e-5), math.log(DAMPING_LIMITS[1])))
             elif name == "color":
                 found.append((-2.6, 2.6))
-            elif name == "ln_width":
-                found.append((math.log(1e-4), math.log(0.3 / dt)))
-            elif name == "shift":
-                found.append((-0.1, 0.1))
             else:
                 found.append(size)
         return found
@@ -114,11 +106,11 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float, block: in
     variance v whose rates are a factor g apart make v / (2 ln g f), so v = B^2 ln g / pi.
     """
     value = dict(zip(terms.names, map(float, theta), strict=True))
-    bands = list(terms.bands)
-    if terms.trial is not None:
-        bands.append((terms.trial * math.exp(value["shift"]), math.exp(value["ln_width"]), value["ln_band"]))
+    swings = list(terms.bands)
+    if terms.oscillation:
+        swings.append((math.exp(value["ln_period"]), math.exp(value["ln_damping"]), value["ln_swing"]))
     rates = flicker_rates(duration_s, dt) if terms.flicker else ()
-    pairs = len(bands) + terms.oscillation + (terms.color == "ma")
+    pairs = len(swings) + (terms.color == "ma")
     single = terms.walk + terms.markov + len(rates) + (terms.color == "ar")
     size = max(1, single + 2 * pairs)
     F, Q, P0, h = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
@@ -155,22 +147,10 @@ def matrices(terms: Terms, theta: Array, dt: float, duration_s: float, block: in
         Q[k, k] = P0[k, k] = P0[k + 1, k + 1] = unit
         h[k], h[k + 1] = 1.0, m
         R, driver, k = 1e-9, k, k + 2
-    if terms.oscillation:
-        turn_of = swing(math.exp(value["ln_period"]), math.exp(value["ln_damping"]), dt)
-        variance = math.exp(2.0 * value["ln_swing"])
+    for period, damping, ln_size in swings:
+        turn_of, variance = swing(period, damping, dt), math.exp(2.0 * ln_size)
         F[k : k + 2, k : k + 2] = turn_of
         Q[k : k + 2, k : k + 2] = variance * (np.eye(2) - turn_of @ turn_of.T)
-        P0[k, k] = P0[k + 1, k + 1] = variance
-        h[k] = 1.0
-        k += 2
-    for frequency, width, ln_size in bands:
-        variance = math.exp(2.0 * ln_size)
-        turn = 2.0 * math.pi * frequency * dt
-        f = math.exp(-2.0 * math.pi * width * dt)
-        F[k, k] = F[k + 1, k + 1] = f * math.cos(turn)
-        F[k, k + 1] = f * math.sin(turn)
-        F[k + 1, k] = -F[k, k + 1]
-        Q[k, k] = Q[k + 1, k + 1] = variance * (1.0 - f * f)
         P0[k, k] = P0[k + 1, k + 1] = variance
         h[k] = 1.0
         k += 2

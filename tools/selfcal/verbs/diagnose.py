@@ -195,7 +195,7 @@ def _looked(
         doing.now("checks")
         looks.by_identify(diagnosed, recording, model)
     errors = {
-        name: seen[name].unfinished if name in seen else looks.why_not(recording, model, record, name)
+        name: seen[name].unfinished if name in seen else looks.why_not(record, name)
         for name in names
         if name not in diagnosed
     }

@@ -43,7 +43,7 @@ def response(
     from selfcal.adequacy.identify import stretch_of
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.diagnosis.diagnose import BELOW_LATTICE
-    from selfcal.diagnosis.record import of_recording, why_left_out
+    from selfcal.diagnosis.record import of_recording
     from selfcal.diagnosis.response import (
         LINES,
         REFUSED_FROM,
@@ -79,7 +79,7 @@ def response(
     record = of_recording(recording, loaded, decimate, axes)
     for name in axes:
         if name not in record.axes:
-            raise UserError(f"{recording.path}: {name}: {why_left_out(recording, loaded, name)}")
+            raise UserError(f"{recording.path}: {name}: {record.left_out[name]}")
     if record.present.size > REFUSED_FROM:
         raise UserError(f"{recording.path}: more than {REFUSED_FROM:,} samples at this rate: take a lower --decimate")
     if record.axes[output].below_lattice:

@@ -8,7 +8,7 @@ from typing import Any
 from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.model_tree import add_law
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.fit import Fit, best, fit, moved
+from selfcal.likelihood.fit import Fit, best
 from selfcal.likelihood.state import Look, State, net, of_parameter
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The size of 1/f noise is at its limit of nothing in
@@ -17,18 +17,16 @@ LN_LOOKS = -1.5
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """1/f noise: beside either drift, or alone."""
+    """1/f noise beside either drift, which may be nothing there."""
     if state.extras.flicker:
         return []
-    extras = replace(state.extras, flicker=True)
-    drifts = (extras, replace(extras, walk=True), replace(extras, markov=True))
-    chosen = best([fit(state.series, drift, moved(state.best, drift)) for drift in drifts])
-    gain = chosen.ln_likelihood - state.best.ln_likelihood
+    gain, fits = state.with_terms({}, flicker=True)
     worth = net(gain, 1, LN_LOOKS)
     if worth < 1.0:
         return []
-    sizes = _sizes(state, chosen)
-    return [Look("flicker", gain, worth, sizes, {"extras": extras}, measure=lambda final: _sizes(final, final.best))]
+    changes = {"extras": replace(state.extras, flicker=True)}
+    look = Look("flicker", gain, worth, _sizes(state, best(fits)), changes)
+    return [replace(look, measure=lambda final: _sizes(final, final.best))]
 
 
 def _sizes(state: State, chosen: Fit) -> dict[str, Any]:

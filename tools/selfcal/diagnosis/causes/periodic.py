@@ -9,95 +9,56 @@ from typing import Any
 
 import numpy as np
 from scipy.fft import next_fast_len, rfft
-from scipy.ndimage import uniform_filter1d
 
+from selfcal.diagnosis import swing
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, Written
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Shape
-from selfcal.likelihood.fit import Fit, fit, moved
+from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import ALIKE, Look, Regressor, State, interval, net
-from selfcal.likelihood.statemodel import PERIOD_LIMITS, SAMPLES_LEAST, Array, Mask
+from selfcal.likelihood.statemodel import Array, Mask
 
-#: Fewer turns in a record than this are drift. Of a band, which needs several of its own, fewer than this.
-TURNS_LEAST, BAND_TURNS = 1.5, 3.0
+#: Fewer turns in a record than this are drift.
+TURNS_LEAST = 1.5
 #: A line of fewer turns is as slow as a drift: its gain must hold over all possible drifts, and its search costs more.
 SLOW_TURNS = 30.0
 #: Two axes know the frequency of one line to so many turns in the record: nearer ones share a column.
 SAME = 0.25
-#: Widths of a band in bins of the periodogram.
-BAND_WIDTHS = (4, 8, 16, 32, 64, 128, 256, 512)
-#: A band must show this much, nats net of the search, before it is fitted; and explain this much more than a line.
-BAND_LEAST = 12.0
-BAND_DEARER = 6.0
-#: Bands that one model may have.
-BANDS_MOST = 5
 #: A band wider than this share of a line's frequency lies at one of its multiples by chance.
 HARMONIC_MOST = 0.1
 #: Lines whose frequencies, or multiples of them, differ by less than this share are one event.
 ONE_LINE = 0.01
 #: Share of its frequency within which another line is a side band.
 SIDE_BAND = 0.1
-#: A band lies at so many of its own widths at least: what is wider is coloured or flicker noise.
-NARROW = 4
 
 
 def looks(state: State, record: Record) -> list[Look]:
     """The strongest line, or a narrow band about a frequency that wanders, if that explains more."""
-    line, band = _line(state, record), _band(state, record)
-    if line and band:
-        return line if line[0].net > band[0].net - BAND_DEARER else band
-    return line or band
+    line, band = _line(state, record), _band(state)
+    return line if line and not (band and band[0].gain > line[0].gain + ALIKE) else band
 
 
-def _band(state: State, record: Record) -> list[Look]:
-    """An oscillator driven by noise: amplitude, frequency and width are fitted."""
-    n = state.y.size
-    w = np.nan_to_num(state.whitened)
-    count = int(np.isfinite(state.y).sum())
-    power = np.abs(rfft(w)) ** 2 / count
-    low = max(4, math.ceil(10.0 * BAND_TURNS))
-    if not state.extras.oscillation:  # a slower band is that
-        low = max(low, math.ceil(n * state.dt / max(PERIOD_LIMITS[0], SAMPLES_LEAST * state.dt)))
-    best: tuple[float, int, int] | None = None
-    for width in BAND_WIDTHS:
-        if width > power.size // 8:
-            break
-        mean = uniform_filter1d(power, width, mode="reflect")
-        gains = width * (mean - 1.0 - np.log(np.maximum(mean, 1e-12))) * (mean > 1.0)
-        gains[: max(low + width, NARROW * width)] = 0.0
-        at = int(np.argmax(gains))
-        if best is None or gains[at] > best[0]:
-            best = (float(gains[at]), at, width)
-    if best is None:
+def _band(state: State) -> list[Look]:
+    """A fast swing that noise drives (swing.py). Slow ones are the bias's own (oscillation.py)."""
+    found = swing.found(state, slow=False) if len(state.extras.bands) < swing.MOST else None
+    if found is None or found.keeps_phase:
         return []
-    ln_places = math.log(max(1.0, 0.5 * count)) + 1.0
-    if net(best[0], 2, ln_places) < BAND_LEAST or len(state.extras.bands) >= BANDS_MOST:
-        return []
-    f, width_hz = best[1] / (n * state.dt), best[2] / (n * state.dt)
-    size, wide = 0.5 * math.log(max(1e-4, 2.0 * best[2] / count)), math.log(max(1.1e-4, 0.3 * width_hz))
-    terms = replace(state.best.terms, trial=f)
-    chosen = fit(state.series, terms, moved(state.best, terms, {"ln_band": size, "ln_width": wide}))
-    gain = chosen.ln_likelihood - state.best.ln_likelihood
-    worth = net(gain, 3, ln_places)
-    centre = f * math.exp(chosen.value("shift"))
-    half_width = math.exp(chosen.value("ln_width"))
-    if worth < 1.0 or half_width * NARROW > centre:
-        return []
-    share, sd = math.exp(chosen.value("ln_band")), 1.0 / math.sqrt(max(1.0, half_width * n * state.dt))
+    (period, damping, ln_size), fit = found.numbers, found.fit
+    width, share = damping / period, math.exp(ln_size)
+    sd = 1.0 / math.sqrt(max(1.0, width * fit.duration_s))
 
     def amplitude(sigma: float) -> dict[str, Any]:
         return {"amplitude": interval(math.sqrt(2.0) * sigma * share, sigma * share * sd, state.unit)}
 
     estimate = {
-        "frequency_hz": interval(centre, half_width * sd, "Hz"),
-        **amplitude(chosen.sigma),
-        "width_hz": interval(half_width, half_width * sd, "Hz"),
+        "frequency_hz": interval(1.0 / period, width * sd, "Hz"),
+        **amplitude(fit.sigma),
+        "width_hz": interval(width, width * sd, "Hz"),
     }
-    bands = (*state.extras.bands, (centre, half_width, math.log(share)))
-    changes = {"extras": replace(state.extras, bands=bands)}
-    look = Look("periodic", gain, worth, estimate, changes, shown_by="band")
+    changes = {"extras": replace(state.extras, bands=(*state.extras.bands, found.numbers))}
+    look = Look("periodic", found.gain, found.net, estimate, changes, shown_by="band")
     return [replace(look, measure=lambda final: amplitude(final.best.sigma))]
 
 
@@ -278,7 +239,7 @@ def _breadth(line: Look) -> float:
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
     """The line that the first half alone shows."""
     part = replace(record, present=record.present[:split])
-    found = looks(before.first(split), part)
+    found = _line(before.first(split), part)
     if not found:
         return after
     f, own = _hz(found[0]), _hz(look)
@@ -322,14 +283,15 @@ def _advice(look: Look, record: Record) -> str:
         beside = "" if "temperature" in record.channels else ", with the temperature at the sensor"
         return f"Record longer{beside}: {turns:.1f} turns hardly tell a line from a drift."
     few = record.recorded_hz < 4.0 * _hz(look)
-    return "Record at another rate: a line that moves is an alias." if few else ""
+    if few:
+        return "Record at another rate: a line that moves is an alias."
+    return "Look for what turns or switches at this frequency."
 
 
 CAUSE = Cause(
     "periodic",
     "A periodic disturbance of one frequency is in the readings.",
-    "Look for what turns or switches at this frequency.",
-    advice=_advice,
+    _advice,
     source="surroundings",
     looks=looks,
     at=at,

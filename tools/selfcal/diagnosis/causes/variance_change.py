@@ -7,8 +7,9 @@ to the temperature, the supply, or the logarithm of another axis' short-term var
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +30,7 @@ from selfcal.diagnosis.causes.step import ONE_EVENT_S
 from selfcal.diagnosis.forms import LN_SMOOTHINGS, SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
+from selfcal.likelihood.edges import raised
 from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
@@ -54,80 +56,78 @@ def ln_changes(n: int, gain: float) -> float:
     return ln_looks(np.repeat(0.5 * n / (k * (n - k)), 2), gain)
 
 
+@dataclass(frozen=True)
+class Level:
+    """What the noise level may follow: ln of the variance is in proportion to `values` [n]. `price` of its search by
+    the gain. `told`: the estimate by the slope, its standard deviation, and the excess of the squares' variance."""
+
+    column: str
+    values: Array
+    price: Callable[[float], float]
+    told: Callable[[float, float, float], dict[str, Any]]
+    when: tuple[float, float] | None = None
+
+
 def looks(state: State, record: Record) -> list[Look]:
-    """The likeliest place, and every channel that the level may follow."""
-    return once(state, record) + follows(state, record)
-
-
-def once(state: State, record: Record) -> list[Look]:
-    """The likeliest place."""
-    present = np.isfinite(state.y)
-    w = state.whitened[present]
-    n = w.size
-    edge = max(EDGE_SAMPLES, round(n * EDGE_SHARE))
-    if n < 4 * edge:
+    """The likeliest place, and for each channel the width of its means that shows most."""
+    present = np.isfinite(state.whitened)
+    if present.sum() < 4 * EDGE_SAMPLES:
         return []
-    square = np.minimum(w * w, MOST) + 1e-12
-    total = np.cumsum(square)
-    k = np.arange(1, n)
+    square = np.minimum(state.whitened[present] ** 2, MOST) + 1e-12
+    best: dict[str, tuple[float, Level]] = {}
+    for level in (*_places(state, record, square), *levels(state, record)):
+        gain = slope_of(square, level.values[present])[1]
+        if gain > best.get(level.column, (0.0, level))[0]:
+            best[level.column] = gain, level
+    found = (_look(state, level) for gain, level in best.values() if net(gain, 1, level.price(gain)) >= 1.0)
+    return [look for look in found if look is not None]
+
+
+def _look(state: State, level: Level) -> Look | None:
+    """The look at a level, refitted: limited squares show less of the louder part at first."""
+    present = np.isfinite(state.whitened)
+    changed, slope, sd = state, 0.0, math.inf
+    for _ in range(2):
+        square = np.minimum(changed.whitened[present] ** 2, MOST) + 1e-12
+        more, _, sd = slope_of(square, level.values[present])
+        slope += more
+        changed = state.refit(r=state.r * np.exp(slope * level.values))
+    # A kurtosis of the squares other than the normal's 2 widens the null in proportion.
+    square = np.minimum(changed.whitened[present] ** 2, MOST)
+    wide = max(1.0, float(np.var(square / square.mean())) / 2.0) if state.lsb == 0.0 else 1.0
+    gain = changed.best.ln_likelihood - state.best.ln_likelihood
+    worth = net(gain / wide, 1, level.price(gain))
+    if worth < 1.0:
+        return None
+    return Look("variance_change", gain, worth, level.told(slope, sd, wide), {"r": changed.r}, when=level.when)
+
+
+def _places(state: State, record: Record, square: Array) -> Iterator[Level]:
+    """The likeliest place of a change, by the squares [m] of the samples that are there."""
+    n, read = square.size, np.flatnonzero(np.isfinite(state.whitened))
+    edge = max(EDGE_SAMPLES, round(n * EDGE_SHARE))
+    total, k = np.cumsum(square), np.arange(1, n)
     first, second = total[:-1] / k, np.maximum((total[-1] - total[:-1]) / (n - k), 1e-12)
     gain = 0.5 * (n * math.log(total[-1] / n) - k * np.log(first) - (n - k) * np.log(second))
     gain[: edge - 1] = gain[n - edge :] = 0.0
     at = int(np.argmax(gain))
-    # A kurtosis of the squares other than the normal's 2 widens the null in proportion.
-    wide = max(1.0, float(np.var(square / first[at] if at else square)) / 2.0) if state.lsb == 0.0 else 1.0
-    scan = float(gain[at]) / wide
-    if net(scan, 1, ln_changes(n, scan)) < 1.0:
-        return []
-    place = int(np.flatnonzero(present)[at + 1])
-    ratio = math.sqrt(float(second[at] / first[at]))
-    r = state.r.copy()
-    r[place:] *= ratio**2
-    changed = state.refit(r=r)
-    # Limited squares show less of the louder part. With the change in the model both parts are limited alike.
-    left = np.minimum(changed.whitened[present] ** 2, MOST)
-    more = math.sqrt(float(left[at + 1 :].mean() / left[: at + 1].mean()))
-    ratio *= more
-    r[place:] *= more**2
-    changed = changed.refit(r=r)
-    exact = changed.best.ln_likelihood - state.best.ln_likelihood
-    worth = net(min(exact, scan * 1.2 + 2.0), 1, ln_changes(n, exact))
-    if worth < 1.0:
-        return []
-    time = float(record.time_s[place])
-    # Over every place: the change lies between the last reading before it and the first one with it.
-    weight = np.exp((gain - gain.max()) / wide) * (gain > 0.0)
-    held = weight > 1e-7
-    read = record.time_s[present]
-    apart = np.diff(read)[held]
-    times = read[1:][held] - 0.5 * apart
-    ratios = np.sqrt(second[held] / first[held]) * more
-    sds = ratios * np.sqrt(0.5 * wide / k[held] + 0.5 * wide / (n - k[held]))
-    return [
-        Look(
-            "variance_change",
-            exact,
-            worth,
-            {
-                "time_s": mixture(weight[held] * apart, times, apart / math.sqrt(12.0), "s"),
-                "ratio": mixture(weight[held], ratios, sds, "1"),
-            },
-            {"r": r},
-            when=(time, float(record.time_s[-1])),
-        )
-    ]
+    place = int(read[at + 1])
 
+    def told(slope: float, sd: float, wide: float) -> dict[str, Any]:
+        """Over every place: the change lies between the last reading before it and the first one with it."""
+        weight = np.exp((gain - gain.max()) / wide) * (gain > 0.0)
+        held = weight > 1e-7
+        time = record.time_s[read]
+        apart = np.diff(time)[held]
+        ratios = np.sqrt(second[held] / first[held] * first[at] / second[at]) * math.exp(0.5 * slope)
+        sds = ratios * np.sqrt(0.5 * wide / k[held] + 0.5 * wide / (n - k[held]))
+        return {
+            "time_s": mixture(weight[held] * apart, time[1:][held] - 0.5 * apart, apart / math.sqrt(12.0), "s"),
+            "ratio": mixture(weight[held], ratios, sds, "1"),
+        }
 
-@dataclass(frozen=True)
-class Level:
-    """What the noise level may follow: ln of the variance is in proportion to `values` [n] of `column`."""
-
-    column: str
-    unit: str
-    values: Array
-    input: str
-    width_s: float
-    ln_looks: float
+    when = (float(record.time_s[place]), float(record.time_s[-1]))
+    yield Level("", raised(state.y.size, place), lambda gain: ln_changes(n, gain), told, when)
 
 
 def levels(state: State, record: Record) -> Iterator[Level]:
@@ -136,10 +136,28 @@ def levels(state: State, record: Record) -> Iterator[Level]:
     sides = {record.channel_names[name]: (SIDE_CHANNELS[name][1], one) for name, one in record.channels.items()}
     others = record.variances(state.axis)
     price = LN_SMOOTHINGS + math.log(max(1, len(sides) + len(others)))
+
+    def level(name: str, unit: str, values: Array, by: str) -> Level:
+        span = float(np.diff(np.quantile(values[np.isfinite(state.whitened)], ENDS))[0])
+
+        def told(slope: float, sd: float, wide: float) -> dict[str, Any]:
+            """The level is the root of the variance."""
+            size, sd = 0.5 * slope, 0.5 * sd * math.sqrt(wide)
+            ratio = math.exp(abs(size) * span)
+            return {
+                "channel": name,
+                "input": by,
+                "form": "static",
+                "coefficient": interval(size, sd, "1" if unit == "1" else f"1/{unit}"),
+                "ratio": interval(ratio, ratio * span * sd, "1"),
+            }
+
+        return Level(name, values - values.mean(), lambda gain: price, told)
+
     for name, (unit, values) in sides.items():
         for width in SMOOTHING_S:
             if width == SMOOTHING_S[0] or width <= 0.1 * n * dt:
-                yield Level(name, unit, smoothed(values, round(width / dt)), "value", width, price)
+                yield level(name, unit, smoothed(values, round(width / dt)), "value")
     for name, values in others.items():
         for width in vibration.WIDTHS_S:
             if width * record.recorded_hz >= vibration.LEAST and width <= 0.1 * n * dt:
@@ -147,50 +165,7 @@ def levels(state: State, record: Record) -> Iterator[Level]:
                 power = smoothed(values, cells)
                 if cells > OWN:
                     power = (cells * power - OWN * smoothed(values, OWN)) / (cells - OWN)
-                yield Level(name, "1", np.log(np.maximum(power / power.max(), 1e-12)), "variance", width, price)
-
-
-def follows(state: State, record: Record) -> list[Look]:
-    """For each channel the width of its means that shows most."""
-    present = np.isfinite(state.whitened)
-    if present.sum() < 4 * EDGE_SAMPLES:
-        return []
-    square = np.minimum(state.whitened[present] ** 2, MOST) + 1e-12
-    wide = max(1.0, float(np.var(square / square.mean())) / 2.0) if state.lsb == 0.0 else 1.0
-    best: dict[str, tuple[float, Level]] = {}
-    for level in levels(state, record):
-        scan = slope_of(square, level.values[present])[1] / wide
-        if scan > best.get(level.column, (0.0, level))[0]:
-            best[level.column] = scan, level
-    found = (_follows(state, level, wide) for scan, level in best.values() if net(scan, 1, level.ln_looks) >= 1.0)
-    return [look for look in found if look is not None]
-
-
-def _follows(state: State, level: Level, wide: float) -> Look | None:
-    """The look at one channel, refitted: limited squares show less of the louder part at first."""
-    present = np.isfinite(state.whitened)
-    changed, slope, sd = state, 0.0, math.inf
-    for _ in range(2):
-        square = np.minimum(changed.whitened[present] ** 2, MOST) + 1e-12
-        more, _, sd = slope_of(square, level.values[present])
-        slope += more
-        changed = state.refit(r=state.r * np.exp(slope * (level.values - level.values.mean())))
-    exact = (changed.best.ln_likelihood - state.best.ln_likelihood) / wide
-    worth = net(exact, 1, level.ln_looks)
-    if worth < 1.0:
-        return None
-    # The level is the root of the variance.
-    size, sd = 0.5 * slope, 0.5 * sd * math.sqrt(wide)
-    span = float(np.diff(np.quantile(level.values[present], ENDS))[0])
-    ratio = math.exp(abs(size) * span)
-    estimate = {
-        "channel": level.column,
-        "input": level.input,
-        "form": "static",
-        "coefficient": interval(size, sd, "1" if level.unit == "1" else f"1/{level.unit}"),
-        "ratio": interval(ratio, ratio * span * sd, "1"),
-    }
-    return Look("variance_change", exact, worth, estimate, {"r": changed.r})
+                yield level(name, "1", np.log(np.maximum(power / power.max(), 1e-12)), "variance")
 
 
 def slope_of(square: Array, values: Array) -> tuple[float, float, float]:
@@ -225,14 +200,8 @@ def slope_of(square: Array, values: Array) -> tuple[float, float, float]:
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
     """The change of the noise as the training samples have it."""
     square = np.minimum(before.whitened[:split] ** 2, MOST)
-    if look.when is None:
-        shape = np.log(after.r / before.r)
-        there = np.isfinite(square)
-        return replace(after, r=before.r * np.exp(slope_of(square[there], shape[:split][there])[0] * shape))
-    place = round(look.when[0] * record.rate_hz)
-    r = before.r.copy()
-    r[place:] *= float(np.nanmean(square[place:]) / np.nanmean(square[:place]))
-    return replace(after, r=r)
+    shape, there = np.log(after.r / before.r), np.isfinite(square)
+    return replace(after, r=before.r * np.exp(slope_of(square[there], shape[:split][there])[0] * shape))
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]]:
@@ -264,7 +233,6 @@ CAUSE = Cause(
     score=Scored(
         once="a change of the noise is an event of its recording",
         no_carry=lambda look: "" if look.when else "the bank's noise level follows no channel",
-        onset=True,
         trained=_trained,
     ),
     written=Written(extend=_extend),

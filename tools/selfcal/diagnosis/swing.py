@@ -1,0 +1,112 @@
+"""A damped oscillator that white noise drives, of any period: x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / P.
+
+A slow one is the drift's (causes/oscillation.py), a fast one a band (causes/periodic.py). The drift swallows slow
+swings: the innovations are looked at behind smaller drifts as well. A smoothed periodogram of these shows the period
+and the damping from which all is fitted.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.fft import rfft
+from scipy.ndimage import uniform_filter1d
+
+from selfcal.likelihood.fit import Fit, best, finish, left, moved
+from selfcal.likelihood.state import SCREEN, State, net
+from selfcal.likelihood.statemodel import PERIOD_LIMITS
+from selfcal.model.laws import DAMPING_LIMITS, SWING_LEAST
+
+#: Turns in a record at least.
+TURNS_LEAST = 3.0
+#: Drifts behind which slow swings are looked for: smaller by exp(-these).
+SIZES = (0.0, 1.5, 4.0)
+#: Widths of a mean of the periodogram, bins. Half the width of a band is this share of the mean that shows it.
+WIDTHS, SHARE = tuple(2**k for k in range(1, 10)), 0.3
+#: Above this damping a fast band is coloured or flicker noise.
+NARROW = 0.25
+#: Swings that one model may have beside a slow one.
+MOST = 5
+#: ln of the bins of the spectrum less this is the price of a search: by 800 clean records at 1 and 10 Hz, of swings
+#: that forget their phase.
+LN_FEWER = 4.4
+
+
+@dataclass(frozen=True)
+class Swing:
+    """A swing with its fits beside every near drift: its gain, and that `net` of the search."""
+
+    fits: tuple[Fit, ...]
+    gain: float
+    net: float
+
+    @property
+    def fit(self) -> Fit:
+        return best(self.fits)
+
+    @property
+    def numbers(self) -> tuple[float, float, float]:
+        """Period, s, damping, and ln of its size over the white noise of a sample."""
+        period, damping, size = (self.fit.value(name) for name in ("ln_period", "ln_damping", "ln_swing"))
+        return math.exp(period), math.exp(damping), size
+
+    @property
+    def keeps_phase(self) -> bool:
+        """Whether the record is too short to show that its phase is forgotten: it may be a line."""
+        period, damping, _ = self.numbers
+        return 2.0 * math.pi * damping * self.fit.duration_s < period
+
+
+def found(state: State, *, slow: bool) -> Swing | None:
+    """The swing that promises most, the drift fitted with it, if it is worth one nat."""
+    n, span = state.y.size, state.y.size * state.dt
+    border = span / max(PERIOD_LIMITS[0], SWING_LEAST * state.dt)
+    low, high = (max(TURNS_LEAST, span / PERIOD_LIMITS[1]), border) if slow else (border, 0.5 * n)
+    start = _search(state, low, high, SIZES if slow else SIZES[:1], 1.0 if slow else NARROW)
+    if start is None:
+        return None
+    gain, fits = state.with_terms(start[0], start[1], oscillation=True, bands=held(state))
+    if slow and not state.extras.flicker:  # a poor drift model makes some nats of any slow term
+        gain -= max(0.0, state.rich.ln_likelihood - state.best.ln_likelihood)
+    swing = Swing(fits, gain, net(gain, 3, max(0.0, math.log(max(high - low, 1.0)) - LN_FEWER)))
+    period, damping, _ = swing.numbers
+    inside = low < span / period < high and (slow or damping < NARROW)
+    return swing if swing.net >= 1.0 and inside else None
+
+
+def held(state: State) -> tuple[tuple[float, float, float], ...]:
+    """The swings of a model, each with the numbers that it has."""
+    return (*state.extras.bands, *([Swing((state.best,), 0.0, 0.0).numbers] if state.extras.oscillation else []))
+
+
+def _search(
+    state: State, low: float, high: float, sizes: Sequence[float], most: float
+) -> tuple[dict[str, float], float] | None:
+    """ln of period, damping and size of the likeliest swing of `low` to `high` turns and a damping of `most`, and by
+    how much the drift beside it is smaller. Each mean of the periodogram has its best place; of these the filter finds
+    the likeliest."""
+    n, fit = state.y.size, state.best
+    place = np.arange(n // 2 + 1)
+    terms = replace(fit.terms, oscillation=True, bands=held(state))
+    chosen, least = None, SCREEN
+    for less in sizes:
+        drift = fit.shrunk(less)
+        white = left(state.series, drift, np.empty((0, n)))[:, 0]
+        power = np.abs(rfft(white)) ** 2 / (fit.sigma**2 * fit.n)
+        for width in WIDTHS:
+            mean = np.maximum(uniform_filter1d(power, width, mode="reflect"), 1.0)
+            gain = width * (mean - 1.0 - np.log(mean)) - np.log(np.maximum(place / width, 1.0))
+            inside = (mean > 1.0) & (place >= low) & (place < high) & (SHARE * width < most * place)
+            if not inside.any():
+                continue
+            at = int(np.argmax(np.where(inside, gain, -math.inf)))
+            size = 0.5 * math.log(2.0 * width * (float(mean[at]) - 1.0) / n)
+            damping = math.log(min(SHARE * width / at, DAMPING_LIMITS[1]))
+            own = {"ln_period": math.log(n * state.dt / at), "ln_damping": damping, "ln_swing": size}
+            value = finish(state.series, terms, moved(drift, terms, own)).ln_likelihood - fit.ln_likelihood
+            if value > least:
+                chosen, least = (own, less), value
+    return chosen
