@@ -90,10 +90,10 @@ class State:
         columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
         return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol, self.block)
 
-    def means(self) -> tuple[Series, int]:
-        """Means of blocks, NaN where half of one is missing, and the samples of a block."""
+    def means(self, longest_s: float = math.inf) -> tuple[Series, int]:
+        """Means of blocks of `longest_s` at most, NaN where half of one is missing, and the samples of a block."""
         n = self.y.size
-        block = max(1, n // MEANS_MOST)
+        block = max(1, int(min(n // MEANS_MOST, longest_s / self.dt)))
         mean, used = half_means(self.y, block)
         r, columns = (
             rows[..., : n // block * block].reshape(*rows.shape[:-1], n // block, block).mean(axis=-1)
