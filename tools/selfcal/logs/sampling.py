@@ -57,8 +57,8 @@ _FEW, _BAND_OF_FEW = 64, (0.95, 1.4)
 _STEPS, _PIECES = 20, 500
 #: A part of one rate must save so many squares of the scatter between neighbouring pieces.
 _PRICE_OF_PART = 40.0
-#: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
-_CHANGE = 0.015
+#: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
+CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
 #: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
 _ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
@@ -180,7 +180,7 @@ def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, P
     steps = np.diff(time)
     changes = rate_changes(time) if rate is None else []
     if changes:
-        dt = min(min(one.before_s, one.after_s) for one in changes)
+        dt = 1.0 / max(max(change.before_hz, change.after_hz) for change in changes)
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     stamps = _stamps(time, noise_s)
     if (steps < 0.0).any():
@@ -198,7 +198,7 @@ def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, P
 
 def _stamps(time: Floats, noise_s: float) -> _Stamps:
     """Stamps with what one look shows of them. Raises Ambiguous."""
-    steps = np.diff(time)
+    time, steps = time - time[0], np.diff(time)
     usual = _usual(steps)
     if not time[-1] < _LONGEST * usual:
         raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {usual:.3g} s")
@@ -498,74 +498,79 @@ def _usual(steps: Floats) -> float:
 
 @dataclass(frozen=True)
 class Change:
-    """The first `row` at another rate, the intervals before and after it (s), and the evidence in nats."""
+    """The first `row` at another rate, its time since the first row, s, the rates before and after it, and the evidence
+    in nats."""
 
     row: int
-    before_s: float
-    after_s: float
+    time_s: float
+    before_hz: float
+    after_hz: float
     nats: float
 
 
 def rate_changes(time: Floats) -> list[Change]:
-    """Every change of rate in stamps float64[n], s, in order of time.
+    """Every change of rate in stamps float64[n], s, in order of time: where the laws of the stamps on its two sides
+    have another interval.
 
     A rate must last two pieces of n / _PIECES rows, or of 3 * _STEPS; one that differs much, of _STEPS."""
-    found = _parts(time, 3 * _STEPS) or _parts(time, _STEPS)
-    steps = np.diff(time)
-    # A burst after a stall makes up for it: samples of one rate, stamped late.
-    late = (steps[max(0, one.row - 3) : one.row + 2].max() > _STEPS * max(one.before_s, one.after_s) for one in found)
-    # Levels of coarse stamps may differ where their mean intervals do not.
-    same = (abs(math.log(one.after_s / one.before_s)) < 0.5 * _CHANGE for one in found)
-    return [] if any(late) or any(same) else found
+    return _changes(time, 3 * _STEPS) or _changes(time, _STEPS)
 
 
-def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
+def _changes(time: Floats, least: int) -> list[Change]:
     """The changes between parts of some pieces, which have `least` rows or more."""
-    n = time.size
-    size = max(least, n // _PIECES)
-    if n < 6 * size:
+    size = max(least, time.size // _PIECES)
+    if time.size < 6 * size:
         return []
-    steps = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
-    count = steps.size // size
-    pieces = steps[: count * size].reshape(count, size)
-    middle = np.quantile(pieces, 0.25, axis=1, keepdims=True)  # a lost row makes windows longer, and few shorter
-    if not middle.min() > 0.0:
+    means = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
+    pieces = means[: means.size // size * size].reshape(-1, size)
+    interval = np.quantile(pieces, 0.25, axis=1)  # a lost row makes windows longer, and few shorter
+    if not interval.min() > 0.0:
         return []
-    # Quantiles of coarse stamps jump by a step of their lattice, means move with gaps: a change of rate does both.
-    near = (pieces > 0.5 * middle) & (pieces < 1.5 * middle)
-    value = np.log(middle[:, 0])
-    mean = np.log((pieces * near).sum(axis=1) / near.sum(axis=1))
-    parts = _constant(value, mean)
+    steps = np.diff(time)
+    lattice = common_step(steps, 1e-6 * interval.min())
+    value = np.log(interval)
+    # The quantile of coarse stamps jumps by a step of their lattice.
+    parts = _constant(value, max(CHANGE, 1.5 * lattice / (_STEPS * interval.min())))
     if len(parts) < 2:
         return []
     level = [math.exp(float(np.median(value[a:b]))) for a, b in parts]
-    lattice = common_step(np.diff(time), 1e-6 * min(level)) if max(level) > 1.05 * min(level) else 0.0
     # The longest step without a loss: stamps are rounded up at most to the next place of their lattice.
-    most = [max(1.5 * step, 1.001 * lattice * math.ceil(step / lattice - 1e-3) if lattice else 0.0) for step in level]
-    pairs = zip(pairwise(parts), pairwise(level), pairwise(most), strict=True)
-    ends = [0, *(_bend(time, *found, size) for found in pairs), n]
-    spans = [slice(a, b) for a, b in pairwise(ends)]
-    if any(b - a < 2 * _STEPS for a, b in pairwise(ends)) or _lossy_parts(time, spans, level, lattice):
-        return []
-    own = [np.diff(time[one.start : one.stop + 1]) for one in spans]
-    kept = [each[(each > 0.5 * step) & (each < last)] for each, step, last in zip(own, level, most, strict=True)]
-    exact = [float(each.mean()) for each in kept]
-    scatter = max(1e-3, _scatter(value, parts))
-    return [
-        Change(row, *intervals, min(1e6, 0.5 * n * math.log(intervals[1] / intervals[0]) ** 2 / scatter**2))
-        for row, intervals in zip(ends[1:-1], pairwise(exact), strict=True)
+    longest = [
+        max(1.5 * step, lattice * math.ceil(step / lattice - 1e-3) * 1.001 if lattice else 0.0) for step in level
     ]
+    pairs = zip(pairwise(parts), pairwise(level), pairwise(longest), strict=True)
+    rows = [0, *(_bend(time, *pair, size) for pair in pairs), time.size]
+    if min(np.diff(rows)) < 2 * _STEPS:
+        return []
+    intervals = [_interval(time[a:b][:_HEAD], lattice) for a, b in pairwise(rows)]
+    scatter, found = max(CHANGE, _scatter(value, parts)), list[Change]()
+    for row, (before, after) in zip(rows[1:-1], pairwise(intervals), strict=True):
+        ratio = math.log(after / before)
+        # A burst after a stall makes up for it: samples of one rate, stamped late.
+        late = steps[max(0, row - 3) : row + 2].max() > _STEPS * max(before, after)
+        if late or abs(ratio) < 0.5 * CHANGE:
+            return []
+        nats = min(1e6, 0.5 * time.size * (ratio / scatter) ** 2)
+        found.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
+    return found
 
 
-def _constant(value: NDArray[np.float64], mean: Floats) -> list[tuple[int, int]]:
-    """First piece and the piece after the last of every part of one rate. `value` and `mean` [pieces]: ln of the
-    interval by the quantile and by the mean. A piece with a change in it belongs to no part.
+def _interval(time: Floats, lattice: float) -> float:
+    """Interval of the samples of a part, s. On a coarse lattice a slower rate looks like losses in a pattern."""
+    law = _likeliest(_stamps(time, 0.0), None)
+    patterned = lattice > _COARSE * law.dt and in_pattern(law.missing + 1)
+    return float(law.dt * (1.0 + law.missing[1:].mean())) if patterned else law.dt
+
+
+def _constant(value: Floats, least: float) -> list[tuple[int, int]]:
+    """First piece and the piece after the last of every part of one rate. `value` [pieces]: ln of the interval, whose
+    changes are `least` or more. A piece with a change in it belongs to no part.
 
     The sum of squares about the levels of the parts, and a price for each part, is the least (optimal partition).
     """
     count = value.size
-    total, square = (np.concatenate([[0.0], np.cumsum(one)]) for one in (value - value[0], (value - value[0]) ** 2))
-    noise = max(float(np.median(np.abs(np.diff(value)))), 0.05 * _CHANGE)
+    total, square = (np.concatenate([[0.0], np.cumsum(each)]) for each in (value - value[0], (value - value[0]) ** 2))
+    noise = max(float(np.median(np.abs(np.diff(value)))), 0.05 * CHANGE)
     best, start = np.zeros(count + 1), np.zeros(count + 1, np.int64)
     for end in range(1, count + 1):
         begin = np.arange(end)
@@ -578,56 +583,34 @@ def _constant(value: NDArray[np.float64], mean: Floats) -> list[tuple[int, int]]
         ends.append(int(start[ends[-1]]))
     parts = [(a, b) for a, b in pairwise(ends[::-1]) if b - a > 1]
     while len(parts) > 1:
-        scatter = _scatter(value, parts)
-        apart = [_apart(value, one, other) for one, other in pairwise(parts)]
-        means = [_apart(mean, one, other) for one, other in pairwise(parts)]
-        sound = [
-            abs(step) >= max(_CHANGE, 6.0 * scatter) and abs(both - step) <= 0.3 * abs(step)
-            for step, both in zip(apart, means, strict=True)
-        ]
-        if all(sound):
+        apart = np.abs(np.diff([float(np.median(value[a:b])) for a, b in parts]))
+        join = int(apart.argmin())
+        if apart[join] >= max(least, 6.0 * _scatter(value, parts)):
             break
-        join = min((k for k in range(len(sound)) if not sound[k]), key=lambda k: abs(apart[k]))
         parts[join : join + 2] = [(parts[join][0], parts[join + 1][1])]
     return parts
 
 
-def _apart(value: NDArray[np.float64], one: tuple[int, int], other: tuple[int, int]) -> float:
-    """How far the level of a part is above the level of the part before."""
-    return float(np.median(value[slice(*other)]) - np.median(value[slice(*one)]))
-
-
-def _scatter(value: NDArray[np.float64], parts: list[tuple[int, int]]) -> float:
+def _scatter(value: Floats, parts: list[tuple[int, int]]) -> float:
     """Distance from the level of its part that one piece in ten exceeds, the largest of all parts of ten pieces and of
     all together."""
     off = [np.abs(value[a:b] - np.median(value[a:b])) for a, b in parts]
-    return max(float(np.quantile(one, 0.9)) for one in [np.concatenate(off), *(one for one in off if one.size >= 10)])
+    return max(
+        float(np.quantile(each, 0.9)) for each in [np.concatenate(off), *(each for each in off if each.size >= 10)]
+    )
 
 
 def _bend(
-    time: Floats, parts: Sequence[tuple[int, int]], level: Sequence[float], most: Sequence[float], size: int
+    time: Floats, parts: Sequence[tuple[int, int]], level: Sequence[float], longest: Sequence[float], size: int
 ) -> int:
-    """First row of the second of two parts [first piece, piece after], with intervals `level`, s, of `most`: the row
-    farthest from the line of the mean interval, gaps left out."""
+    """First row of the second of two parts [first piece, piece after], with intervals `level`, s, of the `longest`: the
+    row farthest from the line of the mean interval, gaps left out."""
     (begin, a), (b, end) = parts
     first = max(0, (max(begin + 1, a - 1)) * size)
     last = min(time.size - 1, min(end, b + 2) * size + (_STEPS if end - b > 2 else 0))
     each = np.diff(time[first : last + 1])
-    line = np.cumsum(np.where(each < max(most), each - 0.5 * sum(level), 0.0))
+    line = np.cumsum(np.where(each < max(longest), each - 0.5 * sum(level), 0.0))
     return first + 1 + int(np.argmax(line) if level[0] > level[1] else np.argmin(line))
-
-
-def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[float], lattice: float) -> bool:
-    """Whether a part is no slower one: its likeliest grid is that of the fastest part. Its stamps are not rounded to a
-    coarse `lattice`."""
-    fastest = min(level)
-    heads = [(time[one][:_HEAD], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
-    coarse = [lattice > _COARSE * fastest and in_pattern(np.rint(np.diff(head) / lattice)) for head, _ in heads]
-    return any(
-        abs(_likeliest(_stamps(head - head[0], 1e-9 * fastest), None).dt / fastest - 1.0) < 0.05
-        for (head, _), rounded in zip(heads, coarse, strict=True)
-        if not rounded
-    )
 
 
 def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
