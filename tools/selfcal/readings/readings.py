@@ -212,34 +212,32 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     # The codes of a counter recur; a dead band takes its counts from its neighbours.
     counter = lattice is not None and lattice.carried > 0.0
     recurring = None if misread or uneven or counter else recurring_of(sound, recording.rate_hz)
-    if recurring is not None:
-        values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
+    lost = none if recurring is None else recurring.mask
+    if lost.any():
+        sound = np.where(lost, np.nan, sound)
         lattice = lattice_of(_known(sound), recording.rate_hz)
     stuck, nats = _stuck(sound, lattice, group.stuck_limit)
     if stuck.any():
-        values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
+        sound = np.where(stuck, np.nan, sound)
     stretches = tuple(slower(sound))
-    repeats = np.zeros(values.size, bool)
-    for one in stretches:
-        repeats[one.rows] = True
-    if stretches:
-        values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
+    repeats = np.isin(np.arange(values.size), np.concatenate([one.rows for one in stretches])) if stretches else none
+    left_out = lost | stuck | repeats
+    values = np.where(left_out, np.nan, values) if left_out.any() else values
+    moving, moved = _moving(recording, axis)
+    if stretches or moving.any():
+        sound = np.where(repeats | moving, np.nan, sound)
     folded = misread is not None and misread.undone is None and misread.kind != "range_change"  # ends at zero
     clipped = None if folded else _clipped(sound, lattice)
-    moving, moved = _moving(recording, axis)
-    if moving.any():
-        sound = np.where(moving, np.nan, sound)
-        clipped = None if folded else _clipped(sound, lattice)
     working = drawn = values
     if clipped is not None:
         working, drawn = _unclipped(sound, clipped, lattice)
     if moving.any():
         working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
     stuck, moving = (mask if mask.any() else none for mask in (stuck, moving))  # one array for all
-    lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
-    counts = {"saturated": lost, "stuck": int((stuck | repeats).sum())}
+    saturated = 0 if clipped is None else int((clipped.mask | ~inside).sum())
+    counts = {"saturated": saturated, "stuck": int((stuck | repeats).sum())}
     if recurring is not None:
-        counts["outliers"] = int(recurring.mask.sum())
+        counts["outliers"] = int(lost.sum())
     return Readings(
         recording,
         values,
