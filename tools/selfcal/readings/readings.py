@@ -211,7 +211,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
             misread = explained
     # The codes of a counter recur; a dead band takes its counts from its neighbours.
     counter = lattice is not None and lattice.carried > 0.0
-    recurring = None if misread or uneven or counter else recurring_of(sound, recording.rate_hz)
+    recurring = None if misread or uneven or counter else recurring_of(sound, explained)
     lost = none if recurring is None else recurring.mask
     if lost.any():
         sound = np.where(lost, np.nan, sound)
