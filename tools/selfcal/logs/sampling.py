@@ -144,10 +144,10 @@ class _Stamps:
         best, width, top = math.inf, float(_PARTS), float(part[-1])
         while True:
             for shift in (*(np.arange(_PARTS) * width / _PARTS), -(top + 1.0) % width):
-                at = np.floor((part + shift) / width)
-                begin = np.flatnonzero(np.diff(at, prepend=-1.0))
+                filled = np.floor((part + shift) / width)
+                begin = np.flatnonzero(np.diff(filled, prepend=-1.0))
                 counts = np.add.reduceat(times, begin)
-                far = np.count_nonzero(np.diff(at) > 1.0) * math.log(1.0 + top / width)
+                far = np.count_nonzero(np.diff(filled) > 1.0) * math.log(1.0 + top / width)
                 best = min(
                     best,
                     n * math.log(width / _PARTS)
@@ -182,16 +182,16 @@ def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, P
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     stamps = _stamps(time, noise_s)
     if (steps < 0.0).any():
-        found = _counted(stamps, stamps.typical)
-        stray = time - np.arange(time.size) * found.dt
-        if np.ptp(stray) > _STRAY * found.dt * time.size / np.count_nonzero(steps < 0.0):
+        law = _counted(stamps, stamps.typical)
+        stray = time - np.arange(time.size) * law.dt
+        if np.ptp(stray) > _STRAY * law.dt * time.size / np.count_nonzero(steps < 0.0):
             raise Ambiguous("the stamps fall, and their count is not steady")
     else:
-        found = _likeliest(stamps, rate)
-        if found.rival and rate is None:
-            what = f"{1.0 / found.dt:.4g} from {1.0 / found.rival:.4g} Hz"
+        law = _likeliest(stamps, rate)
+        if law.rival and rate is None:
+            what = f"{1.0 / law.dt:.4g} from {1.0 / law.rival:.4g} Hz"
             raise Ambiguous(f"stamps of {stamps.lattice:.3g} s are too coarse to tell {what}")
-    return found.dt, found.missing
+    return law.dt, law.missing
 
 
 def _stamps(time: Floats, noise_s: float) -> _Stamps:
@@ -217,35 +217,35 @@ def _likeliest(stamps: _Stamps, rate: float | None) -> _Fit:
     if stamps.coarse:
         laws.append((_within, _slope(np.arange(head.time.size), head.time)))
         if head.time.size < _FEW:
-            low, high = (one / stamps.typical for one in _BAND_OF_FEW)
+            low, high = (edge / stamps.typical for edge in _BAND_OF_FEW)
             laws += [(_within, 1.0 / hertz) for hertz in np.arange(low, high, 0.5 / stamps.time[-1]).tolist()]
-    fits = [(nats, law, one) for law, dt in laws for nats, one in _tried(law, head, dt, rate)]
+    fits = [(nats, law, fit) for law, dt in laws for nats, fit in _tried(law, head, dt, rate)]
     least, _, best = min(fits, key=lambda fit: fit[0])
     if stamps.coarse and best.missing.any() and not stamps.whole(best.dt):
         same = 1e-3 + 4.0 * stamps.lattice / (head.time.size * best.dt)  # dt so far apart are the same to these rows
-        others = (one.dt for nats, _, one in fits if nats < least + _AS_GOOD and abs(one.dt / best.dt - 1.0) > same)
+        others = (fit.dt for nats, _, fit in fits if nats < least + _AS_GOOD and abs(fit.dt / best.dt - 1.0) > same)
         best = replace(best, rival=next(others, 0.0))
     if stamps.time.size <= _HEAD or best.rival:
         return best
-    near = {(law, one.dt) for nats, law, one in fits if nats < least + _CLOSE}
+    near = {(law, fit.dt) for nats, law, fit in fits if nats < least + _CLOSE}
     near.add((_within if stamps.coarse else _phased, best.dt))
-    found = [fit for law, dt in near for fit in _tried(law, stamps, dt, rate)]
-    return min(found, key=lambda fit: fit[0], default=(0.0, _counted(stamps, stamps.typical)))[1]
+    of_all = [fit for law, dt in near for fit in _tried(law, stamps, dt, rate)]
+    return min(of_all, key=lambda fit: fit[0], default=(0.0, _counted(stamps, stamps.typical)))[1]
 
 
 def _tried(law: _Law, stamps: _Stamps, dt: float, rate: float | None) -> list[tuple[float, _Fit]]:
     """What stamps cost by a law, in nats with its price beforehand, and the fit; or nothing."""
-    found, q = law(stamps, dt), stamps.lattice
-    if found is None:
+    fit, q = law(stamps, dt), stamps.lattice
+    if fit is None:
         return []
-    nats = found.nats
+    nats = fit.nats
     if rate is not None:
-        nats += min(_STATED, 0.5 * (math.log(found.dt * rate) / _STATED_SD) ** 2)
-    elif stamps.coarse and law is not _counted and not stamps.whole(found.dt):
+        nats += min(_STATED, 0.5 * (math.log(fit.dt * rate) / _STATED_SD) ** 2)
+    elif stamps.coarse and law is not _counted and not stamps.whole(fit.dt):
         # A lattice that is no tick of a clock is the interval.
-        tick = any(abs(one - round(one)) < 1e-6 for one in (math.log10(q), math.log2(q))) or abs(q - _JIFFY) < 1e-9
+        tick = any(abs(exp - round(exp)) < 1e-6 for exp in (math.log10(q), math.log2(q))) or abs(q - _JIFFY) < 1e-9
         nats += 0.0 if tick else _COINCIDENCE
-    return [(nats, found)]
+    return [(nats, fit)]
 
 
 def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
@@ -337,9 +337,9 @@ def _phased(stamps: _Stamps, dt: float) -> _Fit | None:
     ahead = np.rint(isotonic_regression(np.clip(turns, ahead - 1.0, ahead + 1.0)).x).astype(np.int64)
     cuts = (np.flatnonzero(stamps.asleep) + 1).tolist()
     dt = _slope(index + ahead, stamps.awake, cuts, turns - ahead)
-    found = stamps.fit(dt, np.diff(ahead, prepend=ahead[0]), (turns - ahead) * dt)
+    fit = stamps.fit(dt, np.diff(ahead, prepend=ahead[0]), (turns - ahead) * dt)
     pieces = 0.5 * math.log(_PIECE_OF_GRID) * (index.size // _PIECE_OF_GRID)
-    return replace(found, nats=found.nats + pieces - _ln_line(stamps, dt))
+    return replace(fit, nats=fit.nats + pieces - _ln_line(stamps, dt))
 
 
 def _ln_line(stamps: _Stamps, dt: float) -> float:
@@ -349,14 +349,14 @@ def _ln_line(stamps: _Stamps, dt: float) -> float:
         return 0.0
     power = abs(np.exp(2j * math.pi / dt * stamps.awake).mean()) ** 2 * stamps.time.size
     turn = complex(np.exp(2j * math.pi / dt * np.diff(stamps.awake)).mean())
-    told = power / max(1.0, (1.0 - abs(turn) ** 2) / max(abs(1.0 - turn) ** 2, 1e-12)) - _NO_CHANCE
-    return float(min(max(0.0, told), _LINE_MOST * stamps.time.size))
+    beyond = power / max(1.0, (1.0 - abs(turn) ** 2) / max(abs(1.0 - turn) ** 2, 1e-12)) - _NO_CHANCE
+    return float(min(max(0.0, beyond), _LINE_MOST * stamps.time.size))
 
 
 def _within(stamps: _Stamps, dt: float) -> _Fit | None:
     """Samples that are stamped within a lattice step, of which the interval is no multiple."""
-    found = _decoded(stamps, dt, 1.0001)
-    return None if found is None or stamps.multiple(found.dt) else found
+    fit = _decoded(stamps, dt, 1.0001)
+    return None if fit is None or stamps.multiple(fit.dt) else fit
 
 
 def _exactly(stamps: _Stamps, dt: float) -> _Fit | None:
@@ -372,12 +372,12 @@ def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
         missing, odd = _decode(stamps.time, dt, slack, first)
         if odd > 0.05 * index.size + 3:
             break
-        place = index + np.cumsum(missing)
-        # A sample lost at once leaves the first place open; later ones tell the phase.
-        phase = float(np.median((stamps.time - place * dt)[:_NEAR_FIRST])) + 0.5 * slack
+        sample = index + np.cumsum(missing)
+        # A sample lost at once leaves the first sample open; later ones tell the phase.
+        phase = float(np.median((stamps.time - sample * dt)[:_NEAR_FIRST])) + 0.5 * slack
         first = (phase - 0.1 * slack, phase + 0.1 * slack)
-        fitted = _slope(place, stamps.time)
-        nats = stamps.fit(fitted, np.where(asleep, 0, missing), stamps.time - place * fitted).nats
+        fitted = _slope(sample, stamps.time)
+        nats = stamps.fit(fitted, np.where(asleep, 0, missing), stamps.time - sample * fitted).nats
         if best is None or nats < best.nats:
             best = _Fit(fitted, missing, nats)
         elif again > 1:
@@ -414,18 +414,18 @@ def _decode(time: Floats, dt: float, slack: float, first: tuple[float, float]) -
 def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     """Intervals, s, of which the stamps may have a grid: of short steps, of the lattice, and of lines in the spectrum
     of the stamps. Lattice and jitter leave a line's harmonics, the lattice folds them."""
-    found: list[float] = [] if rate is None else [1.0 / rate]
+    intervals: list[float] = [] if rate is None else [1.0 / rate]
     steps, typical, q = np.diff(stamps.time)[~stamps.asleep], stamps.typical, stamps.lattice
     for short in np.quantile(steps[steps > 0.0], [0.02, 0.25]).tolist():
         dt = short
         for _ in range(4):
             dt = float(steps.sum() / np.maximum(1.0, np.rint(steps / dt)).sum())
-        found.append(dt)
+        intervals.append(dt)
     low, high = _BAND[0] / typical, _BAND[1] / typical
     if stamps.coarse:
         high *= 0.5
         simple = q * np.concatenate([np.arange(1.0, 5.0), 1.0 / np.arange(2.0, 9.0)])
-        found += simple[(simple * low < 1.0) & (simple * high > 1.0) | (simple == q)].tolist()
+        intervals += simple[(simple * low < 1.0) & (simple * high > 1.0) | (simple == q)].tolist()
     cell = q if stamps.coarse else typical / 64.0
     time = stamps.time if stamps.coarse else stamps.awake
     ticks = np.rint(time[time < cell * 2.0**18] / cell).astype(np.int64)
@@ -437,14 +437,14 @@ def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     grid = np.arange(low, high, 0.25 / (size * cell))
     score = np.zeros(grid.size)
     for harmonic in range(1, _HARMONICS + 1):
-        at = np.rint(harmonic * grid * cell * size).astype(np.int64) % size
-        score += np.maximum(power[np.minimum(at, size - at)] - _LINE, 0.0)
+        line = np.rint(harmonic * grid * cell * size).astype(np.int64) % size
+        score += np.maximum(power[np.minimum(line, size - line)] - _LINE, 0.0)
     for _ in range(_LINES):
         top = int(score.argmax())
         if score[top] > 0.0:
-            found.append(1.0 / float(grid[top]))
+            intervals.append(1.0 / float(grid[top]))
         score[max(0, top - 16) : top + 17] = 0.0
-    return found
+    return intervals
 
 
 def in_rhythm(rows: NDArray[np.int64]) -> bool:

@@ -222,10 +222,10 @@ class Cells:
         """Readings [parts] that a fit has in each part."""
         return np.asarray(self.of_pieces(fit) @ self.count.sum(axis=1))
 
-    def gain(self, one: _Map, expected: Array) -> float:
+    def gain(self, rival: _Map, expected: Array) -> float:
         """Of ln likelihood of the counts of all pieces together by a map, over those `expected` [codes] without it."""
         floor = ODD * float(self.total.sum()) / self.many
-        return float(self.total @ np.log((one.read(expected) + floor) / (expected + floor)))
+        return float(self.total @ np.log((rival.read(expected) + floor) / (expected + floor)))
 
     def limit(self, side: int) -> csr_matrix:
         """All above the largest reading, or below the smallest, are read as it."""
@@ -329,18 +329,18 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
     maps = list(_about_zero(cells, y)) if cells.folds else []
     maps += [_Map("limit", cells.limit(side)) for side in (1, -1)]
     tried = list(_of_places(cells, over)) if lattice is None or lattice.coarseness < COARSEST else []
-    for kind in {one.kind for one in tried}:
-        maps.append(max((one for one in tried if one.kind == kind), key=lambda one: cells.gain(one, over)))
+    for kind in {rival.kind for rival in tried}:
+        maps.append(max((rival for rival in tried if rival.kind == kind), key=lambda rival: cells.gain(rival, over)))
     fits = []
-    for one in maps:
-        fit, best = cells.fit(one.within(cells)), one
-        for _ in range(TURNS if one.to is None else 0):
+    for each in maps:
+        fit, best = cells.fit(each.within(cells)), each
+        for _ in range(TURNS if each.to is None else 0):
             over = cells.own @ cells.expected(fit)
-            best = max(_of_places(cells, over, best), key=lambda one: cells.gain(one, over), default=best)
+            best = max(_of_places(cells, over, best), key=lambda rival: cells.gain(rival, over), default=best)
             fit = cells.fit(best.within(cells))
-        fits.append((fit.over(plain) - math.log(len(tried) if one.kind in UNEVEN else len(maps)), best, fit))
-    nats, best, fit = max(fits, key=lambda one: one[0])
-    also = tuple(dict.fromkeys(one.kind for more, one, _ in fits if more > nats - ALSO and one.kind != best.kind))
+        fits.append((fit.over(plain) - math.log(len(tried) if each.kind in UNEVEN else len(maps)), best, fit))
+    nats, best, fit = max(fits, key=lambda tried_map: tried_map[0])
+    also = tuple(dict.fromkeys(rival.kind for more, rival, _ in fits if more > nats - ALSO and rival.kind != best.kind))
     if best.kind not in ELSEWHERE and nats < nats_of("quantization" if best.kind in UNEVEN else "misread"):
         return None
     now, to = cells.expected(fit), best.within(cells)

@@ -220,7 +220,9 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if stuck.any():
         sound = np.where(stuck, np.nan, sound)
     stretches = tuple(slower(sound))
-    repeats = np.isin(np.arange(values.size), np.concatenate([one.rows for one in stretches])) if stretches else none
+    repeats = (
+        np.isin(np.arange(values.size), np.concatenate([stretch.rows for stretch in stretches])) if stretches else none
+    )
     left_out = lost | stuck | repeats
     values = np.where(left_out, np.nan, values) if left_out.any() else values
     moving, moved = _moving(recording, axis)
