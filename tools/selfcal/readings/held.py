@@ -31,8 +31,6 @@ CHANCE, RUN_MOST = 0.01, 5
 #: Rows to a reading in a stretch at most, and stretches at most. The chance that a row
 #: of it does not repeat, and equal readings that are supposed among those of a stretch.
 RATIO_MOST, STRETCHES, MISSED, SUPPOSED = 5, 8, 0.02, 2.0
-#: Of a channel that is read anew each period: rows of one at least, and changes at least.
-PERIOD_LEAST, CHANGES_LEAST = 2.5, 8
 #: Rows in a bin of the phase, and bins at most.
 IN_BIN, BINS = 50, 100
 
@@ -150,11 +148,11 @@ def updates(values: Array, at: Rows) -> Rows | None:
     bends = np.abs(np.diff(steps)) > 1e-9 * float(np.ptp(values))
     held_rows = np.flatnonzero(steps) + 1
     rows = held_rows if 2 * held_rows.size < values.size else np.flatnonzero(bends) + 1
-    if rows.size <= CHANGES_LEAST:
+    if rows.size < 3:
         return None
     gaps = np.diff(at[rows])
     nats, period = max(_of_period(gaps, part) for part in (1, 2, 3))
-    if nats < nats_of("held_samples"):
+    if nats < nats_of("held_samples") + math.log(3 * gaps.size):  # parts and periods were tried
         return None
     times = np.maximum(1, np.rint(gaps / period))
     count = np.concatenate([[0.0], np.cumsum(times)])
@@ -169,8 +167,6 @@ def _of_period(gaps: Rows, part: int) -> tuple[float, float]:
     """Evidence, nats, that gaps [k] are whole multiples of one period: of the short ones, or a part of them."""
     period = float(np.quantile(gaps, 0.05, method="lower")) / part
     period = _period(gaps, period, 3 * part)
-    if period < PERIOD_LEAST:
-        return 0.0, period
     off = np.abs(gaps - np.rint(gaps / period) * period)
     return gaps.size * math.log(period / (1.0 + 2.0 * float(np.quantile(off, 0.95)))), period
 
