@@ -63,7 +63,7 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
         count = int(np.count_nonzero(begins))
         set_back = span in _CLOCKS and count == 1
         sure = count and float(np.log(on[begins] / span).sum()) < math.log(_BY_CHANCE)
-        if not sure or not (set_back or np.ptp(time) < span):
+        if not sure or not few(count, time.size) or not (set_back or np.ptp(time) < span):
             continue
         again = time + np.concatenate(([0.0], np.cumsum(np.where(begins, span, 0.0))))
         times = f"{count} time{'s' if count > 1 else ''}"

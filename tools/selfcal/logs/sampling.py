@@ -58,8 +58,8 @@ _STEPS, _PIECES = 20, 500
 #: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
 CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
-#: where stretches are short, their share of the time at least.
-_ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE = 30.0, 3.0, 20, 0.05
+#: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
+_ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
 #: A gap between steps of any length, in the step beyond which half of the time is; errors about their line that are
 #: far off, in the median one; how far batches that overlap may stray from a steady count, in their length.
 _GAP, _FAR, _STRAY = 12.0, 6.0, 5.0
@@ -257,8 +257,8 @@ def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
     count = int(np.count_nonzero(long))
     if not 0 < count * _AWAKE < steps.size or np.median(steps[long]) < _ALONE * steps[~long].max():
         return np.zeros_like(long)
-    rests = usual * steps.size > _AWAKE_SHARE * time[-1] or 10 * count * _AWAKE < steps.size
-    return long if rests else np.zeros_like(long)
+    even = np.mean(np.abs(steps - usual) < 0.5 * usual) > _EVEN and usual * steps.size > _AWAKE_SHARE * time[-1]
+    return long if even or 10 * count * _AWAKE < steps.size else np.zeros_like(long)
 
 
 def _ln_losses(steps: Places, patterned: bool) -> float:
