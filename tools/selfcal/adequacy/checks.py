@@ -16,10 +16,11 @@ from selfcal.bank.blocks import MOST_DENSE, Blocks
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base import units
 from selfcal.logs.recording import Recording
+from selfcal.logs.sampling import CHANGE
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
 from selfcal.readings.codes import Misread
-from selfcal.readings.readings import CLOCK_LEAST, Readings
+from selfcal.readings.readings import Readings
 from selfcal.readings.tests import TESTS
 
 #: Largest deviation of a check's statistic that passes, sd: a false alarm in 16 000 checks.
@@ -210,7 +211,7 @@ def with_readings(
     if as_fed:
         if readings.changes:
             ratio = max((change.after_hz / change.before_hz - 1.0 for change in readings.changes), key=abs)
-            checks["rate_change"] = {"value": ratio, "limit": CLOCK_LEAST, "passed": False}
+            checks["rate_change"] = {"value": ratio, "limit": CHANGE, "passed": False}
         if readings.coarse > SPACING_MOST:
             checks["float_spacing"] = {"value": readings.coarse, "limit": SPACING_MOST, "passed": False}
     return replace(judged, checks={**judged.checks, **checks})

@@ -15,6 +15,7 @@ from selfcal.base.grid import Rows
 from selfcal.likelihood.state import Regressor, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
+from selfcal.logs.sampling import Change
 from selfcal.logs.timebase import Clock
 from selfcal.model.file import REGRESSORS, Group, Model
 from selfcal.model.file import Regressor as Stated
@@ -22,7 +23,6 @@ from selfcal.model.forms import variance_of
 from selfcal.model.regressors import columns_of, offered
 from selfcal.readings.held import Held
 from selfcal.readings.readings import (
-    RateChange,
     Readings,
     copied,
     evened,
@@ -71,7 +71,7 @@ class Record:
     missing: Mapping[str, Missing] = field(default_factory=dict)
     recorded_hz: float = 1.0
     readings: Mapping[str, Readings] = field(default_factory=dict)
-    changes: tuple[RateChange, ...] = ()
+    changes: tuple[Change, ...] = ()
     redrawn: Mapping[str, Array] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     start_s: float = 0.0

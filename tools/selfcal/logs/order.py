@@ -21,9 +21,8 @@ _REPEATS_FROM = 100
 _BITS, _TICKS = (32, 24, 16), (1e-6, 1e-3)
 #: Spans of a clock's own, s. It may be set back by the first of them.
 _CLOCKS = {3600.0: "an hour", 43200.0: "half a day", 86400.0: "a day", 604800.0: "a week"}
-#: Usual steps in a span at least, and usual steps that a gap where a clock begins anew may last: of 32 bits and a known
-#: tick, of others, of one that begins anew once and whose tick the steps show.
-_IN_SPAN, _LOST_OF_32, _LOST, _LOST_OF_STEPS = 20, 1000.0, 20.0, 2.0
+#: Chance that stamps that fall come so near a span.
+_BY_CHANCE = 0.01
 #: Rows a damaged one at least, and rows to either side that show which of them it is.
 _DAMAGED_APART, _NEAR = 20, 16
 
@@ -58,13 +57,13 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
     steps = np.diff(time)
     if time.size < 3 or not (steps < 0.0).any():
         return time, []
-    usual = float(np.median(np.abs(steps)))
-    for span, lost in _spans(time, steps, tick_s, usual):
+    for span in _spans(time, steps, tick_s):
         on = steps + span
-        begins = (steps < 0.0) & (on > 0.0) & (on <= min(lost * usual, 0.5 * span))
+        begins = (steps < 0.0) & (on > 0.0) & (on <= 0.5 * span)
         count = int(np.count_nonzero(begins))
         set_back = span in _CLOCKS and count == 1
-        if not count or span < _IN_SPAN * usual or not (set_back or np.ptp(time) < span):
+        sure = count and float(np.log(on[begins] / span).sum()) < math.log(_BY_CHANCE)
+        if not sure or not few(count, time.size) or not (set_back or np.ptp(time) < span):
             continue
         again = time + np.concatenate(([0.0], np.cumsum(np.where(begins, span, 0.0))))
         times = f"{count} time{'s' if count > 1 else ''}"
@@ -75,17 +74,14 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
     return time, []
 
 
-def _spans(time: Array, steps: Array, tick_s: float, usual: float) -> list[tuple[float, float]]:
-    """Spans, s, that a clock may have, and the usual steps that may be lost where it begins anew."""
-    found = [(2.0**32 * tick, _LOST_OF_32) for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))]
-    found += [(span, _LOST) for span in _CLOCKS]
+def _spans(time: Array, steps: Array, tick_s: float) -> list[float]:
+    """Spans, s, that a clock may have."""
+    found = [2.0**32 * tick for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))] + [*_CLOCKS]
+    usual = float(np.median(np.abs(steps)))
     counts = [common_step(np.abs(steps), 1e-9 * usual), *(10.0**-digits for digits in range(10))]
-    fits = (one for one in counts if one > 0.0 and np.abs(time / one - np.rint(time / one)).max() < 0.01)
-    once = np.count_nonzero(steps < 0.0) == 1
-    for step in [*fits][:1]:
-        span = step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))
-        found.append((span, _LOST_OF_STEPS if once else _LOST))
-    return found
+    fits = (count for count in counts if count > 0.0 and np.abs(time / count - np.rint(time / count)).max() < 0.01)
+    step = next(fits, None)
+    return found if step is None else [*found, step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))]
 
 
 def broken(time: Array) -> tuple[int, str] | None:

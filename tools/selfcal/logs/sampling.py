@@ -55,10 +55,8 @@ _ONES, _TOO_SHORT = 0.05, 0.01
 _FEW, _BAND_OF_FEW = 64, (0.95, 1.4)
 #: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
 _STEPS, _PIECES = 20, 500
-#: A part of one rate must save so many squares of the scatter between neighbouring pieces.
-_PRICE_OF_PART = 40.0
-#: Share from which on the intervals show a change of rate: beside it `readings.py` looks for a bend.
-_CHANGE = 0.015
+#: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
+CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
 #: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
 _ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
@@ -146,10 +144,10 @@ class _Stamps:
         best, width, top = math.inf, float(_PARTS), float(part[-1])
         while True:
             for shift in (*(np.arange(_PARTS) * width / _PARTS), -(top + 1.0) % width):
-                at = np.floor((part + shift) / width)
-                begin = np.flatnonzero(np.diff(at, prepend=-1.0))
+                filled = np.floor((part + shift) / width)
+                begin = np.flatnonzero(np.diff(filled, prepend=-1.0))
                 counts = np.add.reduceat(times, begin)
-                far = np.count_nonzero(np.diff(at) > 1.0) * math.log(1.0 + top / width)
+                far = np.count_nonzero(np.diff(filled) > 1.0) * math.log(1.0 + top / width)
                 best = min(
                     best,
                     n * math.log(width / _PARTS)
@@ -180,25 +178,25 @@ def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, P
     steps = np.diff(time)
     changes = rate_changes(time) if rate is None else []
     if changes:
-        dt = min(min(one.before_s, one.after_s) for one in changes)
+        dt = 1.0 / max(max(change.before_hz, change.after_hz) for change in changes)
         return dt, np.concatenate(([0], np.maximum(0, np.rint(steps / dt).astype(np.int64) - 1)))
     stamps = _stamps(time, noise_s)
     if (steps < 0.0).any():
-        found = _counted(stamps, stamps.typical)
-        stray = time - np.arange(time.size) * found.dt
-        if np.ptp(stray) > _STRAY * found.dt * time.size / np.count_nonzero(steps < 0.0):
+        law = _counted(stamps, stamps.typical)
+        stray = time - np.arange(time.size) * law.dt
+        if np.ptp(stray) > _STRAY * law.dt * time.size / np.count_nonzero(steps < 0.0):
             raise Ambiguous("the stamps fall, and their count is not steady")
     else:
-        found = _likeliest(stamps, rate)
-        if found.rival and rate is None:
-            what = f"{1.0 / found.dt:.4g} from {1.0 / found.rival:.4g} Hz"
+        law = _likeliest(stamps, rate)
+        if law.rival and rate is None:
+            what = f"{1.0 / law.dt:.4g} from {1.0 / law.rival:.4g} Hz"
             raise Ambiguous(f"stamps of {stamps.lattice:.3g} s are too coarse to tell {what}")
-    return found.dt, found.missing
+    return law.dt, law.missing
 
 
 def _stamps(time: Floats, noise_s: float) -> _Stamps:
     """Stamps with what one look shows of them. Raises Ambiguous."""
-    steps = np.diff(time)
+    time, steps = time - time[0], np.diff(time)
     usual = _usual(steps)
     if not time[-1] < _LONGEST * usual:
         raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {usual:.3g} s")
@@ -219,35 +217,35 @@ def _likeliest(stamps: _Stamps, rate: float | None) -> _Fit:
     if stamps.coarse:
         laws.append((_within, _slope(np.arange(head.time.size), head.time)))
         if head.time.size < _FEW:
-            low, high = (one / stamps.typical for one in _BAND_OF_FEW)
+            low, high = (edge / stamps.typical for edge in _BAND_OF_FEW)
             laws += [(_within, 1.0 / hertz) for hertz in np.arange(low, high, 0.5 / stamps.time[-1]).tolist()]
-    fits = [(nats, law, one) for law, dt in laws for nats, one in _tried(law, head, dt, rate)]
+    fits = [(nats, law, fit) for law, dt in laws for nats, fit in _tried(law, head, dt, rate)]
     least, _, best = min(fits, key=lambda fit: fit[0])
     if stamps.coarse and best.missing.any() and not stamps.whole(best.dt):
         same = 1e-3 + 4.0 * stamps.lattice / (head.time.size * best.dt)  # dt so far apart are the same to these rows
-        others = (one.dt for nats, _, one in fits if nats < least + _AS_GOOD and abs(one.dt / best.dt - 1.0) > same)
+        others = (fit.dt for nats, _, fit in fits if nats < least + _AS_GOOD and abs(fit.dt / best.dt - 1.0) > same)
         best = replace(best, rival=next(others, 0.0))
     if stamps.time.size <= _HEAD or best.rival:
         return best
-    near = {(law, one.dt) for nats, law, one in fits if nats < least + _CLOSE}
+    near = {(law, fit.dt) for nats, law, fit in fits if nats < least + _CLOSE}
     near.add((_within if stamps.coarse else _phased, best.dt))
-    found = [fit for law, dt in near for fit in _tried(law, stamps, dt, rate)]
-    return min(found, key=lambda fit: fit[0], default=(0.0, _counted(stamps, stamps.typical)))[1]
+    of_all = [fit for law, dt in near for fit in _tried(law, stamps, dt, rate)]
+    return min(of_all, key=lambda fit: fit[0], default=(0.0, _counted(stamps, stamps.typical)))[1]
 
 
 def _tried(law: _Law, stamps: _Stamps, dt: float, rate: float | None) -> list[tuple[float, _Fit]]:
     """What stamps cost by a law, in nats with its price beforehand, and the fit; or nothing."""
-    found, q = law(stamps, dt), stamps.lattice
-    if found is None:
+    fit, q = law(stamps, dt), stamps.lattice
+    if fit is None:
         return []
-    nats = found.nats
+    nats = fit.nats
     if rate is not None:
-        nats += min(_STATED, 0.5 * (math.log(found.dt * rate) / _STATED_SD) ** 2)
-    elif stamps.coarse and law is not _counted and not stamps.whole(found.dt):
+        nats += min(_STATED, 0.5 * (math.log(fit.dt * rate) / _STATED_SD) ** 2)
+    elif stamps.coarse and law is not _counted and not stamps.whole(fit.dt):
         # A lattice that is no tick of a clock is the interval.
-        tick = any(abs(one - round(one)) < 1e-6 for one in (math.log10(q), math.log2(q))) or abs(q - _JIFFY) < 1e-9
+        tick = any(abs(exp - round(exp)) < 1e-6 for exp in (math.log10(q), math.log2(q))) or abs(q - _JIFFY) < 1e-9
         nats += 0.0 if tick else _COINCIDENCE
-    return [(nats, found)]
+    return [(nats, fit)]
 
 
 def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
@@ -339,9 +337,9 @@ def _phased(stamps: _Stamps, dt: float) -> _Fit | None:
     ahead = np.rint(isotonic_regression(np.clip(turns, ahead - 1.0, ahead + 1.0)).x).astype(np.int64)
     cuts = (np.flatnonzero(stamps.asleep) + 1).tolist()
     dt = _slope(index + ahead, stamps.awake, cuts, turns - ahead)
-    found = stamps.fit(dt, np.diff(ahead, prepend=ahead[0]), (turns - ahead) * dt)
+    fit = stamps.fit(dt, np.diff(ahead, prepend=ahead[0]), (turns - ahead) * dt)
     pieces = 0.5 * math.log(_PIECE_OF_GRID) * (index.size // _PIECE_OF_GRID)
-    return replace(found, nats=found.nats + pieces - _ln_line(stamps, dt))
+    return replace(fit, nats=fit.nats + pieces - _ln_line(stamps, dt))
 
 
 def _ln_line(stamps: _Stamps, dt: float) -> float:
@@ -351,14 +349,14 @@ def _ln_line(stamps: _Stamps, dt: float) -> float:
         return 0.0
     power = abs(np.exp(2j * math.pi / dt * stamps.awake).mean()) ** 2 * stamps.time.size
     turn = complex(np.exp(2j * math.pi / dt * np.diff(stamps.awake)).mean())
-    told = power / max(1.0, (1.0 - abs(turn) ** 2) / max(abs(1.0 - turn) ** 2, 1e-12)) - _NO_CHANCE
-    return float(min(max(0.0, told), _LINE_MOST * stamps.time.size))
+    beyond = power / max(1.0, (1.0 - abs(turn) ** 2) / max(abs(1.0 - turn) ** 2, 1e-12)) - _NO_CHANCE
+    return float(min(max(0.0, beyond), _LINE_MOST * stamps.time.size))
 
 
 def _within(stamps: _Stamps, dt: float) -> _Fit | None:
     """Samples that are stamped within a lattice step, of which the interval is no multiple."""
-    found = _decoded(stamps, dt, 1.0001)
-    return None if found is None or stamps.multiple(found.dt) else found
+    fit = _decoded(stamps, dt, 1.0001)
+    return None if fit is None or stamps.multiple(fit.dt) else fit
 
 
 def _exactly(stamps: _Stamps, dt: float) -> _Fit | None:
@@ -374,12 +372,12 @@ def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
         missing, odd = _decode(stamps.time, dt, slack, first)
         if odd > 0.05 * index.size + 3:
             break
-        place = index + np.cumsum(missing)
-        # A sample lost at once leaves the first place open; later ones tell the phase.
-        phase = float(np.median((stamps.time - place * dt)[:_NEAR_FIRST])) + 0.5 * slack
+        sample = index + np.cumsum(missing)
+        # A sample lost at once leaves the first sample open; later ones tell the phase.
+        phase = float(np.median((stamps.time - sample * dt)[:_NEAR_FIRST])) + 0.5 * slack
         first = (phase - 0.1 * slack, phase + 0.1 * slack)
-        fitted = _slope(place, stamps.time)
-        nats = stamps.fit(fitted, np.where(asleep, 0, missing), stamps.time - place * fitted).nats
+        fitted = _slope(sample, stamps.time)
+        nats = stamps.fit(fitted, np.where(asleep, 0, missing), stamps.time - sample * fitted).nats
         if best is None or nats < best.nats:
             best = _Fit(fitted, missing, nats)
         elif again > 1:
@@ -416,18 +414,18 @@ def _decode(time: Floats, dt: float, slack: float, first: tuple[float, float]) -
 def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     """Intervals, s, of which the stamps may have a grid: of short steps, of the lattice, and of lines in the spectrum
     of the stamps. Lattice and jitter leave a line's harmonics, the lattice folds them."""
-    found: list[float] = [] if rate is None else [1.0 / rate]
+    intervals: list[float] = [] if rate is None else [1.0 / rate]
     steps, typical, q = np.diff(stamps.time)[~stamps.asleep], stamps.typical, stamps.lattice
     for short in np.quantile(steps[steps > 0.0], [0.02, 0.25]).tolist():
         dt = short
         for _ in range(4):
             dt = float(steps.sum() / np.maximum(1.0, np.rint(steps / dt)).sum())
-        found.append(dt)
+        intervals.append(dt)
     low, high = _BAND[0] / typical, _BAND[1] / typical
     if stamps.coarse:
         high *= 0.5
         simple = q * np.concatenate([np.arange(1.0, 5.0), 1.0 / np.arange(2.0, 9.0)])
-        found += simple[(simple * low < 1.0) & (simple * high > 1.0) | (simple == q)].tolist()
+        intervals += simple[(simple * low < 1.0) & (simple * high > 1.0) | (simple == q)].tolist()
     cell = q if stamps.coarse else typical / 64.0
     time = stamps.time if stamps.coarse else stamps.awake
     ticks = np.rint(time[time < cell * 2.0**18] / cell).astype(np.int64)
@@ -439,14 +437,14 @@ def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     grid = np.arange(low, high, 0.25 / (size * cell))
     score = np.zeros(grid.size)
     for harmonic in range(1, _HARMONICS + 1):
-        at = np.rint(harmonic * grid * cell * size).astype(np.int64) % size
-        score += np.maximum(power[np.minimum(at, size - at)] - _LINE, 0.0)
+        line = np.rint(harmonic * grid * cell * size).astype(np.int64) % size
+        score += np.maximum(power[np.minimum(line, size - line)] - _LINE, 0.0)
     for _ in range(_LINES):
         top = int(score.argmax())
         if score[top] > 0.0:
-            found.append(1.0 / float(grid[top]))
+            intervals.append(1.0 / float(grid[top]))
         score[max(0, top - 16) : top + 17] = 0.0
-    return found
+    return intervals
 
 
 def in_rhythm(rows: NDArray[np.int64]) -> bool:
@@ -498,79 +496,84 @@ def _usual(steps: Floats) -> float:
 
 @dataclass(frozen=True)
 class Change:
-    """The first `row` at another rate, the intervals before and after it (s), and the evidence in nats."""
+    """The first `row` at another rate, its time since the first row, s, the rates before and after it, and the evidence
+    in nats."""
 
     row: int
-    before_s: float
-    after_s: float
+    time_s: float
+    before_hz: float
+    after_hz: float
     nats: float
 
 
 def rate_changes(time: Floats) -> list[Change]:
-    """Every change of rate in stamps float64[n], s, in order of time.
+    """Every change of rate in stamps float64[n], s, in order of time: where the laws of the stamps on its two sides
+    have another interval.
 
     A rate must last two pieces of n / _PIECES rows, or of 3 * _STEPS; one that differs much, of _STEPS."""
-    found = _parts(time, 3 * _STEPS) or _parts(time, _STEPS)
-    steps = np.diff(time)
-    # A burst after a stall makes up for it: samples of one rate, stamped late.
-    late = (steps[max(0, one.row - 3) : one.row + 2].max() > _STEPS * max(one.before_s, one.after_s) for one in found)
-    # Levels of coarse stamps may differ where their mean intervals do not.
-    same = (abs(math.log(one.after_s / one.before_s)) < 0.5 * _CHANGE for one in found)
-    return [] if any(late) or any(same) else found
+    return _changes(time, 3 * _STEPS) or _changes(time, _STEPS)
 
 
-def _parts(time: NDArray[np.float64], least: int) -> list[Change]:
+def _changes(time: Floats, least: int) -> list[Change]:
     """The changes between parts of some pieces, which have `least` rows or more."""
-    n = time.size
-    size = max(least, n // _PIECES)
-    if n < 6 * size:
+    size = max(least, time.size // _PIECES)
+    if time.size < 6 * size:
         return []
-    steps = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
-    count = steps.size // size
-    pieces = steps[: count * size].reshape(count, size)
-    middle = np.quantile(pieces, 0.25, axis=1, keepdims=True)  # a lost row makes windows longer, and few shorter
-    if not middle.min() > 0.0:
+    means = (time[_STEPS:] - time[:-_STEPS]) / _STEPS
+    pieces = means[: means.size // size * size].reshape(-1, size)
+    interval = np.quantile(pieces, 0.25, axis=1)  # a lost row makes windows longer, and few shorter
+    if not interval.min() > 0.0:
         return []
-    # Quantiles of coarse stamps jump by a step of their lattice, means move with gaps: a change of rate does both.
-    near = (pieces > 0.5 * middle) & (pieces < 1.5 * middle)
-    value = np.log(middle[:, 0])
-    mean = np.log((pieces * near).sum(axis=1) / near.sum(axis=1))
-    parts = _constant(value, mean)
+    steps = np.diff(time)
+    lattice = common_step(steps, 1e-6 * interval.min())
+    value = np.log(interval)
+    # The quantile of coarse stamps jumps by a step of their lattice.
+    parts = _constant(value, max(CHANGE, 1.5 * lattice / (_STEPS * interval.min())))
     if len(parts) < 2:
         return []
     level = [math.exp(float(np.median(value[a:b]))) for a, b in parts]
-    lattice = common_step(np.diff(time), 1e-6 * min(level)) if max(level) > 1.05 * min(level) else 0.0
     # The longest step without a loss: stamps are rounded up at most to the next place of their lattice.
-    most = [max(1.5 * step, 1.001 * lattice * math.ceil(step / lattice - 1e-3) if lattice else 0.0) for step in level]
-    pairs = zip(pairwise(parts), pairwise(level), pairwise(most), strict=True)
-    ends = [0, *(_bend(time, *found, size) for found in pairs), n]
-    spans = [slice(a, b) for a, b in pairwise(ends)]
-    if any(b - a < 2 * _STEPS for a, b in pairwise(ends)) or _lossy_parts(time, spans, level, lattice):
-        return []
-    own = [np.diff(time[one.start : one.stop + 1]) for one in spans]
-    kept = [each[(each > 0.5 * step) & (each < last)] for each, step, last in zip(own, level, most, strict=True)]
-    exact = [float(each.mean()) for each in kept]
-    scatter = max(1e-3, _scatter(value, parts))
-    return [
-        Change(row, *intervals, min(1e6, 0.5 * n * math.log(intervals[1] / intervals[0]) ** 2 / scatter**2))
-        for row, intervals in zip(ends[1:-1], pairwise(exact), strict=True)
+    longest = [
+        max(1.5 * step, lattice * math.ceil(step / lattice - 1e-3) * 1.001 if lattice else 0.0) for step in level
     ]
+    pairs = zip(pairwise(parts), pairwise(level), pairwise(longest), strict=True)
+    rows = [0, *(_bend(time, *pair, size) for pair in pairs), time.size]
+    if min(np.diff(rows)) < 2 * _STEPS:
+        return []
+    intervals = [_interval(time[a:b][:_HEAD], lattice) for a, b in pairwise(rows)]
+    scatter, found = max(CHANGE, _scatter(value, parts)), list[Change]()
+    for row, (before, after) in zip(rows[1:-1], pairwise(intervals), strict=True):
+        ratio = math.log(after / before)
+        # A burst after a stall makes up for it: samples of one rate, stamped late.
+        late = steps[max(0, row - 3) : row + 2].max() > _STEPS * max(before, after)
+        if late or abs(ratio) < 0.5 * CHANGE:
+            return []
+        nats = min(1e6, 0.5 * time.size * (ratio / scatter) ** 2)
+        found.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
+    return found
 
 
-def _constant(value: NDArray[np.float64], mean: Floats) -> list[tuple[int, int]]:
-    """First piece and the piece after the last of every part of one rate. `value` and `mean` [pieces]: ln of the
-    interval by the quantile and by the mean. A piece with a change in it belongs to no part.
+def _interval(time: Floats, lattice: float) -> float:
+    """Interval of the samples of a part, s. On a coarse lattice a slower rate looks like losses in a pattern."""
+    law = _likeliest(_stamps(time, 0.0), None)
+    patterned = lattice > _COARSE * law.dt and in_pattern(law.missing + 1)
+    return float(law.dt * (1.0 + law.missing[1:].mean())) if patterned else law.dt
+
+
+def _constant(value: Floats, least: float) -> list[tuple[int, int]]:
+    """First piece and the piece after the last of every part of one rate. `value` [pieces]: ln of the interval, whose
+    changes are `least` or more. A piece with a change in it belongs to no part.
 
     The sum of squares about the levels of the parts, and a price for each part, is the least (optimal partition).
     """
     count = value.size
-    total, square = (np.concatenate([[0.0], np.cumsum(one)]) for one in (value - value[0], (value - value[0]) ** 2))
-    noise = max(float(np.median(np.abs(np.diff(value)))), 0.05 * _CHANGE)
+    total, square = (np.concatenate([[0.0], np.cumsum(each)]) for each in (value - value[0], (value - value[0]) ** 2))
+    noise = max(float(np.median(np.abs(np.diff(value)))), 0.05 * CHANGE)
     best, start = np.zeros(count + 1), np.zeros(count + 1, np.int64)
     for end in range(1, count + 1):
         begin = np.arange(end)
         cost = square[end] - square[:end] - (total[end] - total[:end]) ** 2 / (end - begin)
-        each = best[:end] + cost / noise**2 + _PRICE_OF_PART
+        each = best[:end] + cost / noise**2 + 2.0 * _NO_CHANCE
         start[end] = int(each.argmin())
         best[end] = each[start[end]]
     ends = [count]
@@ -578,56 +581,34 @@ def _constant(value: NDArray[np.float64], mean: Floats) -> list[tuple[int, int]]
         ends.append(int(start[ends[-1]]))
     parts = [(a, b) for a, b in pairwise(ends[::-1]) if b - a > 1]
     while len(parts) > 1:
-        scatter = _scatter(value, parts)
-        apart = [_apart(value, one, other) for one, other in pairwise(parts)]
-        means = [_apart(mean, one, other) for one, other in pairwise(parts)]
-        sound = [
-            abs(step) >= max(_CHANGE, 6.0 * scatter) and abs(both - step) <= 0.3 * abs(step)
-            for step, both in zip(apart, means, strict=True)
-        ]
-        if all(sound):
+        apart = np.abs(np.diff([float(np.median(value[a:b])) for a, b in parts]))
+        join = int(apart.argmin())
+        if apart[join] >= max(least, 6.0 * _scatter(value, parts)):
             break
-        join = min((k for k in range(len(sound)) if not sound[k]), key=lambda k: abs(apart[k]))
         parts[join : join + 2] = [(parts[join][0], parts[join + 1][1])]
     return parts
 
 
-def _apart(value: NDArray[np.float64], one: tuple[int, int], other: tuple[int, int]) -> float:
-    """How far the level of a part is above the level of the part before."""
-    return float(np.median(value[slice(*other)]) - np.median(value[slice(*one)]))
-
-
-def _scatter(value: NDArray[np.float64], parts: list[tuple[int, int]]) -> float:
+def _scatter(value: Floats, parts: list[tuple[int, int]]) -> float:
     """Distance from the level of its part that one piece in ten exceeds, the largest of all parts of ten pieces and of
     all together."""
     off = [np.abs(value[a:b] - np.median(value[a:b])) for a, b in parts]
-    return max(float(np.quantile(one, 0.9)) for one in [np.concatenate(off), *(one for one in off if one.size >= 10)])
+    return max(
+        float(np.quantile(each, 0.9)) for each in [np.concatenate(off), *(each for each in off if each.size >= 10)]
+    )
 
 
 def _bend(
-    time: Floats, parts: Sequence[tuple[int, int]], level: Sequence[float], most: Sequence[float], size: int
+    time: Floats, parts: Sequence[tuple[int, int]], level: Sequence[float], longest: Sequence[float], size: int
 ) -> int:
-    """First row of the second of two parts [first piece, piece after], with intervals `level`, s, of `most`: the row
-    farthest from the line of the mean interval, gaps left out."""
+    """First row of the second of two parts [first piece, piece after], with intervals `level`, s, of the `longest`: the
+    row farthest from the line of the mean interval, gaps left out."""
     (begin, a), (b, end) = parts
     first = max(0, (max(begin + 1, a - 1)) * size)
     last = min(time.size - 1, min(end, b + 2) * size + (_STEPS if end - b > 2 else 0))
     each = np.diff(time[first : last + 1])
-    line = np.cumsum(np.where(each < max(most), each - 0.5 * sum(level), 0.0))
+    line = np.cumsum(np.where(each < max(longest), each - 0.5 * sum(level), 0.0))
     return first + 1 + int(np.argmax(line) if level[0] > level[1] else np.argmin(line))
-
-
-def _lossy_parts(time: NDArray[np.float64], spans: list[slice], level: list[float], lattice: float) -> bool:
-    """Whether a part is no slower one: its likeliest grid is that of the fastest part. Its stamps are not rounded to a
-    coarse `lattice`."""
-    fastest = min(level)
-    heads = [(time[one][:_HEAD], step) for one, step in zip(spans, level, strict=True) if step > 1.1 * fastest]
-    coarse = [lattice > _COARSE * fastest and in_pattern(np.rint(np.diff(head) / lattice)) for head, _ in heads]
-    return any(
-        abs(_likeliest(_stamps(head - head[0], 1e-9 * fastest), None).dt / fastest - 1.0) < 0.05
-        for (head, _), rounded in zip(heads, coarse, strict=True)
-        if not rounded
-    )
 
 
 def common_step(steps: NDArray[np.float64], tolerance: float) -> float:

@@ -168,8 +168,8 @@ def remarks(clock: Clock) -> list[str]:
     regular = in_rhythm(gaps) or in_pattern(np.add(missing, 1.0))
     changes = rate_changes(time)
     if changes and not (regular and np.ptp(gaps) > _NEARLY * time.size):
-        after = ", ".join(f"{1.0 / one.after_s:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
-        return [f"the sampling rate changes: {1.0 / changes[0].before_s:.5g} Hz, {after}"]
+        after = ", ".join(f"{one.after_hz:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
+        return [f"the sampling rate changes: {changes[0].before_hz:.5g} Hz, {after}"]
     if regular:
         lost, every, told = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
         other = float(f"{rate - rate * lost / every:.6g}")

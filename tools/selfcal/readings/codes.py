@@ -17,28 +17,29 @@ import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.special import ndtr
 
-from selfcal.base.grid import Array, counts_of_pieces
+from selfcal.base.grid import Array, counts_of_pieces, noise_of
 from selfcal.readings.budget import nats_of
 from selfcal.readings.lattice import COARSEST, FINE, Lattice, step_of
-from selfcal.readings.lost_words import noise_beside
 
 #: Codes or cells at most, and readings at least.
 CODES, READINGS_LEAST = 400, 300
 #: Pieces of a record that have a level each, at most, and readings in one at least.
 PIECES, PIECE = 100, 64
+#: Share of the readings from which on the commonest value has no part in the steps that show the noise.
+COMMON = 0.2
 #: Cells in the noise of readings on no lattice; parts of true values in one, and points of them.
 CELLS, PARTS, POINTS = 4.0, 8, 32
 #: Noises that are tried, in that of differences; steps of a level, in noises: between them a parabola has the best.
 NOISES, LEVEL_STEP = np.geomspace(0.1, 3.0, 18), 0.25
 #: Shares that are read as another code, and further codes of a dead band on either side.
 SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
-#: Readings of one value among readings on no lattice at least, and times that it is commoner than the next one.
-PILE, STANDS_OUT = 5, 3.0
+#: Times that the commonest value of readings on no lattice is commoner than the next one.
+STANDS_OUT = 3.0
 #: Times that a map is sought at the levels and the noise of the last one.
 TURNS = 3
 #: Chance of a reading that the noise and the codes, or a map, do not make.
 ODD = 1e-6
-#: Readings that a map changes at least.
+#: Readings that a map changes, or of a value that is one, at least.
 CHANGED_LEAST = 5
 #: Nats within which another map is possible too.
 ALSO = 5.0
@@ -129,7 +130,7 @@ class Cells:
     def __init__(self, y: Array, step: float) -> None:
         commonest, most, self.noise = noise_beside(y)
         self.pile = None
-        if not step > 0.0 and most >= PILE:  # it may lie beside the lattice of the others
+        if not step > 0.0 and most >= CHANGED_LEAST:  # it may lie beside the lattice of the others
             others = y[y != commonest]
             step = step_of(others)[0]
             beside = step > FINE * self.noise or most > STANDS_OUT * np.unique(others, return_counts=True)[1].max(
@@ -221,10 +222,10 @@ class Cells:
         """Readings [parts] that a fit has in each part."""
         return np.asarray(self.of_pieces(fit) @ self.count.sum(axis=1))
 
-    def gain(self, one: _Map, expected: Array) -> float:
+    def gain(self, rival: _Map, expected: Array) -> float:
         """Of ln likelihood of the counts of all pieces together by a map, over those `expected` [codes] without it."""
         floor = ODD * float(self.total.sum()) / self.many
-        return float(self.total @ np.log((one.read(expected) + floor) / (expected + floor)))
+        return float(self.total @ np.log((rival.read(expected) + floor) / (expected + floor)))
 
     def limit(self, side: int) -> csr_matrix:
         """All above the largest reading, or below the smallest, are read as it."""
@@ -239,6 +240,13 @@ class Cells:
             shape=self.own.shape,
         )
         return (self.own.multiply(~beyond) + row).tocsr()
+
+
+def noise_beside(y: Array) -> tuple[float, int, float]:
+    """The commonest of readings [n], how often it comes, and the noise, of the others alone where it is common."""
+    unique, counts = np.unique(y, return_counts=True)
+    commonest, most = float(unique[np.argmax(counts)]), int(counts.max())
+    return commonest, most, noise_of(y[y != commonest] if most > COMMON * y.size else y)
 
 
 def _summit(left: Array, middle: Array, right: Array) -> tuple[Array, Array]:
@@ -321,35 +329,38 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
     maps = list(_about_zero(cells, y)) if cells.folds else []
     maps += [_Map("limit", cells.limit(side)) for side in (1, -1)]
     tried = list(_of_places(cells, over)) if lattice is None or lattice.coarseness < COARSEST else []
-    for kind in {one.kind for one in tried}:
-        maps.append(max((one for one in tried if one.kind == kind), key=lambda one: cells.gain(one, over)))
+    for kind in {rival.kind for rival in tried}:
+        maps.append(max((rival for rival in tried if rival.kind == kind), key=lambda rival: cells.gain(rival, over)))
     fits = []
-    for one in maps:
-        fit, best = cells.fit(one.within(cells)), one
-        for _ in range(TURNS if one.to is None else 0):
+    for each in maps:
+        fit, best = cells.fit(each.within(cells)), each
+        for _ in range(TURNS if each.to is None else 0):
             over = cells.own @ cells.expected(fit)
-            best = max(_of_places(cells, over, best), key=lambda one: cells.gain(one, over), default=best)
+            best = max(_of_places(cells, over, best), key=lambda rival: cells.gain(rival, over), default=best)
             fit = cells.fit(best.within(cells))
-        fits.append((fit.over(plain) - math.log(len(tried) if one.kind in UNEVEN else len(maps)), best, fit))
-    nats, best, fit = max(fits, key=lambda one: one[0])
-    also = tuple(dict.fromkeys(one.kind for more, one, _ in fits if more > nats - ALSO and one.kind != best.kind))
-    if best.kind in ELSEWHERE:
-        return Misread(best.kind, best.share, nats)
-    if nats < nats_of("quantization" if best.kind in UNEVEN else "misread"):
+        fits.append((fit.over(plain) - math.log(len(tried) if each.kind in UNEVEN else len(maps)), best, fit))
+    nats, best, fit = max(fits, key=lambda tried_map: tried_map[0])
+    also = tuple(dict.fromkeys(rival.kind for more, rival, _ in fits if more > nats - ALSO and rival.kind != best.kind))
+    if best.kind not in ELSEWHERE and nats < nats_of("quantization" if best.kind in UNEVEN else "misread"):
         return None
     now, to = cells.expected(fit), best.within(cells)
     share = 1.0 - float(now @ np.asarray(to.multiply(cells.own).sum(axis=0)).ravel()) / float(now.sum())
-    if best.kind not in UNEVEN:
-        return Misread(best.kind, share, nats, also_possible=also)
-    undone = values.copy()
-    undone[known[cells.kept]] = _drawn(cells, y[cells.kept], to, fit)
-    if best.kind == "uneven":
-        return Misread("uneven", share, nats, undone, also_possible=also)
-    value = cells.pile
-    if value is None:
+    undone = value = width = None
+    if best.kind in UNEVEN:
+        undone = values.copy()
+        undone[known[cells.kept]] = _drawn(cells, y[cells.kept], to, fit)
+    if best.kind == "word":  # one of the values of a code
+        chance = np.asarray(cells.own[best.place] @ cells.of_pieces(fit)).ravel() * max(cells.step / cells.width, 0.01)
+        random = np.random.default_rng(1).random(cells.code.size)
+        lost = random * (best.share + (1.0 - best.share) * chance[cells.piece]) < best.share
+        undone = values.copy()
+        undone[known[cells.kept][lost & (cells.code == best.place)]] = np.nan
+    if best.kind in ("word", "band"):
         unique, often = np.unique(y[cells.kept][cells.code == best.place], return_counts=True)
-        value = float(unique[np.argmax(often)])
-    return Misread("band", share, nats, undone, value, cells.width * (best.inner + best.share + 0.5), also)
+        value = float(unique[np.argmax(often)]) if cells.pile is None else cells.pile
+    if best.kind == "band":
+        width = cells.width * (best.inner + best.share + 0.5)
+    return Misread(best.kind, share, nats, undone, value, width, also)
 
 
 def _drawn(cells: Cells, y: Array, to: csr_matrix, fit: _Fit) -> Array:

@@ -18,12 +18,10 @@ from selfcal.base.grid import Array, Mask, Rows
 from selfcal.logs.sampling import followed_phase
 from selfcal.readings.budget import nats_of
 
-#: Runs of equal readings that show held ones, at least; of a beat repeats beyond those by chance, their share of the
-#: rows and their standard deviations.
-REPEATS_LEAST, SHARE_LEAST, SURE = 50, 0.008, 6.0
-#: Rows that show its line, the power of a line over the mean beyond the largest by chance, and that over the mean in
-#: the blocks that follow its phase.
-HEAD, LINE, IN_BLOCK = 1 << 17, 12.0, 60.0
+#: Runs of equal readings that show held ones, at least; of a beat repeats beyond those by chance, and their share.
+REPEATS_LEAST, SHARE_LEAST = 50, 0.008
+#: Rows that show its line, and the power of the line over the mean in the blocks that follow its phase.
+HEAD, IN_BLOCK = 1 << 17, 60.0
 #: Share of the rows that repeat, over the beat's frequency, at least: one a beat, and one more for each late row.
 ONE_EACH = 0.75
 #: Share of the rows in whose phase none repeats, at least, and of the repeats that those phases have, at most.
@@ -33,8 +31,6 @@ CHANCE, RUN_MOST = 0.01, 5
 #: Rows to a reading in a stretch at most, and stretches at most. The chance that a row
 #: of it does not repeat, and equal readings that are supposed among those of a stretch.
 RATIO_MOST, STRETCHES, MISSED, SUPPOSED = 5, 8, 0.02, 2.0
-#: Of a channel that is read anew each period: rows of one at least, changes at least, and their evidence, nats.
-PERIOD_LEAST, CHANGES_LEAST, PERIOD_NATS = 2.5, 8, 20.0
 #: Rows in a bin of the phase, and bins at most.
 IN_BIN, BINS = 50, 100
 
@@ -152,11 +148,11 @@ def updates(values: Array, at: Rows) -> Rows | None:
     bends = np.abs(np.diff(steps)) > 1e-9 * float(np.ptp(values))
     held_rows = np.flatnonzero(steps) + 1
     rows = held_rows if 2 * held_rows.size < values.size else np.flatnonzero(bends) + 1
-    if rows.size <= CHANGES_LEAST:
+    if rows.size < 3:
         return None
     gaps = np.diff(at[rows])
     nats, period = max(_of_period(gaps, part) for part in (1, 2, 3))
-    if nats < PERIOD_NATS:
+    if nats < nats_of("held_samples") + math.log(3 * gaps.size):  # parts and periods were tried
         return None
     times = np.maximum(1, np.rint(gaps / period))
     count = np.concatenate([[0.0], np.cumsum(times)])
@@ -171,8 +167,6 @@ def _of_period(gaps: Rows, part: int) -> tuple[float, float]:
     """Evidence, nats, that gaps [k] are whole multiples of one period: of the short ones, or a part of them."""
     period = float(np.quantile(gaps, 0.05, method="lower")) / part
     period = _period(gaps, period, 3 * part)
-    if period < PERIOD_LEAST:
-        return 0.0, period
     off = np.abs(gaps - np.rint(gaps / period) * period)
     return gaps.size * math.log(period / (1.0 + 2.0 * float(np.quantile(off, 0.95)))), period
 
@@ -214,7 +208,7 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
     next_one = np.diff(at, prepend=at[0] - 2) == 1
     share, chance = float(same[next_one].mean()), float(again[next_one].mean())
     excess, sd = share - chance, math.sqrt((share + chance) / n)
-    if excess < max(SHARE_LEAST, REPEATS_LEAST / n, SURE * sd):
+    if excess < max(SHARE_LEAST, REPEATS_LEAST / n, math.sqrt(2.0 * nats_of("held_samples")) * sd):
         return None
     x = np.where(next_one, same - share, 0.0)
     size = min(n, HEAD)
@@ -228,7 +222,7 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
     least = round(SHARE_LEAST * grid.size)
     most = round(min(0.5, (excess + 3.0 * sd) / (1.0 - chance) / ONE_EACH) * grid.size)
     top = least + int(np.argmax(power[least : most + 1]))
-    if power[top] < (math.log(size) + LINE) * mean:
+    if power[top] < (math.log(size) + nats_of("held_samples")) * mean:
         return None
     frequency = top / grid.size
     block = max(256, math.ceil(size * IN_BLOCK * mean / float(power[top])))

@@ -15,7 +15,7 @@ from scipy.ndimage import uniform_filter1d
 
 from selfcal.base.grid import MEDIAN_SD, Array, noise_of
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import CHANGED_LEAST, ODD, PIECE, PIECES, Misread, codes_of
+from selfcal.readings.codes import CHANGED_LEAST, PIECE, PIECES, Misread, codes_of
 from selfcal.readings.lattice import Lattice, step_of
 
 #: Share of the readings that a span has changed, or of the codes with a bit, that may be one value, or are there.
@@ -67,7 +67,7 @@ def spans_of(values: Array) -> Misread | None:
         return None
     line = _ln_of_noise(y - uniform_filter1d(y, PIECE, mode="nearest"), size)
     found = [_of_span(y, span, line, span < size, k < len(spans) - 1) for k, span in enumerate(spans)]
-    best = max((one for one in found if one is not None), key=lambda one: one.nats, default=None)
+    best = max(filter(None, found), key=lambda misread: misread.nats, default=None)
     if best is None or best.nats < nats_of("misread") + math.log(len(spans)):
         return None
     if best.undone is None:
@@ -126,48 +126,34 @@ def _of_span(y: Array, span: float, line: float, torn: bool, lattice: bool) -> M
     return Misread(kind, float(np.mean(turns != 0.0)), nats, y + span * turns if sd * WHOLE < span else None)
 
 
-def stuck_bit_of(values: Array, lattice: Lattice | None) -> Misread | None:
-    """Readings [n], NaN where there are none, whose codes lack one bit: every other 2^k of them never comes.
+def _of_bits(values: Array, lattice: Lattice | None) -> list[Misread]:
+    """Readings [n], NaN where there are none, whose codes lack one bit: every other 2^k of them never comes. Or that
+    lack the lowest ones until one time, or from then on: the range of the part was changed, and they are right.
 
     Each time that the bits above it change, the bit itself is one or the other by chance."""
     y = values[np.isfinite(values)]
-    if lattice is None or y.size < PIECE:
-        return None
+    if lattice is None or y.size < PIECES:
+        return []
     code = np.rint(y / lattice.step).astype(np.int64)
-    low, high = (int(one) for one in np.quantile(code, INNER))
-    for k in range(1, max(2, int(math.log2(high - low + 1)) + 1)):
+    low, high = (int(edge) for edge in np.quantile(code, INNER))
+    found = []
+    for k in range(max(2, int(math.log2(high - low + 1)) + 1)):
         bit = (code >> k) & 1
-        if bit.min() < bit.max():
-            continue
+        for part in (code, code[::-1]) if k < 2 else ():
+            size = int(np.argmax((part - part[0]) % 2 ** (k + 1) != 0))
+            nats = (k + 1) * math.log(2.0) * np.count_nonzero(np.diff(part[:size])) - 2.0 * math.log(y.size)
+            found.append(Misread("range_change", size / y.size, nats))
         inner = np.arange(low, high + 1)
         inner = inner[((inner >> k) & 1) == bit[0]]
-        nats = math.log(2.0) * np.count_nonzero(np.diff(code >> (k + 1))) - math.log(64.0)
-        if np.isin(inner, code).mean() > ALIKE and nats > nats_of("misread"):
-            return Misread(f"bit_{'set' if bit[0] else 'clear'}", 0.5, nats)
-    return None
-
-
-def range_change_of(values: Array, lattice: Lattice | None) -> Misread | None:
-    """Readings [n], NaN where there are none, that from one time on, or until then, lie on every second code alone, or
-    on every fourth: the range of the part was changed. They are right."""
-    y = values[np.isfinite(values)]
-    if lattice is None or y.size < PIECES:
-        return None
-    code = np.rint((y - y[0]) / lattice.step).astype(np.int64)
-    best = Misread("range_change", 0.0, 0.0)
-    for factor in (4, 2):
-        for part in (code, code[::-1]):
-            off = np.flatnonzero((part - part[0]) % factor)
-            size = int(off[0]) if off.size else 0
-            nats = size * math.log(factor) - 2.0 * math.log(y.size)
-            if nats > best.nats and off.size > size * ODD and np.unique(part[:size]).size > factor:
-                best = Misread("range_change", size / y.size, nats)
-    return best if best.nats > nats_of("misread") else None
+        if k and bit.min() == bit.max() and np.isin(inner, code).mean() > ALIKE:
+            nats = math.log(2.0) * np.count_nonzero(np.diff(code >> (k + 1))) - math.log(64.0)
+            found.append(Misread(f"bit_{'set' if bit[0] else 'clear'}", 0.5, nats))
+    return [misread for misread in found if misread.nats > nats_of("misread")]
 
 
 def misread_of(values: Array, lattice: Lattice | None) -> Misread | None:
     """How readings [n], NaN where there are none, were misread: by the likeliest map; None where they were not."""
-    found = [stuck_bit_of(values, lattice)]
-    if found[0] is None:
-        found = [range_change_of(values, lattice), codes_of(values, lattice)]
-    return max((one for one in found if one is not None), key=lambda one: one.nats, default=None)
+    found = _of_bits(values, lattice)
+    stuck = [misread for misread in found if misread.kind != "range_change"]
+    codes = None if stuck else codes_of(values, lattice)
+    return max(stuck[:1] or [*found, *([codes] if codes else [])], key=lambda misread: misread.nats, default=None)

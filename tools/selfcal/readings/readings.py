@@ -28,10 +28,6 @@ from selfcal.readings.lost_words import Recurring, is_limit, recurring_of
 from selfcal.readings.misread import misread_of, spans_of
 from selfcal.readings.motion import Moved, moves_of
 
-#: A change of the sampling clock counts from this share on; a crystal keeps 1e-4.
-CLOCK_LEAST = 1e-3
-#: Pieces on either side of a change, and standard deviations of their slopes that it takes.
-SLOPES, SLOPES_LEAST = 10, 8.0
 #: Rows of a recording whose readings are kept once they were looked at, at most.
 KEPT_MOST = 1 << 22
 #: Longest common interval of two rates, s, and how far off it may be.
@@ -50,16 +46,6 @@ INFORMATION_LEAST = 0.05
 SAME, ROUNDING, LIKE = 1e-7, 1.4, 0.1
 #: Steps of EM at most, and the change of the noise at which it has settled.
 ITERATIONS, SETTLED = 200, 1e-6
-
-
-@dataclass(frozen=True)
-class RateChange:
-    """A change of the sampling rate: `time_s`, the rates before and after, and the evidence in nats."""
-
-    time_s: float
-    before_hz: float
-    after_hz: float
-    nats: float
 
 
 @dataclass(frozen=True)
@@ -115,7 +101,7 @@ class Readings:
     moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held: Held | None = None
-    changes: tuple[RateChange, ...] = ()
+    changes: tuple[Change, ...] = ()
     slower: tuple[Slower, ...] = ()
 
     @property
@@ -225,35 +211,35 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
             misread = explained
     # The codes of a counter recur; a dead band takes its counts from its neighbours.
     counter = lattice is not None and lattice.carried > 0.0
-    recurring = None if misread or uneven or counter else recurring_of(sound, recording.rate_hz)
-    if recurring is not None:
-        values, sound = np.where(recurring.mask, np.nan, values), np.where(recurring.mask, np.nan, sound)
+    recurring = None if misread or uneven or counter else recurring_of(sound, explained)
+    lost = none if recurring is None else recurring.mask
+    if lost.any():
+        sound = np.where(lost, np.nan, sound)
         lattice = lattice_of(_known(sound), recording.rate_hz)
     stuck, nats = _stuck(sound, lattice, group.stuck_limit)
     if stuck.any():
-        values, sound = np.where(stuck, np.nan, values), np.where(stuck, np.nan, sound)
+        sound = np.where(stuck, np.nan, sound)
     stretches = tuple(slower(sound))
-    repeats = np.zeros(values.size, bool)
-    for one in stretches:
-        repeats[one.rows] = True
-    if stretches:
-        values, sound = np.where(repeats, np.nan, values), np.where(repeats, np.nan, sound)
+    repeats = (
+        np.isin(np.arange(values.size), np.concatenate([stretch.rows for stretch in stretches])) if stretches else none
+    )
+    left_out = lost | stuck | repeats
+    values = np.where(left_out, np.nan, values) if left_out.any() else values
+    moving, moved = _moving(recording, axis)
+    if stretches or moving.any():
+        sound = np.where(repeats | moving, np.nan, sound)
     folded = misread is not None and misread.undone is None and misread.kind != "range_change"  # ends at zero
     clipped = None if folded else _clipped(sound, lattice)
-    moving, moved = _moving(recording, axis)
-    if moving.any():
-        sound = np.where(moving, np.nan, sound)
-        clipped = None if folded else _clipped(sound, lattice)
     working = drawn = values
     if clipped is not None:
         working, drawn = _unclipped(sound, clipped, lattice)
     if moving.any():
         working, drawn = np.where(moving, np.nan, working), np.where(moving, values, drawn)
     stuck, moving = (mask if mask.any() else none for mask in (stuck, moving))  # one array for all
-    lost = 0 if clipped is None else int((clipped.mask | ~inside).sum())
-    counts = {"saturated": lost, "stuck": int((stuck | repeats).sum())}
+    saturated = 0 if clipped is None else int((clipped.mask | ~inside).sum())
+    counts = {"saturated": saturated, "stuck": int((stuck | repeats).sum())}
     if recurring is not None:
-        counts["outliers"] = int(recurring.mask.sum())
+        counts["outliers"] = int(lost.sum())
     return Readings(
         recording,
         values,
@@ -297,48 +283,18 @@ def _moving(recording: Recording, axis: str) -> tuple[Mask, Moved | None]:
 # ------------------------------------------------------------------------------------------------------ change of rate
 
 
-def evened(recording: Recording) -> tuple[Recording, tuple[RateChange, ...]]:
+def evened(recording: Recording) -> tuple[Recording, tuple[Change, ...]]:
     """The recording on one even grid, where its rate changes: means over an interval that all rates share."""
     off = recording.off_grid_s
     if off is None or off.size < 60:
         return recording, ()
     time = recording.time_s
     time += off
-    found = rate_changes(time) or _small_change(time, recording)
+    found = tuple(rate_changes(time))
     if not found:
         return recording, ()
-    rows = [one.row for one in found]
-    intervals = [found[0].before_s, *(one.after_s for one in found)]
-    return _regridded(recording, time, rows, intervals), tuple(
-        RateChange(float(time[one.row] - time[0]), 1.0 / one.before_s, 1.0 / one.after_s, one.nats) for one in found
-    )
-
-
-def _small_change(time: Array, recording: Recording) -> list[Change]:
-    """One change so small that the grid is known: the time stamps laid on it have a bend."""
-    off = recording.off_grid_s
-    assert off is not None
-    k = np.arange(off.size)
-    off = off - (off[0] + (off[-1] - off[0]) / k[-1] * k)
-    edge = max(10, off.size // 50)
-    at = edge + int(np.argmax(np.abs(off[edge:-edge])))
-    step = 1.0 / recording.rate_hz
-    bend = float(np.abs(off).max())
-    if bend < 3.0 * step:
-        return []
-    halves = (slice(None, at), slice(at, None))
-    lines = [np.polyfit(k[half], off[half], 1) for half in halves]
-    bent = np.concatenate([np.polyval(line, k[half]) for line, half in zip(lines, halves, strict=True)])
-    scatter = float((off - bent).std())
-    change = float(lines[1][0] - lines[0][0]) / step
-    if abs(change) < CLOCK_LEAST or bend < 5.0 * scatter:
-        return []
-    # Random times walk off any grid. The slopes of pieces show how far.
-    slopes = [np.diff(off[half][:: max(1, off[half].size // SLOPES)]) * SLOPES / off[half].size for half in halves]
-    if abs(change) * step < SLOPES_LEAST * math.hypot(*(float(one.std()) / math.sqrt(one.size) for one in slopes)):
-        return []
-    nats = min(1e6, 0.5 * (bend / max(scatter, 1e-3 * step)) ** 2)
-    return [Change(at, step + float(lines[0][0]), step + float(lines[1][0]), nats)]
+    intervals = [1.0 / rate_hz for rate_hz in (found[0].before_hz, *(change.after_hz for change in found))]
+    return _regridded(recording, time, [change.row for change in found], intervals), found
 
 
 def _regridded(recording: Recording, time: Array, rows: Sequence[int], intervals: Sequence[float]) -> Recording:
@@ -528,72 +484,32 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
 
 
 def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
-    """Readings [n] that pile up at their largest or smallest value: noise would go on beyond it, and none does.
+    """Readings [n] that pile up at their largest or smallest value, as the likelihood of their codes has it: noise
+    would go on beyond it, and none does.
 
-    The number expected beyond is the evidence, in nats (Poisson). Noise is normal about the mean of its neighbours.
     Increments of a counter pile up on the codes about their mean, and none of them is lost.
     """
     if lattice is not None and lattice.carried:
         return None
     rows = np.flatnonzero(np.isfinite(values))
-    y = values[rows]
-    if y.size < 4 * AROUND:
+    y, step = values[rows], 0.0 if lattice is None else lattice.step
+    edges = [float(y.max()), float(y.min())] if y.size >= 4 * AROUND else []
+    at_edges = [np.abs(y - edge) <= max(1e-9 * max(1.0, abs(edge)), 0.25 * step) for edge in edges]
+    if max((int(at_edge.sum()) for at_edge in at_edges), default=0) < 3 or np.unique(y).size < 3:
         return None
-    half = 0.5 * lattice.step if lattice is not None else 0.0
-    edges = [(sign, float((sign * y).max())) for sign in (1, -1)]
-    at_edges = [sign * y >= edge - max(1e-9 * max(1.0, abs(edge)), 0.5 * half) for sign, edge in edges]
-    if all(at_edge.sum() < 3 for at_edge in at_edges):
-        return None
-    if lattice is not None and lattice.too_coarse:
-        found = {
-            sign * edge: (worth, rows[at_edge])
-            for (sign, edge), at_edge, worth in zip(edges, at_edges, _piled(y, lattice), strict=True)
-            if worth > nats_of("saturation") and at_edge.sum() >= 3
-        }
-        masks = {edge: np.isin(np.arange(values.size), at) for edge, (_, at) in found.items()}
-        return Clipped(masks, sum(worth for worth, _ in found.values())) if found else None
-    size = 2 * AROUND + 1
-    level = (uniform_filter1d(y, size, mode="reflect") * size - y) / (size - 1)
-    # The level's own noise, 1 / (2 AROUND), is in the scatter, and a second time in the level.
-    variance = float((y - level).var()) * max(0.0, 1.0 - 2.0 / (size - 1))
-    deviation = math.sqrt(max(variance - half * half / 3.0, 0.01 * variance))  # before rounding
-    limits: dict[float, Mask] = {}
-    nats = 0.0
-    for (sign, edge), at_edge in zip(edges, at_edges, strict=True):
+    cells = Cells(y, step)
+    plain, limits, total = cells.fit(cells.own), dict[float, Mask](), 0.0
+    for side, edge, at_edge in zip((1, -1), edges, at_edges, strict=True):
+        nats = cells.fit(cells.limit(side)).one - plain.one
         count = int(at_edge.sum())
-        if count < 3 or not deviation > 0.0:
+        if count < 3 or nats < nats_of("saturation"):
             continue
-        beyond = ndtr((sign * level - edge - half) / deviation)
-        expected = float(beyond.sum())
-        # Unclipped, the expectation beyond the largest reading is itself distributed as exp(-x): either side is a look.
-        worth = expected - math.log(2.0)
-        if half > 0.0:
-            # Clipped, a reading of the last code was of that code or beyond it. Some ten codes might be the last.
-            cell = ndtr((sign * level - edge + half) / deviation) - beyond
-            pile = float(np.log1p(beyond[at_edge] / np.maximum(cell[at_edge], 1e-300)).sum())
-            worth = max(worth, pile - math.log(20.0))
-        else:
-            # Without a lattice no two readings are alike by chance; each repeat counts for no more than 1 in 100.
-            worth = max(worth, (count - 2) * math.log(100.0))
-        if worth < nats_of("saturation") or count < 0.5 * expected:
-            continue
-        if not is_limit(y[~at_edge], sign * edge, count, 2.0 * half):
+        if not (lattice is not None and lattice.too_coarse) and not is_limit(y[~at_edge], edge, count, step):
             continue  # the others do not come near it: a word that the logger shows for lost ones
-        mask = np.zeros(values.size, bool)
-        mask[rows[at_edge]] = True
-        limits[sign * edge] = mask
-        nats += worth + math.log(2.0)
-    return Clipped(limits, nats) if limits else None
-
-
-def _piled(y: Array, lattice: Lattice) -> tuple[float, float]:
-    """Evidence, nats, that the last and the first code of readings [n] on a coarse lattice hold those beyond too."""
-    if np.unique(y).size < 3:
-        return 0.0, 0.0
-    cells = Cells(y, lattice.step)
-    plain = cells.fit(cells.own)
-    high, low = (cells.fit(cells.limit(side)).one - plain.one for side in (1, -1))
-    return high, low
+        limits[edge] = np.zeros(values.size, bool)
+        limits[edge][rows[at_edge]] = True
+        total += nats
+    return Clipped(limits, total) if limits else None
 
 
 def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:

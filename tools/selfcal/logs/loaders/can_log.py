@@ -29,7 +29,6 @@ def read(path: Path, hints: Hints) -> list[Table]:
     if not isinstance(database, cantools.database.can.Database):
         raise UserError(f"{hints['dbc']}: not a database of CAN messages")
     messages = {known.frame_id: known for known in database.messages}
-    stamps: dict[tuple[int, tuple[str, ...]], Any] = {}
     values: dict[tuple[int, tuple[str, ...]], Any] = {}
     undecoded: set[str] = set()
     with FrameLog(path) as log:
@@ -43,22 +42,20 @@ def read(path: Path, hints: Hints) -> list[Table]:
                 undecoded.add(message.name)
                 continue
             if isinstance(decoded, dict) and all(isinstance(value, int | float) for value in decoded.values()):
-                of = frame.arbitration_id, tuple(decoded)  # the signals that a multiplexer chose
-                stamps.setdefault(of, array("d")).append(frame.timestamp)
-                values.setdefault(of, array("d")).extend(decoded.values())
-    if not stamps:
+                signals = frame.arbitration_id, tuple(decoded)  # those that a multiplexer chose
+                values.setdefault(signals, array("d")).extend((frame.timestamp, *decoded.values()))
+    if not values:
         raise UserError(f"{path}: no frame in it is a message of {hints['dbc']}")
     short = f"left out: frames of {', '.join(sorted(undecoded))}, which are shorter than the database states"
     notes = (short,) if undecoded else ()
     tables = []
-    for (number, names), times in stamps.items():
-        message = messages[number]
-        rows = np.array(values[number, names]).reshape(len(times), -1)
+    for (number, names), rows_of in values.items():
+        message, rows = messages[number], np.array(rows_of).reshape(-1, 1 + len(names))
         unit = {signal.name: signal.unit for signal in message.signals}
-        columns = {heading(name, unit[name]): rows[:, k] for k, name in enumerate(names)}
-        alone = sum(other == number for other, _ in stamps) == 1
+        columns = {heading(name, unit[name]): rows[:, k] for k, name in enumerate(names, 1)}
+        alone = sum(other == number for other, _ in values) == 1
         source = message.name if alone else f"{message.name}/{_chosen(message, names)}"
-        tables.append(of_arrays(source, {"t[s]": np.array(times), **columns}, notes=notes, damaged=log.damaged))
+        tables.append(of_arrays(source, {"t[s]": rows[:, 0], **columns}, notes=notes, damaged=log.damaged))
     return tables
 
 
