@@ -122,6 +122,7 @@ def diagnose_record(
             _measure(one)
 
     work.each(again, dict.fromkeys(name for names in settled for name in names))
+    tilt.settle(record, found)
     work.each(end, found)
     return found
 
@@ -132,9 +133,10 @@ def _stated(state: State) -> bool:
 
 
 def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
-    """What is left over, and the statistics of the model that the loop began with."""
+    """What is left over, each finding beside all others, and the statistics of the model that the loop began with."""
     advance(f"{one.state.axis}: statistics")
     _unexplained(one)
+    one.findings = [each if each.record is not None else each.ended(one.state) for each in one.findings]
     one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
 
 
@@ -278,7 +280,6 @@ def _give(
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     # An axis whose model has the column already has no look.
     looks = {name: look for name, look in looks.items() if look.shape is None or look.shape.regressors}
-    looks = tilt.of_steps(looks, {**states, **own})
     if sum(look.gain for look in looks.values()) < module.NAMED:  # what the axes know by now explains it
         return
     findings = {}

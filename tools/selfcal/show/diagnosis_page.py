@@ -79,7 +79,7 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "boxes_of": lambda finding: [
             (axis.name, k) for axis in axes if (k := axis.first_of(finding["id"], "of")) is not None
         ],
-        "notes": notes(shown, results),
+        "notes": notes(results),
         "readings": _readings(shown, axes) if axes else "",
         "causes": list({str(finding["cause"]): None for _, finding in gains}),
         "gains": gains,
