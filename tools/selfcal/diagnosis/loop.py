@@ -184,8 +184,11 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
         for found_at in (look(record, name) for look in READ):
             if found_at is not None:
                 one.findings.append(Finding(found_at, 0, one.state, one.state))
-        if name in handled:  # the motion that is left out already spoilt the first state
-            one.findings.append(Finding(motion.look_of(handled[name]), 0, one.first, states[name]))
+        for moved in handled[name].events if name in handled else ():  # left out already, and in the first state
+            spoilt = (
+                _with_motion(record, one.first, states[name], moved) if len(handled[name].events) > 1 else one.first
+            )
+            one.findings.append(Finding(motion.look_of(moved), 0, spoilt, states[name]))
         if name in gone:
             one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
@@ -209,6 +212,15 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
         if name in found:
             found[name].state = states[name]
     return replace(record, axes=states)
+
+
+def _with_motion(record: Record, first: State, rest: State, moved: Moved) -> State:
+    """The state at `rest` with the readings of one event of its motion, as the `first` one has them."""
+    y, time = rest.y.copy(), record.time_s
+    for begin, end in moved.intervals:
+        inside = (time > begin - rest.dt) & (time < end + rest.dt)
+        y[inside] = first.y[inside]
+    return replace(first, y=y).refit()
 
 
 def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
