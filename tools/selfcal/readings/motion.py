@@ -417,15 +417,20 @@ def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
 
 
 def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
-    """Whether the axes that moved share a source at rest, and it alone is loud where they moved. It is the direction in
-    which they are loudest, in units of the axes' joint noise at rest."""
-    parts = [energy.apart[k] for k in np.flatnonzero(np.any([one.axes for one in moved], axis=0))]
+    """Whether the axes that moved share a source at rest, each with another one, and it alone is loud where they moved.
+    It is the direction in which they are loudest, in units of the axes' joint noise at rest."""
+    axes = np.flatnonzero(np.any([one.axes for one in moved], axis=0))
+    parts = [energy.apart[k] for k in axes]
     if len({piece.size for _, piece in parts}) > 1:
         return False
     values, piece = np.array([part for part, _ in parts]), parts[0][1]
     inside = np.any([(piece >= one.begin) & (piece < one.end) for one in moved], axis=0)
     together = np.corrcoef(np.clip(values[:, ~inside], -WILD[0], WILD[0]))
-    if np.abs(together - np.eye(len(parts))).max() < SHARED + CORRELATED / math.sqrt(values.shape[1]):
+    linked = np.abs(together) > SHARED + CORRELATED / math.sqrt(values.shape[1])
+    linked = np.linalg.matrix_power(linked.astype(float), axes.size) > 0.0  # by others too
+    loudest = np.max([one.nats[axes] for one in moved], axis=0)
+    sure = loudest >= min(-math.log(SHARE), float(loudest.max()))
+    if not linked[np.ix_(sure, sure)].all() or (linked.sum(axis=1)[sure] == 1).any():
         return False
     size, vectors = np.linalg.eigh(together)
     loud_ones = vectors / np.sqrt(np.maximum(size, TINY)) @ vectors.T @ values[:, inside]
