@@ -173,8 +173,14 @@ def event(finding: Mapping[str, Any]) -> str:
 
 
 def named(cause: str) -> str:
-    """A cause by its name."""
-    return LABELS.get(cause, cause.replace("_", " "))
+    """A cause by its name, or the id of one of several."""
+    of_several, _, number = cause.replace(" ", "_").rpartition("_")
+    return f"{named(of_several)} {number}" if number.isdecimal() else LABELS.get(cause, cause.replace("_", " "))
+
+
+def quantity(key: str) -> str:
+    """What two recordings are compared by: a number, or a size of a cause."""
+    return ", ".join(map(named, key.split(".")))
 
 
 def what(finding: Mapping[str, Any]) -> str:
