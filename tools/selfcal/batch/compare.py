@@ -166,7 +166,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
             say(f"{pair}: {which}nothing changed beyond what the recordings leave open")
             continue
         headings = ("axes", "quantity", "before", "after", "unit", "sd apart")
-        table = table_of(headings, escape(printable(f"{pair}: changes beyond what the recordings leave open")))
+        table = table_of(headings, escape(printable(f"{pair}: changes")))
         for row in rows:
             distance = f"{row.change['distance_sd']:+.1f}" if "distance_sd" in row.change else ""
             sides = (row.side(name, "-") for name in ("before", "after"))

@@ -146,7 +146,9 @@ def _size(key: str, value: Any) -> str:
             return statistic(str(value))
         case "share":
             return f"share of the drift {value:.2g}"
-        case "input" | "source" | "measured" | "law" | "knots":
+        case "source":
+            return f"the source is {value}"
+        case "input" | "measured" | "law" | "knots":
             return ""
     if isinstance(value, list | tuple):
         return f"{label} {', '.join(str(one) for one in value)}"
@@ -161,15 +163,18 @@ def statistic(name: str) -> str:
 def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
     """The cause with its size."""
     text = sizes(estimate)
-    begin = CAUSES[cause].unsure if "source" in estimate else CAUSES[cause].words
-    return f"{begin} {text[:1].upper()}{text[1:]}."
+    return f"{_begin(cause, estimate)} {text[:1].upper()}{text[1:]}."
+
+
+def _begin(cause: str, estimate: Mapping[str, Any]) -> str:
+    return CAUSES[cause].unsure if "source" in estimate else CAUSES[cause].words
 
 
 def event(finding: Mapping[str, Any]) -> str:
     """A finding of all axes in a sentence: the cause, what the axes have in common, and its size on each."""
     each = "; ".join(f"{axis}: {sizes(one['estimate'])}" for axis, one in finding["axes"].items() if one["estimate"])
     told = ". ".join(part[:1].upper() + part[1:] for part in (sizes(finding["estimate"]), each) if part)
-    return f"{CAUSES[finding['cause']].words} {told or 'On ' + ', '.join(finding['axes'])}."
+    return f"{_begin(finding['cause'], finding['estimate'])} {told or 'On ' + ', '.join(finding['axes'])}."
 
 
 def named(cause: str) -> str:
