@@ -85,7 +85,8 @@ def test_a_tilt_is_no_change_of_the_drift(tilted: dict[str, Any], capsys: pytest
     assert 3.0 < K["after"] / max(K["before"], 1e-9) < 8.0  # five times, by two estimates of 15 % each
     show(tilted)
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert [line[:3] for line in lines if "tilt" in line and "->" in line] == [["ax", "ay", "tilt"]]
+    assert [line[:3] for line in lines if line[2:3] == ["tilt"]] == [["ax", "ay", "tilt"]]
+    assert any(line[1:6] == ["tilt", "on", "ax", "ay:", "at"] for line in lines)  # as `diagnose` has it
 
 
 def test_a_drift_that_one_record_cannot_tell_is_below_its_limit() -> None:

@@ -2,8 +2,8 @@
 
 A finding is material where it moves a number that the user takes away: N, K or B of an axis by more than half of the
 stated 90 % interval and by 5 %; or the bias by half of its interval; or the error of the bias ahead by 5 %, on held-out
-time and beyond 2 sd. N, K and B without a finding come from the model that the loop had before it, with it from the one
-after it; the stated intervals are those of the extended model.
+time and beyond 2 sd. N, K and B without a finding are those of the final model less it, refitted; with it those of the
+final one. The stated intervals are those of the extended model.
 """
 
 from __future__ import annotations
