@@ -376,7 +376,7 @@ def test_identify_tells_statistics_of_alike_axes_in_one_line() -> None:
         "not adequate: ax, ay: turn_on: a bias that settles within 44 s or so, by 30 nats: K includes that",
         "not adequate: az: channel: ax (static) explains 21 nats of it: N, K and the bias include that",
         "not adequate: gx, gy: innovation_a +7.500, beyond ±0.600; innovation_b -2.500 to -0.900, beyond ±0.600; "
-        "allan: model -31 to +12 %",
+        "allan_2s model -31 %, 2s +12 %",
         "not adequate: gz: innovation_a +7.500, beyond ±0.600; innovation_b -0.900, beyond ±0.600",
     ]
 

@@ -77,20 +77,17 @@ def names_of(document: Mapping[str, Any]) -> dict[str, str]:
 def told_of(document: Mapping[str, Any]) -> dict[tuple[str, str], list[Told]]:
     """By pair of recordings the lines of all axes: causes that appeared or are gone, on all their axes; then numbers by
     their distance."""
-    causes: dict[tuple[str, str], dict[tuple[str, str], list[tuple[str, Mapping[str, Any]]]]] = {}
-    numbers: dict[tuple[str, str], list[tuple[str, Mapping[str, Any]]]] = {}
-    for name, entry in document["axes"].items():
-        for change in entry["changes"] if isinstance(entry, Mapping) else entry:
-            pair = change["from"], change["to"]
-            if change["what"] == "changed":
-                numbers.setdefault(pair, []).append((name, change))
-            else:
-                kind = change["quantity"], change["what"]
-                causes.setdefault(pair, {}).setdefault(kind, []).append((name, change))
     found = {}
     for pair in pairwise(document["recordings"]):
-        far = sorted(numbers.get(pair, ()), key=lambda row: -abs(row[1]["distance_sd"]))
-        found[pair] = [*map(Told, causes.get(pair, {}).values()), *(Told([row]) for row in far)]
+        causes: dict[tuple[str, str], list[tuple[str, Mapping[str, Any]]]] = {}
+        far: list[tuple[str, Mapping[str, Any]]] = []
+        for name, entry in document["axes"].items():
+            for change in entry["changes"] if isinstance(entry, Mapping) else entry:
+                if (change["from"], change["to"]) == pair:
+                    kind = change["quantity"], change["what"]
+                    (far if kind[1] == "changed" else causes.setdefault(kind, [])).append((name, change))
+        far.sort(key=lambda row: -abs(row[1]["distance_sd"]))
+        found[pair] = [*map(Told, causes.values()), *(Told([row]) for row in far)]
     return found
 
 

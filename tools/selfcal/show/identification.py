@@ -315,24 +315,23 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
     alike: dict[tuple[str, ...], list[str]] = {}  # axes by the statistics that they fail
     for name, axis in axes.items():
         off = _off(axis)
-        failed = [check for check in _failed(axis) if not check.startswith("allan_")] + (["allan"] if off else [])
+        failed = [check for check in _failed(axis) if not check.startswith("allan_")] + ["allan"] * bool(off)
         if name in named and failed:
             most, tau = max(off, key=lambda share: abs(share[0]), default=(0.0, ""))
-            beside.append(name + (f" (allan_{tau} model {most:+.0f} %)" if off else ""))
+            beside.append(name + f" (allan_{tau} model {most:+.0f} %)" * bool(off))
         elif failed:
             alike.setdefault(tuple(failed), []).append(name)
     for checks, names in alike.items():
         told = [_range_of(one, [axes[name]["checks"][one] for name in names]) for one in checks if one != "allan"]
-        if "allan" in checks and len(names) == 1:  # allan_16s model -9 %, 128s +22 %
-            each = ", ".join(f"{tau} {most:+.0f} %" for most, tau in _off(axes[names[0]]))
-            told.append(f"allan_{each.replace(' ', ' model ', 1)}")
-        elif "allan" in checks:
-            shares = [most for name in names for most, _ in _off(axes[name])]
-            told.append(f"allan: model {min(shares):+.0f} to {max(shares):+.0f} %")
+        off = [each for name in names for each in _off(axes[name])]
+        each = off if len(names) == 1 else [min(off), max(off)]  # allan_16s model -9 %, 128s +22 %
+        told += (
+            [f"allan_{', '.join(f'{tau} {most:+.0f} %' for most, tau in each).replace(' ', ' model ', 1)}"]
+            if off
+            else []
+        )
         lines.append(f"not adequate: {', '.join(names)}: {'; '.join(told)}")
-    if beside:
-        lines.append(f"not adequate: statistics of {', '.join(beside)} as well")
-    return lines
+    return [*lines, *([f"not adequate: statistics of {', '.join(beside)} as well"] if beside else [])]
 
 
 def _failed(axis: Mapping[str, Any]) -> list[str]:
