@@ -402,7 +402,8 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
             if harms:
                 (one.dropped if _free(best) else one.harmful).append(best)
                 looks = [look for look in looks if not look.repeats(best)]
-        idle = idle | set(waiting) if len(one.findings) >= BUSY else set()
+        causes_of = {(finding.round, finding.event, finding.look.cause) for finding in one.findings}  # motion once
+        idle = idle | set(waiting) if len(causes_of) >= BUSY else set()
         rivals = tuple(look for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
         possible = tuple(dict.fromkeys(look.cause for look in rivals))
         one.state = after
