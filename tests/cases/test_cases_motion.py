@@ -331,6 +331,18 @@ def test_a_source_that_axes_share_moves_none() -> None:
         assert sorted(found) == (["gx", "gy", "gz"] if alone else [])
 
 
+@pytest.mark.parametrize("line", [(0.9, 0.7, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.2, -0.8), (0.0, 2.0, 0.0, 0.0, 2.0)])
+def test_a_shock_beside_a_line_of_two_axes_moves_all(line: tuple[float, ...]) -> None:
+    """A shock of one and the same course on five axes, of which two share a line at rest. Truth: the test's own."""
+    random, t = np.random.default_rng(12), np.arange(2400) / 2.0
+    for course in ([1.0, -0.7, 0.5, -0.3], [1.0, 1.0, -1.0, -1.0, 0.6]):
+        rows = random.standard_normal((5, t.size)) + np.outer(line, np.sin(2.0 * math.pi * 0.23 * t))
+        rows[:, 1500 : 1500 + len(course)] += np.outer([40.0, 55.0, 30.0, 90.0, 70.0], course)
+        found = moves_of(a_recording(2.0, *rows))
+        assert len(found) == 5
+        assert all(a < 750.0 < 752.0 < b and b - a < 9.0 for one in found.values() for a, b in one.intervals)
+
+
 @pytest.mark.parametrize("run", ["run1", "run2"])
 def test_the_square_wave_of_the_real_runs_is_no_motion(run: str) -> None:
     """The square wave's jitter at 1 Hz. Truth: no surrogate of the runs shows a common burst (shared data, README)."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -84,7 +85,8 @@ def test_a_tilt_is_no_change_of_the_drift(tilted: dict[str, Any], capsys: pytest
     assert 3.0 < K["after"] / max(K["before"], 1e-9) < 8.0  # five times, by two estimates of 15 % each
     show(tilted)
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
-    assert [line[:3] for line in lines if "tilt" in line and "->" in line] == [["ax", "ay", "tilt"]]
+    assert [line[:3] for line in lines if line[2:3] == ["tilt"]] == [["ax", "ay", "tilt"]]
+    assert any(line[1:6] == ["tilt", "on", "ax", "ay:", "at"] for line in lines)  # as `diagnose` has it
 
 
 def test_a_drift_that_one_record_cannot_tell_is_below_its_limit() -> None:
@@ -94,8 +96,8 @@ def test_a_drift_that_one_record_cannot_tell_is_below_its_limit() -> None:
     (row,) = changes({"K": unknown}, {"K": known})
     assert (row["what"], row["before_below"]) == ("changed", 1e-3) and "after_below" not in row
     assert changes({"K": unknown}, {"K": {**unknown, "median": 5e-3, "q05": 4.9e-3, "q95": 5.1e-3}}) == []
-    document = {"axes": {"gx": [{"from": "a", "to": "b", **row}]}}
-    (line,) = told_of(document)
+    document = {"recordings": ["a", "b"], "axes": {"gx": [{"from": "a", "to": "b", **row}]}}
+    ((line,),) = told_of(document).values()
     assert (line.side("before", "-"), line.side("after", "-")) == ("< 0.001", "0.01")
 
 
@@ -116,7 +118,7 @@ def test_nothing_in_it_runs_or_is_loaded(made: tuple[dict[str, Any], str]) -> No
 def test_without_a_change_it_states_so(made: tuple[dict[str, Any], str]) -> None:
     document, _ = made
     quiet = {**document, "axes": {"ax": []}}
-    assert "Nothing changed beyond what the recordings leave open" in page(quiet, {})
+    assert "nothing changed beyond what the recordings leave open" in page(quiet, {})
     missing = {**document, "axes": {"gx": {"error": "b.npz does not have it", "changes": []}}}
     assert "gx not compared: b.npz does not have it" in Page(page(missing, {})).text
 
@@ -124,11 +126,40 @@ def test_without_a_change_it_states_so(made: tuple[dict[str, Any], str]) -> None
 def test_the_terminal_tells_what_each_recording_shows(
     made: tuple[dict[str, Any], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The step is in the second alone."""
-    show(made[0])
-    first, second = (line for line in capsys.readouterr().out.splitlines() if ".npz: " in line)
+    """The step is in the second alone. Findings are as `diagnose` has them."""
+    document = made[0]
+    assert [(one["cause"], one["recording"]) for one in document["findings"] if one["material"]] == [
+        ("step", document["recordings"][1])
+    ]
+    show(document)
+    first, second = capsys.readouterr().out.splitlines()[-2:]
     assert first == "monday.npz: no finding that matters"
-    assert second.endswith(".npz: step on gx")
+    assert re.search(r"\.npz: step on gx: at 699\.\d+ ± [\d.]+ s$", second)
+
+
+def test_each_pair_of_three_has_its_own_list(capsys: pytest.CaptureFixture[str]) -> None:
+    """From the first to the second a settling appears and N grows; it is gone in the third, and N is as it was."""
+    logs, unit = ["u/one.csv", "u/two.csv", "u/three.csv"], {"unit": "deg/s/sqrt(Hz)"}
+    changed = {"quantity": "N", "what": "changed", **unit}
+    first, second = ({"from": one, "to": two} for one, two in pairwise(logs))
+    rows = [
+        {**first, "quantity": "turn_on 2", "what": "appeared", "after": 0.31, "unit": "deg/s"},
+        {**first, **changed, "before": 0.02, "after": 0.05, "distance_sd": 9.0},
+        {**second, "quantity": "turn_on 2", "what": "gone", "before": 0.31, "unit": "deg/s"},
+    ]
+    document = {"recordings": logs, "axes": {"gy": rows, "gz": []}, "findings": [], "verdicts": {}, "limit_sd": 3.4}
+    told = told_of(document)
+    assert [[line.change["quantity"] for line in lines] for lines in told.values()] == [
+        ["turn_on 2", "N"],
+        ["turn_on 2"],
+    ]
+    show(document)
+    shown = capsys.readouterr().out
+    between = shown.index("two.csv -> three.csv")
+    assert shown.index("one.csv -> two.csv") < shown.index("turn-on transient 2") < shown.index("0.05") < between
+    assert "turn-on transient 2" in shown[between:] and "turn_on" not in shown
+    seen = Page(page({**document, "verdicts": {log: {} for log in logs}, "quantities": {}}, {})).text
+    assert "one.csv → two.csv" in seen and "turn-on transient 2" in seen and "turn on" not in seen
 
 
 def test_it_is_not_written_over_a_recording(tmp_path: Path) -> None:

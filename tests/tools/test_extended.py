@@ -19,13 +19,15 @@ import pytest
 import yaml
 
 from selfcal.adequacy.one_over_f import beside_its_law
+from selfcal.diagnosis import words
+from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import _regressors, extended
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import of_recording
 from selfcal.likelihood.fit import Fit, run
 from selfcal.likelihood.state import Regressor, State
-from selfcal.logs.recording import load
+from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
@@ -250,3 +252,17 @@ def test_a_column_without_an_entry_is_no_regressor() -> None:
     found: Any = {"gx": SimpleNamespace(state=SimpleNamespace(regressors=(column,)), findings=[])}
     record: Any = None
     assert _regressors(Model.load(), record, found) == []
+
+
+@pytest.mark.parametrize("leak", [0.4, -0.3])
+def test_a_leak_that_is_stated_is_found_neither_way(leak: float, tmp_path: Path) -> None:
+    """gy in gx, of white noise and a walk alike: the record does not show which follows, and the row says so. The model
+    that was written has it one way, and the other way round is no finding of the same record."""
+    random, n = np.random.default_rng(31), 2000
+    y = 0.05 * random.standard_normal((2, n)) + np.cumsum(4e-4 * random.standard_normal((2, n)), axis=1)
+    y[0] += leak * y[1]
+    save(tmp_path / "log.npz", {"gx": ("deg/s", y[0]), "gy": ("deg/s", y[1])}, 1.0)
+    (row,) = diagnose(tmp_path / "log.npz", write_model=tmp_path / "m.yaml")["findings"]
+    assert row["cause"] == "cross_axis" and "the source is not shown" in words.what(row)
+    assert CAUSES["cross_axis"].unsure in row["words"]
+    assert diagnose(tmp_path / "log.npz", model=tmp_path / "m.yaml")["findings"] == []

@@ -7,9 +7,10 @@ small record, by dense matrices.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -23,7 +24,7 @@ from selfcal.diagnosis.loop import _give, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording
 from selfcal.likelihood.joint import Joint, act, course, information
 from selfcal.likelihood.state import Look, State, interval
-from selfcal.logs.recording import Column, Recording
+from selfcal.logs.recording import Column, Recording, load, save
 from selfcal.model.file import Model
 
 from conftest import case_records
@@ -365,7 +366,13 @@ def _looks(sizes: dict[str, float], turned: float) -> dict[str, Look]:
         )
         for name, size in sizes.items()
     }
-    return tilt.of_steps(looks, states)
+    finding = Finding(Look("", 0.0, 0.0, {}, {}), 0, cast(Any, None), cast(Any, None), event=3)
+    found = {
+        name: SimpleNamespace(state=states[name], findings=[replace(finding, look=look)])
+        for name, look in looks.items()
+    }
+    tilt.settle(cast(Any, SimpleNamespace(axes=states)), cast(Any, found))
+    return {name: one.findings[0].look for name, one in found.items()}
 
 
 def test_a_turn_of_the_sensor_is_a_tilt() -> None:
@@ -375,6 +382,26 @@ def test_a_turn_of_the_sensor_is_a_tilt() -> None:
     estimate = found["ax"].estimate
     assert estimate["angle_x_deg"]["median"] == pytest.approx(math.degrees(0.08 / 9.80665), rel=1e-6)
     assert estimate["angle_y_deg"]["median"] == pytest.approx(math.degrees(0.05 / 9.80665), rel=1e-6)
+
+
+def test_a_turn_has_the_angles_of_its_final_sizes(tmp_path: Path) -> None:
+    """A line of 0.02 m/s^2 in two axes that turn by -0.5 and 0.3 degrees: the angles are those of the amplitudes that
+    the document has beside them, to the step's share across f (1e-4), and those drawn, to 4 of their deviations."""
+    random, n, g = np.random.default_rng(20), 2200, 9.81
+    t = np.arange(n)
+    about_x, about_y = (math.radians(degrees) * (t >= 1460) for degrees in (-0.5, 0.3))
+    drawn = {"ax": g * about_y, "ay": -g * about_x, "az": np.full(n, -g)}
+    for name, (line, phase) in {"ax": (0.02, 0.4), "ay": (0.014, 2.0), "az": (0.0, 0.0)}.items():
+        drawn[name] = drawn[name] + 0.006 * random.standard_normal(n) + line * np.sin(0.93 * t + phase)
+    save(tmp_path / "log.npz", {name: ("m/s^2", y) for name, y in drawn.items()}, 1.0)
+    recording = load(tmp_path / "log.npz")
+    found = diagnose_record(of_recording(recording, Model.load(None)), list(drawn))
+    looks = {name: [each.look for each in found[name].findings if each.look.cause == "tilt"] for name in ("ax", "ay")}
+    for name, other, sign, truth in (("ax", "y", 1.0, 0.3), ("ay", "x", -1.0, -0.5)):
+        (look,) = looks[name]
+        size, angle = look.estimate["amplitude"]["median"], look.estimate[f"angle_{other}_deg"]
+        assert angle["median"] == pytest.approx(sign * math.degrees(size / g), rel=2e-3)
+        assert abs(angle["median"] - truth) < 4.0 * angle["sd"]
 
 
 def test_what_is_no_turn_is_a_step() -> None:

@@ -31,6 +31,7 @@ from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Missing, Record, of_recording
+from selfcal.diagnosis.words import named
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import load
@@ -338,7 +339,8 @@ def test_small_findings_are_folded_whatever_their_evidence(case: Case) -> None:
     findings, events = [], []
     for name, gain in nats.items():
         own = {"cause": name, "record_next": f"Mend the {name} one.", "evidence_nats": gain}
-        events.append({**event, **own, "id": name, "material": name != "strong"})
+        sizes = {"axes": {"gx": {"estimate": {}, "probability": 1.0}}, "estimate": {}}
+        events.append({**event, **own, **sizes, "id": name, "material": name != "strong"})
         box = {"of": name, "words": f"A {name} one.", "evidence_gain_nats": gain, "net_nats": gain}
         findings.append({**entry["findings"][0], **own, **box})
     axis = {**entry, "findings": findings, "material": ["near", "weak"]}
@@ -382,7 +384,7 @@ def test_every_part_of_the_page_is_there(case: Case) -> None:
         assert heading in text
     assert "selfcal diagnose '" in text and "made here.csv' --report report.html" in text
     for row in case.document["axes"]["gy"]["not_found"]:
-        assert row["cause"].replace("_", " ") in text
+        assert named(row["cause"]) in text
 
 
 def test_the_commands_on_the_page_reproduce_it(tmp_path: Path) -> None:

@@ -28,8 +28,8 @@ from selfcal.model.file import Group
 
 _Floats = NDArray[np.float64]
 
-#: The parameter of coloured noise, and the sizes of drifts.
-COLOURED, _SIZES = "spectral_ratio", ("K", "sigma_m", "B")
+#: The parameter of coloured noise.
+COLOURED = "spectral_ratio"
 #: Number of draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
 _DRAWS, _PER_OCTAVE = 256, 16
 #: Longest rest that is looked at, in lengths of the record, and halvings of its logarithm: to 2 %.
@@ -101,19 +101,28 @@ def summarize(
         "bias_instability": _number(floor / units.FLICKER_FLOOR, w),
     }
     if float(w[q > 0.0].sum()) >= _SURE:
-        of_Q = sum(law.probability for law in laws if COLOURED in law.estimates and law.estimates[COLOURED].identified)
+        of_Q = sum(law.probability for law in laws if COLOURED in _identified(law))
         Q = _number(q, w)
         numbers["quantization_noise"] = Q if of_Q > 0.5 * sum(law.probability for law in laws) else _without(Q, WIDE)
-    # Laws with a drift: whether each size of it is identified.
-    sizes = [(law.probability, [e.identified for key, e in law.estimates.items() if key in _SIZES]) for law, _ in sound]
-    drifts = sum(share for share, each in sizes if each)
-    left_open = sum(share for share, each in sizes if each and not any(each)) > 0.5 * drifts
+    known = [(law.probability, law.estimates.keys(), {*_identified(law)}) for law, _ in sound]
+
+    def left_open(*sizes: set[str]) -> bool:
+        """Whether most laws with a drift leave it open: no set of these is identified whole."""
+        own = [
+            (share, any(each <= sure for each in sizes)) for share, keys, sure in known if keys & set().union(*sizes)
+        ]
+        return sum(share for share, sure in own if not sure) > 0.5 * sum(share for share, _ in own)
+
     rrw, why = numbers["rrw"].estimate, ""
     if more >= SURE:
         why = ONE_OVER_F
     elif float(w_walk[walk > 0.0].sum()) < _SURE:
         why = NO_WALK if max(result.probability.values()) >= _SURE else NOT_DECIDED
-    elif left_open or math.log(rrw.q95 / rrw.q05) > HALF_90 * group.priors["K"].ln_sd:  # half the prior's sd
+    elif (
+        left_open({"K"}, {"sigma_m", "alpha"})
+        or math.log(rrw.q95 / rrw.q05) > HALF_90 * group.priors["K"].ln_sd  # half the prior's sd
+        or rrw.q95 - rrw.q05 > 2.0 * rrw.median  # it reaches as far as to nothing
+    ):
         why = WIDE
     if why:
         # Its limit holds if there is a walk, however little a law with one counts.
@@ -125,9 +134,13 @@ def summarize(
     if float(w[side == 0].sum()) < _SURE:
         reason = BELOW if float(w[side < 0].sum()) > 0.5 else NO_MINIMUM
         numbers["bias_instability"] = _without(numbers["bias_instability"], reason)
-    elif left_open:  # then the prior of the drift makes the minimum
+    elif left_open({"K"}, {"sigma_m"}, {"B"}):  # then the prior of the drift makes the minimum
         numbers["bias_instability"] = _without(numbers["bias_instability"], WIDE)
     return numbers
+
+
+def _identified(law: Beside) -> list[str]:
+    return [name for name, estimate in law.estimates.items() if estimate.identified]
 
 
 def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:

@@ -6,12 +6,15 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
+
+from rich.markup import escape
 
 from selfcal.bank.result import bias_of, likeliest, sd_of
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, table_of
+from selfcal.diagnosis import words
+from selfcal.diagnosis.events import parted
 
 SCHEMA = "selfcal.compare/1"
 #: Least difference that counts, in standard deviations: 1 in 1600 quantities exceeds it by chance.
@@ -146,33 +149,31 @@ def compared_of(
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
-    """Print a line a change, the largest first, then the findings of each recording that matter."""
-    from selfcal.show.comparison_page import told_of
+    """Print for each pair of recordings a line a change, the largest first, then the findings of each recording that
+    matter, as `diagnose` tells them."""
+    from selfcal.show.comparison_page import names_of, told_of
 
-    console = console_of(to_stderr=to_stderr)
-    headings = ("axes", "quantity", "before", "after", "unit", "sd apart", "recordings")
-    table = table_of(headings, "changes beyond what the recordings leave open")
-    rows = told_of(document)
-    for row in rows:
-        logs = f"{Path(row.change['from']).name} -> {Path(row.change['to']).name}"
-        distance = f"{row.change['distance_sd']:+.1f}" if "distance_sd" in row.change else ""
-        before, after = (row.side(name, "-") for name in ("before", "after"))
-        quantity = row.change["quantity"].replace("_", " ")
-        table.add_row(row.axes, quantity, before, after, row.unit, distance, printable(logs))
-    if rows:
-        console.print(table)
+    console, names = console_of(to_stderr=to_stderr), names_of(document)
+
+    def say(line: str) -> None:
+        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
+
     errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}
-    if not rows:
-        which = [name for name in document["axes"] if name not in errors] if errors else []
-        console.print(f"{', '.join(which)}{': ' if which else ''}nothing changed beyond what the recordings leave open")
-    for log, verdicts in document["verdicts"].items():
-        on: dict[str, list[str]] = {}
-        for name, judged in verdicts.items():
-            for cause in judged.get("causes", ()):
-                if cause in (*judged["material"], "unexplained"):
-                    on.setdefault(cause.replace("_", " "), []).append(name)
-        findings = "; ".join(f"{cause} on {' '.join(names)}" for cause, names in on.items())
-        line = f"{printable(Path(log).name)}: {findings or 'no finding that matters'}"
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+    which = ", ".join(name for name in document["axes"] if name not in errors) + ": " if errors else ""
+    for (first, second), rows in told_of(document).items():
+        pair = f"{names[first]} -> {names[second]}"
+        if not rows:
+            say(f"{pair}: {which}nothing changed beyond what the recordings leave open")
+            continue
+        headings = ("axes", "quantity", "before", "after", "unit", "sd apart")
+        table = table_of(headings, escape(printable(f"{pair}: changes")))
+        for row in rows:
+            distance = f"{row.change['distance_sd']:+.1f}" if "distance_sd" in row.change else ""
+            sides = (row.side(name, "-") for name in ("before", "after"))
+            table.add_row(row.axes, words.quantity(row.change["quantity"]), *sides, row.unit, distance)
+        console.print(table)
+    for log, name in names.items():
+        shown, _ = parted([finding for finding in document["findings"] if finding["recording"] == log])
+        say(f"{name}: {'; '.join(map(words.what, shown)) or 'no finding that matters'}")
     for name, error in errors.items():
-        console.print(f"{name}: not compared: {printable(error)}", highlight=False, markup=False, soft_wrap=True)
+        say(f"{name}: not compared: {error}")

@@ -227,8 +227,9 @@ class Cause:
 
     @property
     def several(self) -> bool:
-        """Whether the simulator makes several of its effects on an axis: it has no member that holds one."""
-        return self.simulated.add is not None and not any(key.field for key in self.simulated.keys.values())
+        """Whether the simulator makes several of its effects on an axis: no member holds one, or all intervals do."""
+        keys = self.simulated.keys
+        return "intervals" in keys or (self.simulated.add is not None and not any(key.field for key in keys.values()))
 
 
 def shown(*names: str) -> Callable[[Look], Sequence[str]]:

@@ -115,7 +115,7 @@ def _finding(finding: Finding, record: Record, factor: float, unit: str, final: 
         # A density per unit: its logarithm moves with the unit.
         for key in ("before", "after"):
             held_out["log_score_per_sample"][key] -= math.log(factor)
-    factors = inflation(finding.before, finding.after)
+    factors = inflation(*finding.without_and_with)
     estimate = {key: _in_unit(value, inner, factor, unit) for key, value in look.estimate.items()}
     estimate |= {key: later(value, record.start_s) for key, value in estimate.items() if _is_time(key, value)}
     return {

@@ -2,8 +2,8 @@
 
 A finding is material where it moves a number that the user takes away: N, K or B of an axis by more than half of the
 stated 90 % interval and by 5 %; or the bias by half of its interval; or the error of the bias ahead by 5 %, on held-out
-time and beyond 2 sd. N, K and B without a finding come from the model that the loop had before it, with it from the one
-after it; the stated intervals are those of the extended model.
+time and beyond 2 sd. N, K and B without a finding are those of the final model less it, refitted; with it those of the
+final one. The stated intervals are those of the extended model.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood import work
 from selfcal.likelihood.heldout import HARM_SD, in_sd
-from selfcal.likelihood.state import interval, log_normal, mixture
+from selfcal.likelihood.state import State, interval, log_normal, mixture
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.readings.motion import joined
@@ -58,20 +58,12 @@ class Member:
     @cached_property
     def sides(self) -> tuple[dict[str, float], dict[str, float]]:
         """N, K and B without the finding and with it, in the recording's unit."""
-        before, after = self.finding.before, self.finding.after
-        old = {name: value * self.factor for name, value in numbers(before).items()}
-        if before is after:
-            return {**old, "N": old["N"] * self.plain}, old
-        new = {name: value * self.factor for name, value in numbers(after).items()}
-        if after.r is not before.r:  # the noise level is several: the one that is farthest from a single one's
-            levels = new["N"] * np.sqrt(np.quantile(after.r / before.r, ENDS))
-            new["N"] = float(max(levels, key=lambda level: abs(math.log(level / old["N"]))))
-        return old, new
+        return _sides(*self.finding.without_and_with, self.factor, self.plain)
 
     @cached_property
     def bias(self) -> float:
         """How far the finding moves the bias, in the recording's unit."""
-        before, after = self.finding.before, self.finding.after
+        before, after = self.finding.without_and_with
         with work.within(work.Work(lambda: False)):  # two passes: an end that was asked for keeps the result
             return 0.0 if before is after else (bias_ahead(after) - bias_ahead(before)) * self.factor
 
@@ -156,7 +148,8 @@ def add_findings(
         axis["causes"], axis["material"] = (sorted({event.cause for event in some}) for some in (own, material))
         axis["verdict"] = "inadequate" if material or UNEXPLAINED in axis["causes"] else "adequate"
         axis["small_findings"] = len(own) - len(material) - axis["causes"].count(UNEXPLAINED)
-        axis["numbers"] = _before_and_after(one, axis["unit"], known.get(name))
+        of_axis = [member for member in members if member.axis == name]
+        axis["numbers"] = _before_and_after(one, of_axis, axis["unit"], known.get(name))
 
 
 def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -> list[Event]:
@@ -211,6 +204,20 @@ def _differences(values: Array) -> float:
     steps = np.diff(values)
     steps = steps[np.isfinite(steps)]
     return float(np.sqrt(np.mean(steps**2))) if steps.size else 0.0
+
+
+def _sides(before: State, after: State, factor: float, plain: float) -> tuple[dict[str, float], dict[str, float]]:
+    """N, K and B by two models of an axis, times `factor`. `plain`: of N, by readings that no model has."""
+    old, new = ({name: value * factor for name, value in numbers(state).items()} for state in (before, after))
+    new["N"] *= math.sqrt(float(np.mean(after.r / before.r))) * _farthest(before, after)
+    return {**old, "N": old["N"] * plain}, new
+
+
+def _farthest(before: State, after: State) -> float:
+    """Times its mean that the noise level is where it is farthest from that: a finding may have made it several."""
+    ratio = after.r / before.r
+    ends = np.sqrt(np.quantile(ratio, ENDS) / ratio.mean())
+    return float(max(ends, key=lambda end: abs(math.log(end))))
 
 
 def _changes(event: Event, axis: str, unit: str, known: Identified | None) -> dict[str, Any]:
@@ -401,21 +408,24 @@ def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
     return in_sd(known) > HARM_SD if known else None
 
 
-def _before_and_after(one: Diagnosed, unit: str, known: Identified | None) -> dict[str, dict[str, Any]]:
-    """N, K and B of an axis: without any finding, as plain noise has them; and with all, as the extended model does."""
+def _before_and_after(
+    one: Diagnosed, members: Sequence[Member], unit: str, known: Identified | None
+) -> dict[str, dict[str, Any]]:
+    """N, K and B of an axis: without any finding, and with all, as the extended model has them where that is `known`.
+    Both are then in its measure: an axis without findings has one number."""
     factor = units.factor(one.state.unit, unit)
     if any("y" in finding.look.changes for finding in one.findings):  # the bank has the readings as they were read
         known = None
-    before, after = (numbers(state) for state in (one.first, one.state))
+    old, new = _sides(one.first, one.state, factor, math.prod(member.plain for member in members))
     found: dict[str, dict[str, Any]] = {}
     for name, key in SUMMARY.items():
-        own = {"before": before[name] * factor, "unit": units.parameter_unit(key, unit)}
-        if known is None or key not in known.summary:
-            found[name] = {**own, "after": {"median": after[name] * factor, "identified": after[name] > 0.0}}
-            continue
-        number = known.summary[key].estimate.scaled(units.factor(known.group_unit, unit))
-        kept = {part: getattr(number, part) for part in ("median", "q05", "q95", "identified")}
-        found[name] = {**own, "after": kept}
+        after: dict[str, Any] = {"median": new[name], "identified": new[name] > 0.0}
+        if known is not None and key in known.summary:
+            level = _farthest(one.first, one.state) if name == "N" else 1.0  # the bank has the mean one
+            number = known.summary[key].estimate.scaled(units.factor(known.group_unit, unit) * level)
+            after = {part: getattr(number, part) for part in ("median", "q05", "q95", "identified")}
+        measure = after["median"] / new[name] if after["identified"] and new[name] else 1.0
+        found[name] = {"before": old[name] * measure, "unit": units.parameter_unit(key, unit), "after": after}
     return found
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
 
 from selfcal.diagnosis.hidden import Hidden
 from selfcal.diagnosis.record import Record
@@ -20,7 +22,8 @@ UNEXPLAINED = "unexplained"
 class Finding:
     """One named cause on one axis. `partner`: the other axis, of a cause that two share. `held_out`: its gain, where
     the loop has asked for it. `event`: above 0, the one of several axes that it is a part of.
-    `record`: the means that it was found in, where its axis was looked at in every sample."""
+    `record`: the means that it was found in, where its axis was looked at in every sample. `ends`: the model with all
+    findings of its axis but this one, and with all of them, once the loop has both."""
 
     look: Look
     round: int
@@ -32,6 +35,27 @@ class Finding:
     held_out: HeldOut | None = None
     event: int = 0
     record: Record | None = None
+    ends: tuple[State, State] | None = None
+
+    @property
+    def without_and_with(self) -> tuple[State, State]:
+        """The model without it and with it: all others are in both. Those of its round where the loop was stopped."""
+        return self.ends or (self.before, self.after)
+
+    def ended(self, final: State) -> Finding:
+        """The same with its `ends`: what it added to the model of its round is taken out of the `final` one."""
+        before, after = self.before, self.after
+        if before is after or after is final:
+            return replace(self, ends=(final if before is after else before, final))
+        terms = {one.name: getattr(before.extras, one.name) for one in fields(before.extras)}
+        terms = {name: one for name, one in terms.items() if one != getattr(after.extras, name)}
+        less = final.without({column.name for column in self.columns}).refit(
+            y=np.where(np.isfinite(after.y), final.y + before.y - after.y, before.y),
+            r=final.r * (before.r / after.r),
+            extras=replace(final.extras, **terms),
+            fits=before.fits,  # from a drift that is nothing no climb begins
+        )
+        return replace(self, ends=(less, final))
 
     @property
     def columns(self) -> tuple[Regressor, ...]:

@@ -120,6 +120,7 @@ def diagnose_record(
             _measure(one)
 
     work.each(again, dict.fromkeys(name for names in settled for name in names))
+    tilt.settle(record, found)
     work.each(end, found)
     return found
 
@@ -130,9 +131,10 @@ def _stated(state: State) -> bool:
 
 
 def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
-    """What is left over, and the statistics of the model that the loop began with."""
+    """What is left over, each finding beside all others, and the statistics of the model that the loop began with."""
     advance(f"{one.state.axis}: statistics")
     _unexplained(one)
+    one.findings = [each if each.record is not None else each.ended(one.state) for each in one.findings]
     one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
 
 
@@ -178,8 +180,11 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
     for name, one in found.items():
         read = (*changed, *integrity.of_readings(record, name))
         one.findings.extend(Finding(look, 0, one.state, one.state) for look in read)
-        if name in handled:  # the motion that is left out already spoilt the first state
-            one.findings.append(Finding(motion.look_of(handled[name]), 0, one.first, states[name]))
+        for moved in handled[name].events if name in handled else ():  # left out already, and in the first state
+            spoilt = (
+                _with_motion(record, one.first, states[name], moved) if len(handled[name].events) > 1 else one.first
+            )
+            one.findings.append(Finding(motion.look_of(moved), 0, spoilt, states[name]))
         if name in gone:
             one.findings.append(Finding(gone[name], 0, one.state, states[name]))
     for name in states:
@@ -191,6 +196,15 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
         if name in found:
             found[name].state = states[name]
     return replace(record, axes=states)
+
+
+def _with_motion(record: Record, first: State, rest: State, moved: Moved) -> State:
+    """The state at `rest` with the readings of one event of its motion, as the `first` one has them."""
+    y, time = rest.y.copy(), record.time_s
+    for begin, end in moved.intervals:
+        inside = (time > begin - rest.dt) & (time < end + rest.dt)
+        y[inside] = first.y[inside]
+    return replace(first, y=y).refit()
 
 
 def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
@@ -262,7 +276,6 @@ def _give(
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     # An axis whose model has the column already has no look.
     looks = {name: look for name, look in looks.items() if look.shape is None or look.shape.regressors}
-    looks = tilt.of_steps(looks, {**states, **own})
     if sum(look.gain for look in looks.values()) < module.NAMED:  # what the axes know by now explains it
         return
     findings = {}
@@ -373,7 +386,8 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
             if harms:
                 (one.dropped if _free(best) else one.harmful).append(best)
                 looks = [look for look in looks if not look.repeats(best)]
-        idle = idle | set(waiting) if len(one.findings) >= BUSY else set()
+        causes_of = {(finding.round, finding.event, finding.look.cause) for finding in one.findings}  # motion once
+        idle = idle | set(waiting) if len(causes_of) >= BUSY else set()
         rivals = tuple(look for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
         possible = tuple(dict.fromkeys(look.cause for look in rivals))
         one.state = after

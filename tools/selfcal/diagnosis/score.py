@@ -226,14 +226,17 @@ def _mean(values: Array) -> float:
 
 def numbers(state: State) -> dict[str, float]:
     """N, K and B of plain white noise and random walk fitted beside the model of a state, in the axis' unit; 0 where
-    the record shows none. B is that of the model's flicker noise, else by the minimum of the Allan deviation."""
+    the record shows none, of N where the walk takes all. B is that of the model's flicker noise, else by the minimum of
+    the Allan deviation."""
     plain, best = next(fit for fit in state.fits if fit.terms.walk), state.best
-    N, K = plain.N_of_color, plain.K
+    N, K = 0.0 if plain.drowned else plain.N_of_color, plain.K
     # Drop a walk that moves less over the record than three times the mean's white noise.
     if not K * plain.duration_s > 3.0 * N:
         K = 0.0
     if best.terms.flicker:
-        return {"N": N, "K": K, "B": best.sigma * math.exp(best.value("ln_flicker"))}
+        B = best.sigma * math.exp(best.value("ln_flicker"))
+        # Drop flicker noise that is below the white noise of half the record.
+        return {"N": N, "K": K, "B": B * (B * FLICKER_FLOOR * math.sqrt(0.5 * plain.duration_s) > N)}
     return {"N": N, "K": K, "B": math.sqrt(2.0 * N * K / math.sqrt(3.0)) / FLICKER_FLOOR}
 
 

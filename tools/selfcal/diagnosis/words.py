@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -147,7 +146,9 @@ def _size(key: str, value: Any) -> str:
             return statistic(str(value))
         case "share":
             return f"share of the drift {value:.2g}"
-        case "input" | "source" | "measured" | "law" | "knots":
+        case "source":
+            return f"the source is {value}"
+        case "input" | "measured" | "law" | "knots":
             return ""
     if isinstance(value, list | tuple):
         return f"{label} {', '.join(str(one) for one in value)}"
@@ -162,20 +163,29 @@ def statistic(name: str) -> str:
 def sentence(cause: str, estimate: Mapping[str, Any]) -> str:
     """The cause with its size."""
     text = sizes(estimate)
-    begin = CAUSES[cause].unsure if "source" in estimate else CAUSES[cause].words
-    return f"{begin} {text[:1].upper()}{text[1:]}."
+    return f"{_begin(cause, estimate)} {text[:1].upper()}{text[1:]}."
+
+
+def _begin(cause: str, estimate: Mapping[str, Any]) -> str:
+    return CAUSES[cause].unsure if "source" in estimate else CAUSES[cause].words
 
 
 def event(finding: Mapping[str, Any]) -> str:
     """A finding of all axes in a sentence: the cause, what the axes have in common, and its size on each."""
     each = "; ".join(f"{axis}: {sizes(one['estimate'])}" for axis, one in finding["axes"].items() if one["estimate"])
     told = ". ".join(part[:1].upper() + part[1:] for part in (sizes(finding["estimate"]), each) if part)
-    return f"{CAUSES[finding['cause']].words} {told or 'On ' + ', '.join(finding['axes'])}."
+    return f"{_begin(finding['cause'], finding['estimate'])} {told or 'On ' + ', '.join(finding['axes'])}."
 
 
 def named(cause: str) -> str:
-    """A cause by its name."""
-    return LABELS.get(cause, cause.replace("_", " "))
+    """A cause by its name, or the id of one of several."""
+    of_several, _, number = cause.replace(" ", "_").rpartition("_")
+    return f"{named(of_several)} {number}" if number.isdecimal() else LABELS.get(cause, cause.replace("_", " "))
+
+
+def quantity(key: str) -> str:
+    """What two recordings are compared by: a number, or a size of a cause."""
+    return ", ".join(map(named, key.split(".")))
 
 
 def what(finding: Mapping[str, Any]) -> str:
@@ -204,7 +214,7 @@ def _by_unit(values: Sequence[tuple[str, float, str]]) -> str:
     for unit in dict.fromkeys(unit for _, _, unit in values):
         own = [(axis, value) for axis, value, of in values if of == unit]
         if len(own) > 2:
-            text = _range([abs(value) for _, value in own])
+            text = _range([value for _, value in own])
         else:
             text = ", ".join(f"{axis} {ratio(value)}" for axis, value in own)
         told.append(f"{text} {unit}")
@@ -230,7 +240,7 @@ def _off(factors: Sequence[float]) -> str:
 
 
 def effects(finding: Mapping[str, Any]) -> str:
-    """How far numbers are off without it, where by as much as matters, and whether time that the fit did not see
+    """How far numbers are off without it alone, where by as much as matters, and whether time that the fit did not see
     confirms it."""
     told = []
     changes = finding["changes"]
@@ -244,10 +254,10 @@ def effects(finding: Mapping[str, Any]) -> str:
     if moved:
         told.append(f"bias off by {_by_unit(moved)}")
     rows = [one["bias_error"] for one in changes.values() if "bias_error" in one["material"]]
-    more = [(row["before"] / row["after"] - 1.0, horizon) for one in rows for horizon, row in one.items()]
+    more = [(row["before"] / row["after"], horizon) for one in rows for horizon, row in one.items()]
     if more:
         most, horizon = max(more)
-        told.append(f"bias error {horizon} s ahead {100.0 * most:.0f} % larger")
+        told.append(f"bias error {horizon} s ahead {_off([most])}")
     seen = []
     if finding["confirmed"] is False:
         cause = CAUSES.get(finding["cause"])
@@ -256,25 +266,6 @@ def effects(finding: Mapping[str, Any]) -> str:
     if finding.get("confirmed_on") is not None:
         seen.append("holds on the second recording" if finding["confirmed_on"] else "not seen on the second recording")
     return "; ".join([*([", ".join(told)] if told else []), *seen])
-
-
-def contrary(findings: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[str, Any]]) -> str:
-    """Why a number moves one way without a finding of the list and the other way in the table; "" where none does."""
-    told: dict[str, list[str]] = {}
-    for name, (axis, one) in itertools.product(("N", "K", "B"), axes.items()):
-        number = one["numbers"][name]
-        rise = number["after"]["median"] - number["before"] if number["after"]["identified"] else 0.0
-        own = [finding["changes"][axis] for finding in findings if axis in finding["changes"]]
-        own = [
-            change for change in own if name in change["material"] and (name != "B" or "K" not in change["material"])
-        ]
-        large = [change[name] > 1.0 for change in own if change[name]]
-        if (rise > 0.0 and True in large) or (rise < 0.0 and False in large):
-            told.setdefault(name, []).append(axis)
-    each = ", ".join(f"{name} of {' '.join(names)}" for name, names in told.items())
-    return (
-        f"{each}: the list leaves out one finding, the table all of them: these move it the other way" if each else ""
-    )
 
 
 def action(finding: Mapping[str, Any]) -> str:

@@ -51,6 +51,8 @@ LARGER = (
     (("ln_rho",), -7.0, ((-7.0,), (-5.5,))),
     (("ln_markov", "ln_alpha"), -5.0, ((-5.0, -7.0), (-5.0, -5.0), (-5.0, -3.0), (-5.0, -1.7))),
 )
+#: Logarithm of a drift over the white noise at which this is nothing.
+DROWNED = math.log(SIZE_LIMITS[1]) - 0.01
 #: Parameters that are logarithms of sizes.
 SIZES = (*DRIFT_SIZES, "ln_swing")
 
@@ -176,6 +178,11 @@ class Fit:
     def N(self) -> float:
         """White noise density, unit/sqrt(Hz)."""
         return self.sigma * math.sqrt(self.dt)
+
+    @property
+    def drowned(self) -> bool:
+        """Whether a drift leaves no white noise: a climb from there may not begin."""
+        return any(self.value(name) > DROWNED for name in self.terms.names if name in DRIFT_SIZES)
 
     @property
     def quantized(self) -> bool:

@@ -319,7 +319,8 @@ def gain_for(worth: Callable[[float], float]) -> float:
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
     same = [one for one in known if one.terms == terms]
     if same:
-        return refit(series, same[0])
+        again = refit(series, same[0])
+        return best([again, fit(series, terms)]) if again.drowned else again
     near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
     if near:
         return fit(series, terms, moved(near[0], terms))

@@ -12,7 +12,7 @@ have grown: an axis alone moves there where most of its readings are pushed.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
@@ -68,12 +68,13 @@ MARGIN_S, EDGE_S = 0.5, 5.0
 class Moved:
     """Motion of one axis: begin and end of its stretches in order, s, their `nats` over rest, and those `net` of the
     search. `ratio`: the readings in them about their level over the noise beside them, root mean square; not a number
-    where that is 0."""
+    where that is 0. `events`: the same of each event that the axis is in."""
 
     intervals: tuple[tuple[float, float], ...]
     nats: float
     net: float
     ratio: float
+    events: tuple[Moved, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -119,11 +120,19 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         for one in stretches(energy):
             for k in np.flatnonzero(one.axes).tolist():
                 found[names[k]].append(one)
+        times = {name: joined([_times(energy, one, recording) for one in found[name]]) for name in names}
+        events = events_of(times).values()
+
+        def within(k: int, spans: Sequence[tuple[float, float]]) -> Moved:
+            name = names[k]
+            own = [one for one in found[name] if _overlap(spans, *_times(energy, one, recording))]
+            moved = tuple(each for each in times[name] if _overlap(spans, *each))
+            nats, net = sum(float(one.nats[k]) for one in own), sum(one.net for one in own)
+            return Moved(moved, nats, net, _loudness(recording, name, energy, own, times[name]))
+
         for k, name in enumerate(names):
-            times = joined([_times(energy, one, recording) for one in found[name]])
-            nats = sum(float(one.nats[k]) for one in found[name])
-            ratio = _loudness(recording, name, energy, found[name], times)
-            seen[name] = Moved(tuple(times), nats, sum(one.net for one in found[name]), ratio)
+            each = tuple(within(k, spans) for spans in events)
+            seen[name] = replace(within(k, times[name]), events=tuple(one for one in each if one.intervals))
     return {name: one for name, one in seen.items() if one.intervals}
 
 
@@ -408,21 +417,42 @@ def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
 
 
 def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
-    """Whether the axes that moved share a source at rest, and it alone is loud where they moved. It is the direction in
-    which they are loudest, in units of the axes' joint noise at rest."""
-    parts = [energy.apart[k] for k in np.flatnonzero(np.any([one.axes for one in moved], axis=0))]
+    """Whether the axes that moved share a source at rest, each with another one, and it alone is loud where they moved.
+    It is the direction in which they are loudest, in units of the axes' joint noise at rest."""
+    axes = np.flatnonzero(np.any([one.axes for one in moved], axis=0))
+    parts = [energy.apart[k] for k in axes]
     if len({piece.size for _, piece in parts}) > 1:
         return False
     values, piece = np.array([part for part, _ in parts]), parts[0][1]
     inside = np.any([(piece >= one.begin) & (piece < one.end) for one in moved], axis=0)
     together = np.corrcoef(np.clip(values[:, ~inside], -WILD[0], WILD[0]))
-    if np.abs(together - np.eye(len(parts))).max() < SHARED + CORRELATED / math.sqrt(values.shape[1]):
+    linked = np.abs(together) > SHARED + CORRELATED / math.sqrt(values.shape[1])
+    linked = np.linalg.matrix_power(linked.astype(float), axes.size) > 0.0  # by others too
+    loudest = np.max([one.nats[axes] for one in moved], axis=0)
+    sure = loudest >= min(-math.log(SHARE), float(loudest.max()))
+    if not linked[np.ix_(sure, sure)].all() or (linked.sum(axis=1)[sure] == 1).any():
         return False
     size, vectors = np.linalg.eigh(together)
     loud_ones = vectors / np.sqrt(np.maximum(size, TINY)) @ vectors.T @ values[:, inside]
     mean = np.maximum(np.linalg.eigvalsh(loud_ones @ loud_ones.T) / np.count_nonzero(inside), 1.0)
     nats = 0.5 * np.count_nonzero(inside) / SQUARES * (mean - 1.0 - np.log(mean))
     return float(nats[:-1].sum()) < -math.log(SHARE)
+
+
+def events_of(
+    intervals: Mapping[str, Sequence[tuple[float, float]]],
+) -> dict[tuple[str, ...], list[tuple[float, float]]]:
+    """Events by their axes, of the intervals of each axis: those that meet are one, and those of the same axes are one
+    again."""
+    found: dict[tuple[str, ...], list[tuple[float, float]]] = {}
+    for each in joined([each for own in intervals.values() for each in own]):
+        names = tuple(name for name, own in intervals.items() if _overlap(own, *each))
+        found.setdefault(names, []).append(each)
+    return found
+
+
+def _overlap(intervals: Sequence[tuple[float, float]], begin: float, end: float) -> bool:
+    return any(a <= end and begin <= b for a, b in intervals)
 
 
 def joined(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:

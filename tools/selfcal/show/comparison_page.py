@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,7 @@ def write_page(path: Path | str, document: Mapping[str, Any], curves: Curves) ->
 
 def page(document: Mapping[str, Any], curves: Curves) -> str:
     """The page of a document `selfcal.compare/1`."""
-    recordings = document["recordings"]
-    short = [Path(log).name for log in recordings]  # whole paths where two names are equal
-    names = dict(zip(recordings, short if len(set(short)) == len(short) else recordings, strict=True))
+    names = names_of(document)
     axes = [_axis(name, entry, document, curves.get(name, {}), names) for name, entry in document["axes"].items()]
     title = f"Comparison of {' and '.join(names.values())}"
     values = {"document": document, "title": title, "names": names, "axes": axes, "changes": told_of(document)}
@@ -68,19 +67,28 @@ class Told:
         return ", ".join(f"{size:.{digits}g}{unit}" for size, unit in zip(sizes, units, strict=True))
 
 
-def told_of(document: Mapping[str, Any]) -> list[Told]:
-    """The lines of all axes: causes that appeared or are gone, on all their axes; then numbers by their distance."""
-    causes: dict[tuple[str, ...], list[tuple[str, Mapping[str, Any]]]] = {}
-    numbers: list[tuple[str, Mapping[str, Any]]] = []
-    for name, entry in document["axes"].items():
-        for change in entry["changes"] if isinstance(entry, Mapping) else entry:
-            if change["what"] == "changed":
-                numbers.append((name, change))
-            else:
-                kind = tuple(change[key] for key in ("from", "to", "quantity", "what"))
-                causes.setdefault(kind, []).append((name, change))
-    numbers.sort(key=lambda row: -abs(row[1]["distance_sd"]))
-    return [Told(rows) for rows in causes.values()] + [Told([row]) for row in numbers]
+def names_of(document: Mapping[str, Any]) -> dict[str, str]:
+    """The recordings by their file names; by whole paths where two names are equal."""
+    logs = document["recordings"]
+    short = [Path(log).name for log in logs]
+    return dict(zip(logs, short if len(set(short)) == len(short) else logs, strict=True))
+
+
+def told_of(document: Mapping[str, Any]) -> dict[tuple[str, str], list[Told]]:
+    """By pair of recordings the lines of all axes: causes that appeared or are gone, on all their axes; then numbers by
+    their distance."""
+    found = {}
+    for pair in pairwise(document["recordings"]):
+        causes: dict[tuple[str, str], list[tuple[str, Mapping[str, Any]]]] = {}
+        far: list[tuple[str, Mapping[str, Any]]] = []
+        for name, entry in document["axes"].items():
+            for change in entry["changes"] if isinstance(entry, Mapping) else entry:
+                if (change["from"], change["to"]) == pair:
+                    kind = change["quantity"], change["what"]
+                    (far if kind[1] == "changed" else causes.setdefault(kind, [])).append((name, change))
+        far.sort(key=lambda row: -abs(row[1]["distance_sd"]))
+        found[pair] = [*map(Told, causes.values()), *(Told([row]) for row in far)]
+    return found
 
 
 @dataclass(frozen=True)

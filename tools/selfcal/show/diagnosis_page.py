@@ -19,6 +19,7 @@ from markupsafe import Markup
 from selfcal.base import units
 from selfcal.base.ending import Stopped
 from selfcal.base.output import write_text
+from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted, times_of
 from selfcal.diagnosis.extend import fitted_law
 from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
@@ -27,7 +28,7 @@ from selfcal.diagnosis.statistics import Statistic
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outside_of, strips
 from selfcal.show.findings import before_after, notes
-from selfcal.show.template import number, render, spaced
+from selfcal.show.template import number, render
 
 #: Length of the line in place of a picture, bytes.
 LINE = 140
@@ -79,7 +80,7 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "boxes_of": lambda finding: [
             (axis.name, k) for axis in axes if (k := axis.first_of(finding["id"], "of")) is not None
         ],
-        "notes": notes(shown, results),
+        "notes": notes(results),
         "readings": _readings(shown, axes) if axes else "",
         "causes": list({str(finding["cause"]): None for _, finding in gains}),
         "gains": gains,
@@ -319,7 +320,7 @@ def _least(key: str, value: Any) -> str:
     unit = "" if estimate.get("unit") in (None, "1") else f" {estimate['unit']}"
     size = estimate.get("value", estimate.get("median"))
     text = number(float(size), 3) if isinstance(size, int | float) else str(size)
-    return f"{spaced(key.removesuffix('_hz').removesuffix('_s'))} {text}{unit}"
+    return f"{words.named(key.removesuffix('_hz').removesuffix('_s'))} {text}{unit}"
 
 
 def _given(options: Options, leave: Sequence[str] = ()) -> str:

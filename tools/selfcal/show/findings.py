@@ -45,8 +45,8 @@ def show(
         console.print(_events(shown))
     if axes:
         console.print(_numbers(axes))
-        say("without -> with the findings: medians ± half of the 90 % interval; –: looked for, not identified")
-    for line in notes(shown, axes):
+        say("without any finding -> with all: medians ± half of the 90 % interval; –: looked for, not identified")
+    for line in notes(axes):
         say(line)
     if less:
         say(words.small(less) + ("" if details else " (--details)"))
@@ -72,14 +72,10 @@ def verdict(axis: Mapping[str, Any]) -> str:
     return text + (f"; the model states {', '.join(axis['stated'])}" if axis.get("stated") else "")
 
 
-def notes(shown: Sequence[Mapping[str, Any]], axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Lines on the table of numbers: what moves the other way in the list of findings, and the axes that are noisier
-    than their siblings."""
-    axes = {name: axis for name, axis in axes.items() if "numbers" in axis}
-    noise = {name: axis["numbers"]["N"] for name, axis in axes.items()}
-    noise = {name: N for name, N in noise.items() if "q05" in N["after"]}
-    lines = noisier({name: {**N["after"], "unit": N["unit"]} for name, N in noise.items()})
-    return [*filter(None, [words.contrary(shown, axes)]), *lines]
+def notes(axes: Mapping[str, Mapping[str, Any]]) -> list[str]:
+    """Lines on the table of numbers: the axes that are noisier than their siblings."""
+    noise = {name: axis["numbers"]["N"] for name, axis in axes.items() if "numbers" in axis}
+    return noisier({name: {**N["after"], "unit": N["unit"]} for name, N in noise.items() if "q05" in N["after"]})
 
 
 def _events(findings: Sequence[Mapping[str, Any]]) -> Table:

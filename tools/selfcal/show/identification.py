@@ -21,6 +21,7 @@ from selfcal.base.output import TABLE_WIDTH, console_of, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
+from selfcal.readings.motion import events_of
 from selfcal.readings.rest import MOST_LISTED
 
 Reason = TypeVar("Reason", str, tuple[str, str])
@@ -176,7 +177,7 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
             return f"turn_on: {text}: K includes that"
         case "jump":
             return f"jump: the bias jumps at {outcome['time_s']:.6g} s, by {nats} nats: K includes that"
-    return f"{check} {value:+.3f}, beyond ±{outcome['limit']:.3f}"
+    return _range_of(check, [outcome])
 
 
 def _times(intervals: Sequence[Sequence[float]]) -> str:
@@ -251,14 +252,12 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
     failed += _not_adequate(axes)
-    for said, chosen in (("identified with", True), ("strongest suspicion", False)):
-        suspected = _by_reason(
-            (axis["suspicion"].replace("_", " "), name)
-            for name, axis in axes.items()
-            if "suspicion" in axis and ("added_law" in axis) is chosen
-        )
-        if suspected:
-            failed.append(f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in suspected.items())}")
+    suspicions = {name: axis["suspicion"] for name, axis in axes.items() if "suspicion" in axis}
+    for said, chosen in (("identified with", True), ("strongest suspicion", False)) if suspicions else ():
+        from selfcal.diagnosis.words import named  # it takes a second
+
+        of = _by_reason((named(one), name) for name, one in suspicions.items() if ("added_law" in axes[name]) is chosen)
+        failed += [f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in of.items())}"] if of else []
     more = _by_reason(
         (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > 0.01), name)
         for name, more in ((name, axis["more_laws"]) for name, axis in axes.items() if "more_laws" in axis)
@@ -274,34 +273,36 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
 
 def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
     """Checks that name an event or source, with the axes and their outcomes: those that speak against the laws, or the
-    stretches of time that are left out and `passed`. Each stretch is an event, those of the same axes are one again."""
+    stretches of time that are left out and `passed`."""
     events: list[_Event] = []
+    lasting: dict[str, dict[str, Mapping[str, Any]]] = {}
     for name, axis in axes.items():
         for check, outcome in axis["checks"].items():
             if outcome["passed"] is not passed or check.startswith(STATISTICS) or passed > ("intervals" in outcome):
                 continue
-            for part in [{**outcome, "intervals": [each]} for each in outcome.get("intervals", ())] or [outcome]:
-                same = next((event for event in events if event[0] == check and _same(check, event[2][0], part)), None)
-                if same is None:
-                    events.append(same := (check, [], []))
-                same[1].extend([name] if name not in same[1] else [])
-                same[2].append(part)
-    merged: dict[Any, _Event] = {}
-    for k, (check, names, outcomes) in enumerate(events):
-        event = merged.setdefault((check, *names) if "intervals" in outcomes[0] else k, (check, names, []))
-        if "intervals" not in outcomes[0]:
-            event[2].extend(outcomes)
-            continue
-        begins, ends = zip(*(outcome["intervals"][0] for outcome in outcomes), strict=True)
-        before = event[2][0]["intervals"] if event[2] else []
-        event[2][:] = [{**outcomes[0], "intervals": [*before, [min(begins), max(ends)]]}]
-    return list(merged.values())
+            if "intervals" in outcome:
+                lasting.setdefault(check, {})[name] = outcome
+                continue
+            same = next((event for event in events if event[0] == check and _same(check, event[2][0], outcome)), None)
+            if same is None:
+                events.append(same := (check, [], []))
+            same[1].append(name)
+            same[2].append(outcome)
+    for check, outcomes in lasting.items():
+        for names, intervals in events_of({name: one["intervals"] for name, one in outcomes.items()}).items():
+            events.append((check, [*names], [{**outcomes[names[0]], "intervals": intervals}]))
+    return events
 
 
 def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
     """Evidence against the laws: a line an event or source, which covers the statistics of its axes."""
     events = _events(axes, passed=False)
     named = {name for _, names, _ in events for name in names}
+    once = [{*names} for check, names, _ in events if check in ("turn_on", "jump")]
+    # An axis goes like another one by an event of both.
+    events = [
+        one for one in events if one[0] != "channel" or not any({one[2][0]["column"], *one[1]} <= both for both in once)
+    ]
     lines = []
     for check, names, outcomes in events:
         values = [
@@ -310,28 +311,44 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
         nats = values[0] if values[0] == values[-1] else f"{values[0]} to {values[-1]}"
         text = _why(check, outcomes[0], axes[names[0]]["bias_now"]["unit"], nats)
         lines.append(f"not adequate: {', '.join(names)}: {text}")
-    beside = []
+    beside: list[str] = []
+    alike: dict[tuple[str, ...], list[str]] = {}  # axes by the statistics that they fail
     for name, axis in axes.items():
-        failed = {check: outcome for check, outcome in axis["checks"].items() if not outcome["passed"]}
-        unit = axis["bias_now"]["unit"]
-        # The model's deviation over the recording's, by averaging time.
-        off = [
-            (100.0 * outcome["value"], check.removeprefix("allan_"))
-            for check, outcome in failed.items()
-            if check.startswith("allan_")
-        ]
-        if name in named:
+        off = _off(axis)
+        failed = [check for check in _failed(axis) if not check.startswith("allan_")] + ["allan"] * bool(off)
+        if name in named and failed:
             most, tau = max(off, key=lambda share: abs(share[0]), default=(0.0, ""))
-            if any(check.startswith(STATISTICS) for check in failed):
-                beside.append(name + (f" (allan_{tau} model {most:+.0f} %)" if off else ""))
-            continue
-        own = [_why(check, outcome, unit, "") for check, outcome in failed.items() if not check.startswith("allan_")]
-        if off:  # allan_16s model -9 %, 128s +22 %
-            own.append("allan_" + ", ".join(f"{tau} {most:+.0f} %" for most, tau in off).replace(" ", " model ", 1))
-        lines += [f"not adequate: {name}: {text}" for text in own]
-    if beside:
-        lines.append(f"not adequate: statistics of {', '.join(beside)} as well")
-    return lines
+            beside.append(name + f" (allan_{tau} model {most:+.0f} %)" * bool(off))
+        elif failed:
+            alike.setdefault(tuple(failed), []).append(name)
+    for checks, names in alike.items():
+        told = [_range_of(one, [axes[name]["checks"][one] for name in names]) for one in checks if one != "allan"]
+        off = [each for name in names for each in _off(axes[name])]
+        each = off if len(names) == 1 else [min(off), max(off)]  # allan_16s model -9 %, 128s +22 %
+        told += (
+            [f"allan_{', '.join(f'{tau} {most:+.0f} %' for most, tau in each).replace(' ', ' model ', 1)}"]
+            if off
+            else []
+        )
+        lines.append(f"not adequate: {', '.join(names)}: {'; '.join(told)}")
+    return [*lines, *([f"not adequate: statistics of {', '.join(beside)} as well"] if beside else [])]
+
+
+def _failed(axis: Mapping[str, Any]) -> list[str]:
+    """Statistics of an axis that speak against its law."""
+    return [check for check, one in axis["checks"].items() if check.startswith(STATISTICS) and not one["passed"]]
+
+
+def _off(axis: Mapping[str, Any]) -> list[tuple[float, str]]:
+    """The model's Allan deviation over the recording's less 1, percent, and its averaging time, where that fails."""
+    failed = [check for check in _failed(axis) if check.startswith("allan_")]
+    return [(100.0 * axis["checks"][check]["value"], check.removeprefix("allan_")) for check in failed]
+
+
+def _range_of(check: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
+    values = [outcome["value"] for outcome in outcomes]
+    ends = " to ".join(dict.fromkeys(f"{end(values):+.3f}" for end in (min, max)))
+    return f"{check} {ends}, beyond ±{outcomes[0]['limit']:.3f}"
 
 
 def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
@@ -343,9 +360,6 @@ def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
             return True
         case "channel":
             return bool(a["column"] == b["column"])
-        case "motion" | "stuck":
-            (begin, end), (other, last) = a["intervals"][0], b["intervals"][0]
-            return bool(begin <= last and other <= end)
     return False
 
 

@@ -373,10 +373,11 @@ class Diagnosis(Document):
 
 class Comparison(Document):
     """`selfcal.compare/1`. By axis the list of its changes, or {"error": ..., "changes": [...]}; `verdicts` by
-    recording and axis."""
+    recording and axis; `findings` of all recordings, each with its `recording`."""
 
     schema: str
     recordings: list[str]
+    findings: list[Event]
     axes: dict[str, Any]
     verdicts: dict[str, dict[str, Any]]
 

@@ -41,11 +41,6 @@ def interval(estimate: Mapping[str, Any] | None) -> str:
     return f"{sign}{number(estimate['median'], 3)}{limits} {typeset(str(estimate['unit']))}"
 
 
-def spaced(key: str) -> str:
-    """A key or a cause in words."""
-    return key.replace("_", " ")
-
-
 def shortened(text: str) -> str:
     """A name or a reason from a file, on one line of at most LONGEST letters."""
     shown = printable(text)
@@ -56,7 +51,7 @@ def shortened(text: str) -> str:
 def _environment() -> Environment:
     folder = FileSystemLoader(Path(__file__).parent / "templates")
     made = Environment(loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True)
-    made.filters |= {function.__name__: function for function in (number, interval, spaced, shortened, typeset)}
+    made.filters |= {function.__name__: function for function in (number, interval, shortened, typeset, words.named)}
     made.filters["tenth"] = "{:.1f}".format
     made.globals |= {"words": words, "version": selfcal.__version__}
     return made

@@ -46,10 +46,10 @@ def compare(
     """Identify and diagnose each of `logs`, and compare each with the one before it.
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
-    distance in standard deviations; the `verdicts` by recording and axis; and the `quantities` that were set beside
-    each other, by recording, axis and name. An axis that two successive recordings do
-    not both have, judged and in the same unit, is {"error": ..., "changes": [...]}.
-    `fail_on` is only checked here.
+    distance in standard deviations; the `findings` of each recording as `diagnose` has them, with its `recording`; the
+    `verdicts` by recording and axis; and the `quantities` that were set beside each other, by recording, axis and name.
+    An axis that two successive recordings do not both have, judged and in the same unit, is {"error": ..., "changes":
+    [...]}. `fail_on` is only checked here.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     from selfcal.base.ending import Held
@@ -71,6 +71,7 @@ def compare(
     check_writable(json, report, junit, verdicts, inputs=(*files, model, limits))
     bounds = None if limits is None else Limits.load(limits, Model.load(model))
     seen = []
+    findings: list[dict[str, Any]] = []
     judged: list[Judged] = []
     by_log: dict[str, dict[str, Any]] = {}
     curves: dict[str, dict[str, Any]] = {}
@@ -86,7 +87,9 @@ def compare(
         if bounds is not None:
             add_verdicts(known, bounds, None, None)
             judged.append(("", path, [Verdict.of(entry) for entry in known["limits"]]))
-        diagnosed = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)["axes"]
+        diagnosis = diagnose(log, decimate=decimate, full_rate=decimate is None, **part)
+        diagnosed = diagnosis["axes"]
+        findings += [{**finding, "recording": path} for finding in diagnosis.get("findings", ())]
         Held().check()
         by_log[path] = {
             name: verdict(identified.get(name, {}), diagnosed.get(name, {})) for name in identified | diagnosed
@@ -99,6 +102,7 @@ def compare(
     document = {
         "schema": SCHEMA,
         "recordings": names,
+        "findings": findings,
         "axes": {name: axis.entry() for name, axis in compared.items()},
         "verdicts": by_log,
         "quantities": dict(zip(names, seen, strict=True)),

@@ -60,7 +60,12 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     partners = _partners(found)
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
-        if back is None:
+        if back is None:  # of the two ways the model file may state the other one
+            source = found[other].state if other in found else record.axes[other]
+            known = source.best.ln_likelihood - without(source, name).best.ln_likelihood
+            if known > finding.look.gain - ALIKE:
+                _drop(found[name], finding, without(found[name].state, other))
+                changed.append(name)
             continue
         ahead: float = back.look.gain - finding.look.gain
         if abs(ahead) < ALIKE:
@@ -175,7 +180,7 @@ def _is_late(final: State, finding: Finding, values: Array) -> bool:
 def without(state: State, other: str) -> State:
     """The state without the columns of another axis."""
     kept = tuple(one for one in state.regressors if one.cause != "cross_axis" or one.entry["column"] != other)
-    return state.refit(regressors=kept)
+    return state if len(kept) == len(state.regressors) else state.refit(regressors=kept)
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:

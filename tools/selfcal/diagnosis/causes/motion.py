@@ -6,7 +6,7 @@ from typing import Any
 
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, counted, shown
 from selfcal.likelihood.state import Look
-from selfcal.readings.motion import Moved
+from selfcal.readings.motion import Moved, events_of
 
 
 def look_of(moved: Moved) -> Look:
@@ -15,6 +15,11 @@ def look_of(moved: Moved) -> Look:
     size = {"ratio": {"median": moved.ratio, "unit": "1"}} if moved.ratio > 0.0 else {}
     when = (intervals[0][0], intervals[-1][1])
     return Look("motion", moved.nats, moved.net, {"intervals": intervals, **size}, {}, when=when)
+
+
+def _meet(a: Look, b: Look) -> bool:
+    """Whether two axes moved at one time."""
+    return len(events_of({"a": a.estimate["intervals"], "b": b.estimate["intervals"]})) == 1
 
 
 def _seconds(value: float) -> str:
@@ -31,7 +36,7 @@ CAUSE = Cause(
     "Record on a heavy table, away from traffic.",
     source="handling",
     pictures=shown("largest", "fine_level"),
-    grouping=Grouping(alike=lambda a, b: True),
+    grouping=Grouping(alike=_meet),
     score=Scored(once="motion is an event of its recording"),
     simulated=Simulated(
         keys={

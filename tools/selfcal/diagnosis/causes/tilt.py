@@ -6,7 +6,6 @@ A small turn theta of the sensor changes the specific force f by f x theta. Two 
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -31,25 +30,34 @@ EXPLAINED = 0.9
 ABOUT_S, SURE = 3.0, 3.0
 
 
-def of_steps(looks: Mapping[str, Look], states: Mapping[str, State]) -> dict[str, Look]:
-    """The looks at one event of several axes: where that is a step that a turn of the sensor explains, looks at the
-    turn."""
-    seen = _turn_of(looks, states) if len(looks) > 1 else None
-    if seen is None:
-        return dict(looks)
-    angles, sure = seen
-    others = () if sure else (step.CAUSE.id,)
-    return {
-        name: replace(look, cause="tilt", estimate={**look.estimate, **angles}, others=(*look.others, *others))
-        for name, look in looks.items()
-    }
+def settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
+    """Name the steps of one event a turn of the sensor, where their sizes beside all other findings are one. A step of
+    one accelerometer may be a turn about one axis: gravity moves on the others by its square alone."""
+    states = {**record.axes, **{name: one.state for name, one in found.items()}}
+    events: dict[int | str, dict[str, int]] = {}
+    for name, one in found.items():
+        for k, finding in enumerate(one.findings):
+            if finding.look.cause == step.CAUSE.id and finding.record is None:
+                events.setdefault(finding.event or f"{name} {k}", {})[name] = k
+    for event in events.values():
+        looks = {name: found[name].findings[k].look for name, k in event.items()}
+        seen = _turn_of(looks, states)
+        if seen is None:
+            continue
+        angles, sure = seen
+        others = () if sure else (step.CAUSE.id,)
+        for name, look in looks.items():
+            own: dict[str, Any] = {"others": (CAUSE.id,)}
+            if len(event) > 1:
+                own = {"cause": CAUSE.id, "estimate": {**look.estimate, **angles}, "others": (*look.others, *others)}
+            k = event[name]
+            found[name].findings[k] = replace(found[name].findings[k], look=replace(look, **own))
 
 
 def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[dict[str, Any], bool] | None:
     """The angles of the turn that explains the steps of one event, and whether the gyroscopes show it; None: none."""
     force = _specific_force(states)
-    steps = all(look.cause == step.CAUSE.id for look in looks.values())
-    if force is None or not steps or not looks.keys() <= force.keys():
+    if force is None or not looks.keys() <= force.keys():
         return None
     axes = list(force)
     f = np.array([force[name][0] for name in axes])
@@ -78,18 +86,6 @@ def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[di
         sd = math.sqrt(float(row**2 @ weight))
         angles[f"angle_{axes[k][-1]}_deg"] = interval(math.degrees(turn[k]), math.degrees(sd), "deg")
     return angles, sure
-
-
-def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    """A step of one accelerometer may be a turn about one axis: gravity moves on the others by its square alone."""
-    states = {**record.axes, **{name: one.state for name, one in found.items()}}
-    events = Counter(finding.event for one in found.values() for finding in one.findings)
-    for name, one in found.items():
-        for k, finding in enumerate(one.findings):
-            alone = not finding.event or events[finding.event] == 1
-            if finding.look.cause == step.CAUSE.id and alone and _turn_of({name: finding.look}, states) is not None:
-                one.findings[k] = replace(finding, look=replace(finding.look, others=(CAUSE.id,)))
-    return []
 
 
 def _specific_force(states: Mapping[str, State]) -> dict[str, tuple[float, float]] | None:
@@ -137,7 +133,7 @@ CAUSE = Cause(
     at=step.at,
     of_means=True,
     pictures=shown("means", "evidence"),
-    grouping=Grouping(alike=step.alike, settle=_settle),
+    grouping=Grouping(alike=step.alike),
     score=Scored(once="a turn is an event of its recording"),
     written=Written(entry=step.entry, of_column=step.of_column),
     simulated=Simulated(
