@@ -72,6 +72,12 @@ def half_means(values: Array, size: int) -> tuple[Array, Rows]:
     return np.where(2 * used >= size, np.where(there, cells, 0.0).sum(axis=1) / np.maximum(used, 1), np.nan), used
 
 
+def in_blocks(rows: Array, size: int) -> Array:
+    """Means [..., n // size] of whole blocks of rows [..., n], all of which are there."""
+    n = rows.shape[-1] // size
+    return np.ascontiguousarray(rows[..., : n * size].reshape(*rows.shape[:-1], n, size).mean(axis=-1))
+
+
 def regridded(values: Array, dt: float, n: int, to_dt: float) -> Array:
     """Means of `dt` s [k] on a grid of n samples `to_dt` s apart that begins where they do, by straight lines."""
     return np.asarray(np.interp((np.arange(n) + 0.5) * to_dt, (np.arange(values.size) + 0.5) * dt, values))

@@ -325,8 +325,13 @@ def states_of(m: Matrices, level: Array, random: np.random.Generator) -> Array:
             rest[[now, before]] = False
             out += m.h[now] * e[now] + m.h[before] * np.append(e[before, 0], e[now, :-1])
     poles, vectors = np.linalg.eig(m.F[np.ix_(rest, rest)])
-    for pole, weight, row in zip(poles, m.h[rest] @ vectors, np.linalg.solve(vectors, e[rest]), strict=True):
-        out += (weight * lfilter([1.0], [1.0, -pole], row)).real
+    e = e[rest]
+    for pole, weight, mixed in zip(poles, m.h[rest] @ vectors, np.linalg.inv(vectors), strict=True):
+        held = np.flatnonzero(mixed)
+        if pole.imag == 0.0:
+            out += weight.real * lfilter([1.0], [1.0, -pole.real], mixed[held].real @ e[held])
+        elif pole.imag > 0.0:  # the conjugate makes as much
+            out += 2.0 * (weight * lfilter([1.0], [1.0, -pole], mixed[held] @ e[held])).real
     return out
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import in_blocks
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import (
     ALIKE,
@@ -75,6 +76,7 @@ class Shape:
     where       when or at which frequency it is, by its fit; `when` of a Look.
     stated      what the estimate says beside.
     measure     its posterior, of a family that knows more of it than `measured` does.
+    whole       of a shape in means: the same at every sample.
 
     Fewer keys than columns: the last one is the norm of the next two coefficients, sine and cosine of a line.
     """
@@ -92,6 +94,18 @@ class Shape:
     when: tuple[float, float] | None = None
     measure: Callable[[State], Mapping[str, Any]] | None = None
     stated: Mapping[str, Any] = field(default_factory=dict)
+    whole: Shape | None = None
+
+    def in_means(self, block: int) -> Shape:
+        """The shape in means of so many samples."""
+        moved, sharper = self.moved, self.sharper
+        return replace(
+            self,
+            columns=in_blocks(self.columns, block),
+            moved=moved and (lambda numbers: moved(numbers).in_means(block)),
+            sharper=sharper and (lambda fit: sharper(fit).in_means(block)),
+            whole=self,
+        )
 
     @property
     def theta(self) -> tuple[float, ...]:
@@ -136,8 +150,12 @@ def fitted(state: State, shape: Shape) -> Tried:
 
 
 def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = SCREEN) -> dict[str, Tried]:
-    """The best shape of each form that ranks high enough, in the order of the forms. `slow`: its gain must hold over
-    the drifts that the record leaves possible."""
+    """The best shape of each form that ranks high enough, in the order of the forms. `slow`: it is looked for in means,
+    and its gain must hold over the drifts that the record leaves possible."""
+    means, block = state.slow if slow else (state, 1)
+    if block > 1:
+        found = tried(means, [one.in_means(block) for one in shapes], slow=slow, least=least)
+        return {form: replace(one, shape=one.shape.whole or one.shape) for form, one in found.items()}
     shapes = [one for one in shapes if all(np.ptp(column) > 0.0 for column in one.columns)]
     if not shapes:
         return {}

@@ -13,9 +13,9 @@ from scipy.special import chdtrc, logsumexp, ndtr, softmax
 
 from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
-from selfcal.base.grid import half_means
+from selfcal.base.grid import half_means, in_blocks
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
-from selfcal.likelihood.statemodel import DRIFT_SIZES, Array, Terms
+from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Terms
 
 if TYPE_CHECKING:
     from selfcal.likelihood.columns import Shape
@@ -95,10 +95,7 @@ class State:
         n = self.y.size
         block = max(1, int(min(n // MEANS_MOST, longest_s / self.dt)))
         mean, used = half_means(self.y, block)
-        r, columns = (
-            rows[..., : n // block * block].reshape(*rows.shape[:-1], n // block, block).mean(axis=-1)
-            for rows in (self.r, self.series.columns)
-        )
+        r, columns = in_blocks(self.r, block), in_blocks(self.series.columns, block)
         return Series(mean, self.dt * block, r * block / np.maximum(used, 1), np.ascontiguousarray(columns)), block
 
     @property
@@ -206,8 +203,13 @@ class State:
         if block == 1:
             return self, 1
         columns = [replace(one, values=mean) for one, mean in zip(self.regressors, series.columns[1:], strict=True)]
+        bands = [  # sizes are relative to the white noise; faster ones average out
+            (period, damping, ln_size + 0.5 * math.log(block))
+            for period, damping, ln_size in self.extras.bands
+            if period >= PERIOD_LIMITS[0]
+        ]
         means = replace(self, y=series.y, dt=series.dt, r=series.r, block=block * self.block, fits=())
-        return means.refit(regressors=tuple(columns)), block
+        return means.refit(regressors=tuple(columns), extras=replace(self.extras, bands=tuple(bands))), block
 
     @cached_property
     def ln_marginal(self) -> float:
@@ -237,8 +239,7 @@ class State:
     def average_gain(self, more: Array) -> float:
         """Gain by further slow columns [k, n] averaged over the drifts that the record leaves possible: one that is
         known from few of its own turns makes nats of any slow column."""
-        slow, block = self.slow
-        gains, ln_share, _ = slow.averaged(more[:, : slow.y.size * block].reshape(len(more), -1, block).mean(axis=2))
+        gains, ln_share, _ = self.averaged(more)
         return float(logsumexp(gains + ln_share))
 
     def bayes(self, column: Array, widths: Array) -> tuple[Array, float, float]:
