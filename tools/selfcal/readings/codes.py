@@ -227,6 +227,11 @@ class Cells:
         floor = ODD * float(self.total.sum()) / self.many
         return float(self.total @ np.log((rival.read(expected) + floor) / (expected + floor)))
 
+    def lacking(self, expected: Array) -> float:
+        """Nats that the counts of all pieces together have beyond those `expected` [codes]."""
+        count = self.total[self.there]
+        return float(count @ np.log(count / (expected[self.there] + ODD * float(self.total.sum()) / self.many)))
+
     def limit(self, side: int) -> csr_matrix:
         """All above the largest reading, or below the smallest, are read as it."""
         ends = self.there[self.there < self.many - 1]
@@ -322,8 +327,7 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
     cells = Cells(y, 0.0 if lattice is None else lattice.step)
     plain = cells.fit(cells.own)
     over = cells.own @ cells.expected(plain)
-    here = cells.there
-    lacking = float(cells.total[here] @ np.log(cells.total[here] / (over[here] + ODD * y.size / cells.many)))
+    lacking = cells.lacking(over)
     if lacking < cells.there.size + nats_of("quantization"):
         return None
     maps = list(_about_zero(cells, y)) if cells.folds else []
@@ -341,6 +345,8 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
         fits.append((fit.over(plain) - math.log(len(tried) if each.kind in UNEVEN else len(maps)), best, fit))
     nats, best, fit = max(fits, key=lambda tried_map: tried_map[0])
     also = tuple(dict.fromkeys(rival.kind for more, rival, _ in fits if more > nats - ALSO and rival.kind != best.kind))
+    # Noise that is not normal makes evidence as well: as it makes what the best map leaves, beyond half a nat a code.
+    nats /= max(1.0, 2.0 * cells.lacking(best.within(cells) @ cells.expected(fit)) / cells.there.size)
     if best.kind not in ELSEWHERE and nats < nats_of("quantization" if best.kind in UNEVEN else "misread"):
         return None
     now, to = cells.expected(fit), best.within(cells)
