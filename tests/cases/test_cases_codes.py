@@ -118,8 +118,8 @@ def test_codes_that_are_alike_are_not_named(kind: str) -> None:
 @pytest.mark.parametrize("q", [0.7, 0.8, 0.9])
 @pytest.mark.parametrize("freedom", [10.0, 15.0])
 def test_noise_that_is_not_normal_has_no_word(q: float, freedom: float) -> None:
-    """A line that switches and tails, many readings, a lattice almost as coarse as the noise: their counts are not those
-    of normal noise, by hundreds of nats. Before, the best map took those for evidence of a lost word, from 16 on."""
+    """A line that switches, and tails, on a lattice almost as coarse as the noise: the counts of many readings are not
+    those of normal noise, by hundreds of nats. The best map took those for evidence of a lost word, from 16 on."""
     for seed in range(case_records(1, 20)):
         random = np.random.default_rng([72, seed])
         line = np.sign(np.sin(0.031 * np.arange(300_000)))
