@@ -96,7 +96,7 @@ def test_the_size_of_a_step_beside_a_weak_walk(samples: int, gap: int) -> None:
     random = np.random.default_rng([398, gap])
     sizes: list[bool] = []
     n = samples + gap
-    for _ in range(case_records(6, 150)):
+    for _ in range(case_records(12, 150)):
         walk = 0.01 * math.exp(random.uniform(-0.4, 0.4))
         y = random.standard_normal(n) + walk * random.standard_normal(n).cumsum()
         begin = round(random.uniform(0.3, 0.7) * samples)

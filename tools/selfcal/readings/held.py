@@ -31,6 +31,8 @@ CHANCE, RUN_MOST = 0.01, 5
 #: Rows to a reading in a stretch at most, and stretches at most. The chance that a row
 #: of it does not repeat, and equal readings that are supposed among those of a stretch.
 RATIO_MOST, STRETCHES, MISSED, SUPPOSED = 5, 8, 0.02, 2.0
+#: Changes of a channel that is read anew each period, at least: a chamber may step a few times, as evenly.
+CHANGES_LEAST = 8
 #: Rows in a bin of the phase, and bins at most.
 IN_BIN, BINS = 50, 100
 
@@ -148,7 +150,7 @@ def updates(values: Array, at: Rows) -> Rows | None:
     bends = np.abs(np.diff(steps)) > 1e-9 * float(np.ptp(values))
     held_rows = np.flatnonzero(steps) + 1
     rows = held_rows if 2 * held_rows.size < values.size else np.flatnonzero(bends) + 1
-    if rows.size < 3:
+    if rows.size <= CHANGES_LEAST:
         return None
     gaps = np.diff(at[rows])
     nats, period = max(_of_period(gaps, part) for part in (1, 2, 3))
