@@ -345,8 +345,10 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
         fits.append((fit.over(plain) - math.log(len(tried) if each.kind in UNEVEN else len(maps)), best, fit))
     nats, best, fit = max(fits, key=lambda tried_map: tried_map[0])
     also = tuple(dict.fromkeys(rival.kind for more, rival, _ in fits if more > nats - ALSO and rival.kind != best.kind))
-    # Noise that is not normal makes evidence as well: as it makes what the best map leaves, beyond half a nat a code.
-    nats /= max(1.0, 2.0 * cells.lacking(best.within(cells) @ cells.expected(fit)) / cells.there.size)
+    if best.to is None:
+        # Of a few codes noise that is not normal makes evidence as well: as it makes what the map leaves, beyond half a
+        # nat a code. A map of all codes leaves what lies within its parts.
+        nats /= max(1.0, 2.0 * cells.lacking(best.within(cells) @ cells.expected(fit)) / cells.there.size)
     if best.kind not in ELSEWHERE and nats < nats_of("quantization" if best.kind in UNEVEN else "misread"):
         return None
     now, to = cells.expected(fit), best.within(cells)
