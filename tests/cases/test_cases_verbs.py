@@ -450,8 +450,8 @@ def test_a_change_counts_beside_an_axis_without_a_partner(tmp_path: Path) -> Non
 def test_means_come_first_and_every_sample_is_final(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Truth: a step, which both looks show; and a line at 3.1 Hz, whose alias at 0.1 Hz has 3 % of its size in means
-    of 1 s. A recording of so few samples has two looks here only."""
+    """Truth: a step, which means show and every sample keeps; and a line at 3.1 Hz, whose alias at 0.1 Hz has 3 % of
+    its size in means of 1 s. A recording of so few samples has two looks here only."""
     monkeypatch.setattr(diagnose_module, "FIRST_FROM", 3000)
     columns = quiet(9, 10.0, 300.0, ("gx",))
     t = np.arange(columns["gx"][1].size) / 10.0
@@ -464,7 +464,7 @@ def test_means_come_first_and_every_sample_is_final(
     assert [line.partition(": The")[0] for line in first[1:]] == ["selfcal: gx: step"]
     assert axis["judged_at_hz"] == 10.0 and axis["only_in_means"] == [] and "unfinished" not in axis
     rates = {finding["cause"]: finding["judged_at_hz"] for finding in axis["findings"]}
-    assert rates == {"step": 10.0, "periodic": 10.0}
+    assert rates == {"step": 1.0, "periodic": 10.0}
     for options, rate_hz in ({"decimate": 1.0}, 1.0), ({"full_rate": True}, 10.0):
         one = diagnose(tmp_path / "log.npz", **options)["axes"]["gx"]
         assert one["judged_at_hz"] == rate_hz and "only_in_means" not in one
@@ -553,8 +553,8 @@ def test_a_signal_ends_it_with_the_first_look(number: int, code: int, tmp_path: 
         output, _ = process.communicate(timeout=60)
     assert process.returncode == code
     assert after - before < 2.0 or time.monotonic() - began < 2.0
-    assert "gx [deg/s]: inadequate, not finished: every sample: interrupted" in output
-    assert "gy [deg/s]: nothing found so far, not finished: every sample: interrupted" in output
+    assert "gx, °/s   inadequate, not finished: every sample:" in output
+    assert "gy, °/s   nothing found so far, not finished: every sample:" in output
     axes = json.loads((tmp_path / "found.json").read_text(encoding="utf-8"))["axes"]
     assert [finding["cause"] for finding in axes["gx"]["findings"]] == ["step"]
     assert axes["gx"]["judged_at_hz"] == 1.0 and "interrupted" in axes["gx"]["unfinished"]
