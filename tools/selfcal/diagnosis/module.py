@@ -721,7 +721,7 @@ class Search:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
         if one.share_of(self.model.loading) <= PATTERN:
             return False
-        if one.cause in OF_TIME or one.cause not in self.channels:
+        if one.cause not in self.channels:
             return one.cause in OF_TIME
         slow = max([self.seen.wandering, *(each.evidence for each in self.known["transient"])])
         return one.evidence < slow + ALIKE

@@ -96,7 +96,7 @@ class State:
         block = max(1, int(min(n // MEANS_MOST, longest_s / self.dt)))
         mean, used = half_means(self.y, block)
         r, columns = in_blocks(self.r, block), in_blocks(self.series.columns, block)
-        return Series(mean, self.dt * block, r * block / np.maximum(used, 1), np.ascontiguousarray(columns)), block
+        return Series(mean, self.dt * block, r * block / np.maximum(used, 1), columns), block
 
     @property
     def best(self) -> Fit:

@@ -327,8 +327,7 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
     cells = Cells(y, 0.0 if lattice is None else lattice.step)
     plain = cells.fit(cells.own)
     over = cells.own @ cells.expected(plain)
-    lacking = cells.lacking(over)
-    if lacking < cells.there.size + nats_of("quantization"):
+    if cells.lacking(over) < cells.there.size + nats_of("quantization"):
         return None
     maps = list(_about_zero(cells, y)) if cells.folds else []
     maps += [_Map("limit", cells.limit(side)) for side in (1, -1)]
@@ -345,13 +344,13 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
         fits.append((fit.over(plain) - math.log(len(tried) if each.kind in UNEVEN else len(maps)), best, fit))
     nats, best, fit = max(fits, key=lambda tried_map: tried_map[0])
     also = tuple(dict.fromkeys(rival.kind for more, rival, _ in fits if more > nats - ALSO and rival.kind != best.kind))
+    now, to = cells.expected(fit), best.within(cells)
     if best.to is None:
         # Of a few codes noise that is not normal makes evidence as well: as it makes what the map leaves, beyond half a
         # nat a code. A map of all codes leaves what lies within its parts.
-        nats /= max(1.0, 2.0 * cells.lacking(best.within(cells) @ cells.expected(fit)) / cells.there.size)
+        nats /= max(1.0, 2.0 * cells.lacking(to @ now) / cells.there.size)
     if best.kind not in ELSEWHERE and nats < nats_of("quantization" if best.kind in UNEVEN else "misread"):
         return None
-    now, to = cells.expected(fit), best.within(cells)
     share = 1.0 - float(now @ np.asarray(to.multiply(cells.own).sum(axis=0)).ravel()) / float(now.sum())
     undone = value = width = None
     if best.kind in UNEVEN:
