@@ -460,8 +460,9 @@ def test_noise_of_half_a_step_and_more_passes_the_lattice(tmp_path: Path, level:
 
 @pytest.mark.parametrize("lsb", [0.0, 0.02])
 def test_memory_of_a_long_recording(tmp_path: Path, lsb: float) -> None:
-    """24 bytes a reading of six axes, once the record is long: the reading, a third of the stamps, the work of an axis.
-    One axis jumps, so that the search for its cause is in it. `lsb`: on a lattice that is no coarser than the noise,
+    """40 bytes a reading of six axes: the reading, its share of the stamps and of their laws, energies for motion, the
+    work of an axis. An hour of six axes at 200 Hz takes 170 MB at most. One
+    axis jumps, so that the search for its cause is in it. `lsb`: on a lattice that is no coarser than the noise,
     with gaps."""
     rng = np.random.default_rng(8)
     peaks = {}
@@ -481,4 +482,4 @@ def test_memory_of_a_long_recording(tmp_path: Path, lsb: float) -> None:
         tracemalloc.stop()
     growth = (peaks[120_000] - peaks[40_000]) / (80_000 * 6)
     print(f"{growth:.1f} bytes a reading")
-    assert growth <= 24.0
+    assert growth <= 40.0

@@ -18,6 +18,7 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import binom, fdtrc, gammainc, gammaincinv
 
@@ -79,22 +80,23 @@ class Moved:
 
 @dataclass(frozen=True)
 class Energy:
-    """Squares of axes over their variance, `most` [axes] at most, in pieces of `piece_s`: `sums`, `counts` and the sums
-    of their own `squares` [axes, bands, pieces], of single readings, of means of BANDS_S, and of pushes. `apart`: the
-    readings of each axis about their level, over their noise [n], and the piece that each is in [n]."""
+    """Squares of axes over their variance, `most` [axes] at most, in pieces of `piece_s`: `sums` and `counts` [axes,
+    bands, pieces], of single readings, of means of BANDS_S, and of pushes, whose own `squares` [axes, pieces] are
+    summed too. `apart`: the readings of each axis about their level, over their noise [n], and the piece of each [n].
+    """
 
     piece_s: float
     sums: Array
     counts: Array
     squares: Array
-    apart: tuple[tuple[Array, Rows], ...]
+    apart: tuple[tuple[NDArray[np.float32], NDArray[np.int32]], ...]
     most: Array
 
     @cached_property
     def before(self) -> tuple[Array, ...]:
-        """Sums, counts and squares of all pieces before each one, and of all, [axes, bands, pieces + 1] each."""
+        """Sums, counts and squares of all pieces before each one, and of all, [..., pieces + 1]."""
         every = (self.sums, self.counts, self.squares)
-        return tuple(np.pad(np.cumsum(one, axis=2), ((0, 0), (0, 0), (1, 0))) for one in every)
+        return tuple(np.concatenate((0.0 * each[..., :1], np.cumsum(each, axis=-1)), axis=-1) for each in every)
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,8 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     length_s = max(float(clock.time_s[-1]) + 1.0 / clock.rate_hz for clock in clocks)
     piece_s = max(PIECE_S, 1.0 / max(clock.rate_hz for clock in clocks), length_s / PIECES_MOST)
     count = math.ceil(length_s / piece_s - 1e-6)
-    sums, counts, squares = np.zeros((3, len(names), 2 + len(BANDS_S), count))
+    sums, counts = np.zeros((2, len(names), 2 + len(BANDS_S), count))
+    squares = np.zeros((len(names), count))
     there = [np.isfinite(recording.columns[name].values) for name in names]
     tame = [_tame(recording.columns[name].values[each]) for name, each in zip(names, there, strict=True)]
     scaled_rows = [_scaled(own) for own, _ in tame]
@@ -195,10 +198,11 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
                 scaled = np.maximum(np.abs(scaled) - PUSH, 0.0)
             piece = np.minimum((at[: scaled.size] / piece_s + 1e-6).astype(np.int64), count - 1)
             square = np.minimum(scaled**2, tame[k][1])
-            for power, total in enumerate((counts, sums, squares)):
-                total[k, band] = np.bincount(piece, square**power, minlength=count)
+            totals = counts[k, band], sums[k, band], *([squares[k]] if pushes else [])
+            for power, total in enumerate(totals):
+                total[:] = np.bincount(piece, square**power, minlength=count)
             if not band:
-                readings.append((scaled_rows[k], piece))
+                readings.append((scaled_rows[k].astype(np.float32), piece.astype(np.int32)))
     return Energy(piece_s, sums, counts, squares, tuple(readings), np.array([one for _, one in tame]))
 
 
@@ -319,56 +323,69 @@ def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array,
     """Nats of windows of a length over their louder side [axes, and the others but the loudest as one, bands, windows].
     Whether an axis has both sides, or is pushed most of the time [axes, windows]. How much wider than of white noise
     the means lie, `wide` at least [axes, bands]."""
-    sums, counts, squares = energy.before
-    pieces = energy.sums.shape[2]
-    each = counts[..., -1:] / pieces
+    axes, bands, pieces = energy.sums.shape
+    most = max(1e-9, float(energy.counts.sum(axis=2).max()) / pieces)
+    side = max(SIDE * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / most))
+    nats, wide = np.zeros((axes + 1, bands, begin.size)), wide.copy()
+    inside = np.zeros((axes, begin.size), bool)
+    for band in range(bands):  # one by one: a long record has many windows
+        nats[:, band], both, wide[:, band] = _of_band(energy, band, begin, length, side, wide[:, band])
+        inside |= both
+    return nats, inside, wide
 
-    def means(first: Rows, last: Rows) -> tuple[Array, Array]:
-        first, last = np.clip(first, 0, pieces), np.clip(last, 0, pieces)
-        n = counts[..., last] - counts[..., first]
-        return (sums[..., last] - sums[..., first]) / np.maximum(n, 1.0), n
 
-    side = max(SIDE * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / max(1e-9, float(each.max()))))
-    own, n = means(begin, begin + length)
-    left, n_left = means(begin - 1 - side, begin - 1)
-    right, n_right = means(begin + length + 1, begin + length + 1 + side)
-    there = [(one >= side * each / SIDE) & (one > 0.0) for one in (n_left, n_right)]
-    level = np.maximum(np.where(there[0], left, 0.0), np.where(there[1], right, 0.0))
-    beside = np.maximum(np.where(there[0], n_left, 0.0), np.where(there[1], n_right, 0.0))
+def _of_band(energy: Energy, band: int, begin: Rows, length: int, side: int, wide: Array) -> tuple[Array, Mask, Array]:
+    """What `_nats` has of a band, with sides of so many pieces: [axes + 1, windows], [axes, windows], [axes]."""
+    sums, counts = (every[:, band] for every in energy.before[:2])
+    pieces, pushes = energy.sums.shape[2], band == energy.sums.shape[1] - 1
+
+    def inside(every: Array, first: Rows, last: Rows) -> Array:
+        difference: Array = every[:, np.clip(last, 0, pieces)] - every[:, np.clip(first, 0, pieces)]
+        return difference
+
+    least = counts[:, -1:] / pieces * side / SIDE
+    level, beside = np.zeros((2, len(sums), begin.size))
+    both = np.ones(level.shape, bool)
+    for first in (begin - 1 - side, begin + length + 1):
+        n = inside(counts, first, first + side)
+        there = (n >= least) & (n > 0.0)
+        mean = inside(sums, first, first + side) / np.maximum(n, 1.0)
+        level, beside = np.maximum(level, np.where(there, mean, 0.0)), np.maximum(beside, np.where(there, n, 0.0))
+        both &= there
+    n = inside(counts, begin, begin + length)
+    own = inside(sums, begin, begin + length) / np.maximum(n, 1.0)
     known = (beside > 0.0) & (n > 0.0)
+    wide = np.maximum(wide, [_spread(*row) for row in zip(own, n, known, strict=True)])
+    free = known / (SQUARES * wide[:, None])
+    if pushes:
+        # Pushes are rare and large, also in noise that has grown: their own spread beside the window counts.
+        second, fourth, many = (
+            inside(every, begin - 1 - side, begin - 1) + inside(every, begin + length + 1, begin + length + 1 + side)
+            for every in (sums, energy.before[2], counts)
+        )
+        free /= np.maximum(0.5 * (fourth * many / np.maximum(second**2, 1.0) - 1.0), 1.0)
+    own_free, side_free = np.maximum(n * free, 0.5), np.maximum(beside * free, 0.5)
     ratio = np.where(known, own / np.maximum(level, STILL**2), 1.0)
-    # Pushes are rare and large, also in noise that has grown: their own spread beside the window counts.
-    ends = np.clip([begin - 1 - side, begin - 1, begin + length + 1, begin + length + 1 + side], 0, pieces)
-    second, fourth, many = (
-        one[:, -1, ends[1]] - one[:, -1, ends[0]] + one[:, -1, ends[3]] - one[:, -1, ends[2]]
-        for one in (sums, squares, counts)
-    )
-    heavy = np.ones_like(own)
-    heavy[:, -1] = np.maximum(0.5 * (fourth * many / np.maximum(second**2, 1.0) - 1.0), 1.0)
-    wide = np.maximum(
-        wide, [[_spread(*row) for row in zip(*rows, strict=True)] for rows in zip(own, n, known, strict=True)]
-    )
-    own_free, side_free = (np.maximum(one * known / (SQUARES * wide[..., None] * heavy), 0.5) for one in (n, beside))
-    ratio_least = np.maximum(ratio, 1.0)
-    order = np.argsort(-own_free * (ratio_least - 1.0 - np.log(ratio_least)), axis=0)[1:]
+    louder = np.maximum(ratio, 1.0)
+    order = np.argsort(-own_free * (louder - 1.0 - np.log(louder)), axis=0)[1:]
     # But the loudest: the next one, the next two, and so on, as many as show most. A choice costs its number of ways.
-    of_others = [np.take_along_axis(one, order, 0).cumsum(axis=0) for one in (ratio * own_free, own_free, side_free)]
-    ratio = np.concatenate([ratio, of_others[0] / np.maximum(of_others[1], 0.5)])
+    of_others = [np.take_along_axis(each, order, 0).cumsum(axis=0) for each in (ratio * own_free, own_free, side_free)]
+    ratio = np.maximum(np.concatenate([ratio, of_others[0] / np.maximum(of_others[1], 0.5)]), 1.0)
     own_free, side_free = (np.concatenate(pair) for pair in ((own_free, of_others[1]), (side_free, of_others[2])))
-    ratio = np.maximum(ratio, 1.0)
     nats = 0.5 * own_free * (ratio - 1.0 - np.log(ratio))
     near = nats > 1.0
     nats[near] = -np.log(np.maximum(fdtrc(own_free[near], side_free[near], ratio[near]), TINY))
-    # Of readings that are far by themselves some come together: so many are rare by their share of the record.
-    share = np.exp(-0.5 * energy.most) + sums[:, -1, -1] / (energy.most * np.maximum(counts[:, -1, -1], 1.0))
-    far, usual = own[:, -1] * n[:, -1] / energy.most[:, None], n[:, -1] * share[:, None]
-    rare = np.where(far > usual, far * np.log(np.maximum(far, TINY) / np.maximum(usual, TINY)) - far + usual, 0.0)
-    rares = np.take_along_axis(rare, order[:, -1], 0).cumsum(axis=0)
-    nats[:, -1] = np.minimum(nats[:, -1], np.concatenate([rare, rares]))
-    ways = binom(len(order), 1.0 + np.arange(len(order)))
-    others = np.max(nats[len(rare) :] - np.log(ways)[:, None, None], axis=0, initial=0.0)
-    nats = np.concatenate([nats[: len(rare)], [others]])
-    return nats, (there[0] & there[1]).any(axis=1) | (own[:, -1] > 0.5 * energy.most[:, None]), wide
+    if pushes:
+        # Of readings that are far by themselves some come together: so many are rare by their share of the record.
+        most = energy.most[:, None]
+        share = np.exp(-0.5 * most) + sums[:, -1:] / (most * np.maximum(counts[:, -1:], 1.0))
+        far, usual = own * n / most, n * share
+        rare = np.where(far > usual, far * np.log(np.maximum(far, TINY) / np.maximum(usual, TINY)) - far + usual, 0.0)
+        nats = np.minimum(nats, np.concatenate([rare, np.take_along_axis(rare, order, 0).cumsum(axis=0)]))
+        both |= own > 0.5 * most
+    axes, ways = len(sums), binom(len(order), 1.0 + np.arange(len(order)))
+    others = np.max(nats[axes:] - np.log(ways)[:, None], axis=0, initial=0.0)
+    return np.concatenate([nats[:axes], [others]]), both, wide
 
 
 def _spread(means: Array, counts: Array, known: Mask) -> float:
