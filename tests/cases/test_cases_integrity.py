@@ -561,7 +561,8 @@ def test_one_slow_axis_leaves_the_others_at_their_rate() -> None:
 def test_the_diagnosis_of_a_case_has_one_cause(
     case: str, cause: str, truth: dict[str, Any], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """The shared cases as their README has them: the cause alone, N 0.04 beside it, and nothing on the terminal."""
+    """The shared cases as their README has them: the cause alone, N 0.04 beside it. On the terminal no line but one on
+    the clock, whose rate changes."""
     axis = diagnose(shared_case(case, tmp_path), axes=["gx"], decimate=4.0)["axes"]["gx"]
     assert causes(axis) == [cause]
     estimate = axis["findings"][0]["estimate"]
@@ -570,7 +571,8 @@ def test_the_diagnosis_of_a_case_has_one_cause(
         assert found == pytest.approx(np.array(value) if key == "intervals" else value, rel=1e-3)
     N = axis["posterior"]["parameters"]["constant"]["N"]
     assert N["q05"] < 0.0402 < N["q95"]
-    assert capfd.readouterr().err == ""
+    lines = capfd.readouterr().err.splitlines()
+    assert ["the sampling rate changes: " in line for line in lines] == [True] * (cause == "rate_change")
 
 
 # --------------------------------------------------------------------------------------------------------------- clock

@@ -399,7 +399,7 @@ def test_the_commands_on_the_page_reproduce_it(tmp_path: Path) -> None:
     done = run("diagnose", *given, "--report", "page.html", "--json", "first.json", cwd=tmp_path)
     assert done.returncode == 0, done
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
-    found = re.search(r"<pre [^>]*aria-label=Commands[^>]*><code>(.*?)</code>", text, re.DOTALL)
+    found = re.search(r'<pre [^>]*aria-label="Commands"[^>]*><code>(.*?)</code>', text, re.DOTALL)
     assert found is not None
     commands = [shlex.split(line) for line in html.unescape(found[1]).splitlines()]
     assert [command[:2] for command in commands] == [
