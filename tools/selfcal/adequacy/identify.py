@@ -219,8 +219,9 @@ def _by_reference(fed: _Fed, model: Model, advance: Callable[[], object]) -> lis
 
 def may_act(model: Model, recording: Recording, name: str) -> list[str]:
     """The columns that may act on an axis: the side channels and the other axes, but for those that the model file has
-    move together with it."""
+    move together with it, or follow it."""
     candidates = {*model.axes, *(column for column, _ in SIDE_CHANNELS.values())} - {name}
+    candidates -= {axis for axis in model.axes if any(column.column == name for column in offered(model, axis))}
     if model.hidden_input is not None and name in model.hidden_input.loadings:
         candidates -= model.hidden_input.loadings.keys()
     return [column for column in recording.columns if column in candidates]

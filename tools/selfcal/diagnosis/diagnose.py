@@ -128,8 +128,14 @@ def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Mod
         # Beside a hidden quantity other axes explain one as it does.
         if one.findings or one.hidden is not None or one.state.below_lattice or model.beyond:
             continue
+        # An axis that follows this one would explain it as well.
+        follow = {
+            axis for axis, other in found.items() for each in other.findings if each.look.estimate.get("other") == name
+        }
+        others = {axis: column for axis, column in recording.columns.items() if axis not in follow}
+        beside = replace(recording, columns=others)
         with suppress(UserError):  # no report, no checks
-            look = of_checks(one, identify_axis(recording, name, model, "library", None).judged.checks)
+            look = of_checks(one, identify_axis(beside, name, model, "library", None).judged.checks)
             if look is not None:
                 one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))
 
