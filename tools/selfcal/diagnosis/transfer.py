@@ -210,38 +210,45 @@ class Drive:
 
 
 def quiet(values: Array, lattice: float = 0.0) -> Array:
-    """[n]: what readings [n] with a noise of their own are of: an integrated random walk, whose size the readings
-    tell (the spline of Wahba, 1978). What it leaves of the noise does not go with it, and so it biases no gain. On a
-    `lattice` the noise is that of rounding at least: between its steps readings look exact."""
+    """[n]: what readings [n] with a noise of their own are of: a walk or an integrated one, whichever the readings tell
+    with its size (the splines of Wahba, 1978). What it leaves of the noise does not go with it, and so it biases no
+    gain. On a `lattice` the noise is that of rounding at least: between its steps readings look exact."""
     n = values.size
     about = values - values.mean()
     if n < ROUGH or not np.any(np.diff(values, 2)):
         return values
-    # Second differences D: D'D has five diagonals.
-    ends = np.ones(n - 2)
-    bands = np.zeros((3, n))
-    for size, parts in ((2, (1.0, 4.0, 1.0)), (1, (-2.0, -2.0)), (0, (1.0,))):
-        for shift, part in enumerate(parts):
-            bands[size, 2 - size + shift : n - len(parts) + 1 + shift] += part * ends
-    unit = np.array([[0.0], [0.0], [1.0]])
 
-    def smoothed(ln_stiff: float) -> tuple[float, Array]:
-        """Restricted likelihood, less, and the curve."""
-        root = cholesky_banded(unit + math.exp(ln_stiff) * bands)
+    def smoothed(order: int, ln_stiff: float) -> tuple[float, Array]:
+        """Restricted likelihood, less, and the curve, whose differences of this order are white."""
+        parts = np.diff(np.eye(order + 1), order)[:, 0]
+        bands = np.zeros((order + 1, n))  # of D'D, D the differences
+        bands[order] = np.convolve(parts**2, np.ones(n - order))
+        for apart in range(1, order + 1):
+            bands[order - apart, apart:] = np.convolve(parts[apart:] * parts[:-apart], np.ones(n - order))
+        bands *= math.exp(ln_stiff)
+        bands[order] += 1.0
+        root = cholesky_banded(bands)
         curve = cho_solve_banded((root, False), about)
         left = max(float(about @ (about - curve)), 1e-300)
-        return 0.5 * (n - 2) * (math.log(left) - ln_stiff) + float(np.log(root[2]).sum()), curve
+        # Twice the second term is ln det D D': of a walk n, of an integrated one n^2 (n^2 - 1) / 12.
+        scale = 0.5 * math.log(n if order == 1 else n**2 * (n**2 - 1.0) / 12.0)
+        return 0.5 * (n - order) * (math.log(left) - ln_stiff) - scale + float(np.log(root[order]).sum()), curve
 
-    found = minimize_scalar(lambda x: smoothed(x)[0], bounds=STIFF, method="bounded", options={"xatol": 0.1})
+    tried = []
+    for order in (1, 2):
+        found = minimize_scalar(
+            lambda x, order=order: smoothed(order, x)[0], bounds=STIFF, method="bounded", options={"xatol": 0.1}
+        )
+        tried.append((float(found.fun), order, float(found.x)))
+    _, order, stiff = min(tried)
 
     def fine(ln_stiff: float) -> float:
         """How far what the curve leaves is above the noise of rounding."""
-        return float(np.var(about - smoothed(ln_stiff)[1])) - lattice**2 / 12.0
+        return float(np.var(about - smoothed(order, ln_stiff)[1])) - lattice**2 / 12.0
 
-    stiff = float(found.x)
     if fine(stiff) < 0.0 < fine(STIFF[1]):
         stiff = brentq(fine, stiff, STIFF[1], xtol=0.05)
-    return np.asarray(values.mean() + smoothed(stiff)[1])
+    return np.asarray(values.mean() + smoothed(order, stiff)[1])
 
 
 def late(values: Array, lag_s: complex, dt: float) -> NDArray[Any]:
