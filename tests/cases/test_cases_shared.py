@@ -162,17 +162,18 @@ def test_one_source_of_several_axes_is_one_leak(tmp_path: Path, seed: int, sourc
 
 
 def test_a_leak_is_no_common_source(tmp_path: Path) -> None:
-    """The drift of the other axis leaks as well; of a common source each axis has a drift of its own."""
+    """The drift of the other axis leaks as well; of a common source each axis has a drift of its own. Of 100 modules
+    one has a finding by chance: two of eight have a probability of 0.3 %."""
     random = np.random.default_rng(45)
     n = 2 * SAMPLES
-    records, alone = case_records(1, 8), 0
+    records, alone, by_chance = case_records(1, 8), 0, 0
     for _ in range(records):
         other = random.standard_normal(n) + drift(random, n, 1.0)
         leaking = random.standard_normal(n) + 0.3 * other
         axes = diagnose(written(tmp_path, {"gx": leaking, "gy": other}), axes=("gx", "gy"))["axes"]
         causes = {name: [finding["cause"] for finding in axes[name]["findings"]] for name in axes}
         assert causes["gx"] == ["cross_axis"]
-        assert not causes["gy"]
+        by_chance += bool(causes["gy"])
         common = random.standard_normal(n)
         axes = diagnose(
             written(
@@ -196,6 +197,7 @@ def test_a_leak_is_no_common_source(tmp_path: Path) -> None:
                 assert finding["gain"]["bias_rmse"]["horizon_s"] == {}
     # A leak of the one with the smaller drift explains some of the records as well.
     assert alone > records // 2
+    assert by_chance <= records // 8
 
 
 def test_the_real_accelerometers_share_noise() -> None:

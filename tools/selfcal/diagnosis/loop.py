@@ -139,8 +139,9 @@ def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
 
 
 def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
-    """Drop events of several axes that what was found after them explains as well: noise with a memory, or a law that
-    the first model had not, looks like events to it. Returns the axes whose model changed."""
+    """Drop events of several axes that what was found after them explains as well, and axes of which it explains most:
+    noise with a memory, or a law that the first model had not, looks like events to it, and a leak shows one of another
+    axis again. Returns the axes whose model changed."""
     changed: list[str] = []
     events: dict[int, list[tuple[Diagnosed, Finding]]] = {}
     for one in found.values():
@@ -150,14 +151,19 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
     for parts in sorted(events.values(), key=lambda parts: sum(finding.look.gain for _, finding in parts)):
         price = sum(finding.look.gain for _, finding in parts) - max(finding.look.net for _, finding in parts)
         less = [one.state.without({column.name for column in finding.columns}).refit() for one, finding in parts]
-        gain = sum(
+        gains = [
             one.state.best.ln_likelihood - state.best.ln_likelihood for (one, _), state in zip(parts, less, strict=True)
-        )
-        if gain - price < module.NAMED:
-            for (one, finding), state in zip(parts, less, strict=True):
-                one.findings = [each for each in one.findings if each.event != finding.event]
-                one.state = state
-                changed.append(state.axis)
+        ]
+        most = [gain > 0.5 * finding.look.gain for gain, (_, finding) in zip(gains, parts, strict=True)]
+        kept = [gain for gain, own in zip(gains, most, strict=True) if own]
+        least = NET_LEAST if len(kept) == 1 < len(parts) else module.NAMED
+        stays = sum(kept) - price >= least
+        for (one, finding), state, own in zip(parts, less, most, strict=True):
+            if stays and own:
+                continue
+            one.findings = [each for each in one.findings if each is not finding]
+            one.state = state
+            changed.append(state.axis)
     return changed
 
 
