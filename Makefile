@@ -9,7 +9,7 @@
 #                               effects from physics, by a generator that knows nothing of the detector
 #   make hidden-several [KINDS="step f_walk"] [RECORDS=n] [SEED=n] [OUT=dir]   one cause on several axes: named once?
 #   make false-alarms [RECORDS=n] [SEED=n] [RATE=hz]
-#                               clean axes that diagnose calls inadequate, in the forms of people's logs
+#                               clean axes: what the tests of the readings, identify and diagnose call wrong
 #   make module-null [RECORDS=n] [SEED=n]   the best evidence of several axes on which nothing acts
 #   make soak                   a record of 10^8 bank samples
 #   make tolerances             all that must agree, as one table; fails where a tolerance is not kept
