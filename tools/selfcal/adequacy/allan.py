@@ -24,7 +24,7 @@ from scipy.special import gammaincinv, ndtri
 from selfcal.bank.result import HALF_90, Estimate
 from selfcal.base.grid import runs
 from selfcal.model.file import Group
-from selfcal.model.laws import Law, averaged, named
+from selfcal.model.laws import KINDS, Law, named
 
 _Floats = NDArray[np.float64]
 
@@ -96,24 +96,15 @@ class Terms:
 def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
     """A law at `parameters` (continuous time, units.py), for readings every `dt_s`, means of `block` samples."""
     drift, second = law.node(parameters)
-    variance, lag1 = parameters["N"] ** 2 / dt_s, 0.0
-    if law.coloured_noise:
-        theta = (second - 1.0) / (second + 1.0)
-        variance, lag1 = variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
-    sized = list(law.sized(drift, second))
-    step = sum(term.variance * dt_s for term in sized if term.kind == "walk")
-    lacking = (1.0 - 1.0 / block**2) * step / 6.0
-    markov: list[tuple[complex, complex]] = []
-    for kind, own, alpha, damping in sized:
-        if kind == "oscillation":
-            share = math.sqrt(1.0 - damping**2)
-            mean = 1.0 - (alpha * dt_s) ** 2 * (1.0 - 1.0 / block**2) / 12.0
-            markov.append((own * mean * complex(1.0, -damping / share), alpha * dt_s * complex(damping, -share)))
-        elif kind == "markov":
-            gain, without = averaged(alpha * dt_s, block)
-            markov.append((own * gain, alpha * dt_s))
-            lacking += own * without
-    return Terms(variance, lag1, step, tuple(markov), lacking)
+    white, lag1 = law.noise(second)
+    terms = [KINDS[term.kind].averages(term, dt_s, block) for term in law.sized(drift, second)]
+    return Terms(
+        parameters["N"] ** 2 / dt_s * white,
+        lag1,
+        sum(term.step for term in terms),
+        tuple(pole for term in terms for pole in term.poles),
+        sum(term.lacking for term in terms),
+    )
 
 
 def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
