@@ -31,7 +31,7 @@ _Floats = NDArray[np.float64]
 #: Least length of a record over its longest averaging time: fewer windows say little.
 LONGEST = 5
 #: Step in the ln of a parameter for derivatives.
-_STEP = 1e-3
+STEP = 1e-3
 #: Correlation times after which a Gauss-Markov drift is forgotten.
 _FORGOTTEN = 14.0
 #: Least share of S that S - V keeps (curve_of): nearly equal numbers have a small difference.
@@ -162,7 +162,7 @@ def _around(
         terms = terms_of(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
-    steps = np.eye(ln_estimate.size) * _STEP
+    steps = np.eye(ln_estimate.size) * STEP
     return terms_at, [(terms_at(ln_estimate + step), terms_at(ln_estimate - step)) for step in steps]
 
 
@@ -176,7 +176,7 @@ def information_of(
     _, sides = _around(of, ln_estimate, dt_s, white, block)
     k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
     omega = 2.0 * math.pi * k / n
-    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * _STEP)
+    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * STEP)
     return np.asarray((slopes * np.gradient(k)) @ slopes.T, np.float64)
 
 
@@ -197,7 +197,7 @@ def fit_of(
     information = information_of(of, parameters, dt_s, n, white, block)
     prior = [group.priors[name].ln_sd ** -2 for name in of.parameters]
     terms_at, sides = _around(of, ln_estimate, dt_s, white, block)
-    jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * _STEP)
+    jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * STEP)
     covariance = np.linalg.inv(information + np.diag(prior))
     terms = terms_at(ln_estimate)
     return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.asarray(covariance, np.float64))
