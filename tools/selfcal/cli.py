@@ -6,6 +6,7 @@ A verb's options are annotated on its function (`base/options.py`). A verb is im
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from selfcal.base.options import Option
 #: Exit code of everything the user can put right.
 USER_ERROR = 2
 #: ... after Ctrl-C.
-INTERRUPTED = 130
+INTERRUPTED = 128 + signal.SIGINT
 #: Folder of what compares the method with others; the verb of a file there stands apart in the help.
 _STUDIES = Path(__file__).parent / "studies"
 

@@ -54,10 +54,10 @@ def cell(text: str) -> str:
     return _FORMULA.sub(r"\1'", printable(text))
 
 
-def short(text: str) -> str:
-    """At most 60 printable characters of something found in a file."""
-    clean = "".join(letter if letter.isprintable() else "?" for letter in text[:61])
-    return clean if len(clean) <= 60 else clean[:57] + "..."
+def short(text: str, most: int = 60) -> str:
+    """At most so many printable characters of something found in a file."""
+    clean = "".join(letter if letter.isprintable() else "?" for letter in text[: most + 1])
+    return clean if len(clean) <= most else clean[: most - 3] + "..."
 
 
 def few(names: Sequence[str], most: int, more: str = "more") -> str:

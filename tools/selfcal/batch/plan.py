@@ -379,9 +379,9 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         for rate in document["rates"]:
             times = math.nan if there is None or rate["wish"] != wish["wish"] else rate["duration_s"] / there
             factor = rate["rate_hz"] / document["rate_hz"]
-            if abs(factor / FASTER - 1.0) < 1e-6 and times < WORTH:
+            if math.isclose(factor, FASTER) and times < WORTH:
                 lines.append(f"  by means at {rate['rate_hz']:g} Hz: {duration_words(rate['duration_s'])}")
-            if abs(factor * FASTER - 1.0) < 1e-6 and times < 1.0 / WORTH:
+            if math.isclose(factor * FASTER, 1.0) and times < 1.0 / WORTH:
                 lines.append(f"  means at {rate['rate_hz']:g} Hz suffice: {duration_words(rate['duration_s'])}")
     if document["duration_s"] is not None:
         lines.append(

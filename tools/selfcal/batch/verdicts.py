@@ -16,9 +16,11 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 from selfcal.bank.result import HALF_90, bias_of, likeliest
+from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, shown
 from selfcal.base.grid import bisected
@@ -203,7 +205,7 @@ def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
     if not having:
         return f"no law of the model has {parameter}"
     law = best if best in having else max(having, key=lambda law: probability[law])
-    if law != best and not constant and probability[law] < 0.05:
+    if law != best and not constant and probability[law] < LIKELY:
         there = ", ".join(name for name in axis["parameters"][best] if name != "N")
         return f"its drift is {best}, which has no {parameter}: limit {there}"
     return {**axis["parameters"][law][parameter], "sharpens": True}
@@ -238,15 +240,16 @@ def _rest_s(
     def chance(times: float) -> float:
         """Probability of a verdict at `times` the length."""
         left, moves = sd / math.sqrt(times), sd * math.sqrt(1.0 - 1.0 / times)
-        return _normal((abs(middle) - HALF_90 * left) / moves) + _normal((-abs(middle) - HALF_90 * left) / moves)
+        return sum(NormalDist().cdf((side * abs(middle) - HALF_90 * left) / moves) for side in (1.0, -1.0))
 
     if chance(MOST_TIMES) < CHANCE:
         return None
     return duration_s * math.expm1(bisected(lambda ln: chance(math.exp(ln)) >= CHANCE, 0.0, math.log(MOST_TIMES))[1])
 
 
-def _normal(x: float) -> float:
-    return 0.5 * math.erfc(-x / math.sqrt(2.0))
+def worst(codes: Iterable[int]) -> int:
+    """The exit code of several: 1 goes before 2, and 2 before 0."""
+    return min(filter(None, codes), default=0)
 
 
 def code_of(verdicts: Iterable[Verdict]) -> int:

@@ -219,7 +219,9 @@ def _save_npz(
     for name, (unit, values) in columns.items():
         if name in lsb:
             counts = np.rint(np.asarray(values, np.float64) / lsb[name])
-            arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
+            arrays[name] = counts.astype(
+                np.int16 if np.abs(counts).max(initial=0) <= np.iinfo(np.int16).max else np.int32
+            )
             described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
         else:
             arrays[heading(name, unit)] = np.asarray(values, np.float64)

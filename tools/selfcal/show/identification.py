@@ -14,7 +14,7 @@ from rich.table import Table
 from selfcal.adequacy.document import as_typed, since
 from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
-from selfcal.bank.result import likeliest
+from selfcal.bank.result import FAINT, likeliest
 from selfcal.base import units
 from selfcal.base.errors import called, few, printable
 from selfcal.base.output import TABLE_WIDTH, console_of, table_of
@@ -186,7 +186,7 @@ def _times(intervals: Sequence[Sequence[float]]) -> str:
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
     """The table without the intervals of its last `left_out` columns."""
-    brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
+    brief = {name: place < left_out for place, name in enumerate(("alpha", "N", "K"))}
     names = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
     drift = "K or sigma_m" if "B" not in names else "K, sigma_m or B"
     second = "1/alpha, s" + (", or ratio" if names & set(RATIOS) else "")
@@ -247,7 +247,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         coarse = [
             law
             for law, parameters in axis["parameters"].items()
-            if axis["hypotheses"][law] >= 0.01 and any(e["off_grid"] for e in parameters.values())
+            if axis["hypotheses"][law] >= FAINT and any(e["off_grid"] for e in parameters.values())
         ]
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
@@ -259,7 +259,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         of = _by_reason((named(one), name) for name, one in suspicions.items() if ("added_law" in axes[name]) is chosen)
         failed += [f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in of.items())}"] if of else []
     more = _by_reason(
-        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > 0.01), name)
+        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > FAINT), name)
         for name, more in ((name, axis["more_laws"]) for name, axis in axes.items() if "more_laws" in axis)
     )
     failed += [f"with the laws of sums.yaml: {names}: {laws}" for laws, names in more.items()]

@@ -23,15 +23,9 @@ from selfcal.model.tables import bank_block, make_tables
 SCHEMA = "selfcal.montecarlo/1"
 #: Fewest bank samples.
 MIN_SAMPLES = 10
-#: Most samples of a record: 80 MB.
-MOST_SAMPLES = 10_000_000
-
-
 #: Samples drawn of a bank interval and averaged as the intake does, where the sensor gives as many: their drift's mean
 #: is that of infinitely many to a hundredth of the averaging's effect.
 BLOCK = 10
-
-
 #: Keys of each estimate of the true law in a row.
 ESTIMATE = ("mean", "sd", "q05", "median", "q95")
 

@@ -516,7 +516,7 @@ def _with_coefficients(
     if not math.isfinite(probability):
         probability = 0.0
     sent = [coefficients.get(column, (math.nan, math.nan, 0.0))[:2] for column in columns]
-    used = probability > 0.5
+    used = report.in_use(probability)
     if used:
         result = replace(result, coefficients={law: tuple(sent) for law in result.probability})
     factor = factor_of(model.group_of(report.axis).unit, unit)

@@ -55,13 +55,12 @@ class _Bytes:
 
     def unsigned(self) -> int:
         """Seven bits a byte, the lowest first."""
-        value = shift = 0
-        while shift < 35:
+        value = 0
+        for shift in range(0, 35, 7):
             byte = self.byte()
             value |= (byte & 0x7F) << shift
             if byte < 0x80:
                 return value & 0xFFFFFFFF
-            shift += 7
         raise _Damaged
 
     def signed(self) -> int:
