@@ -61,6 +61,8 @@ def load(
     sources: Sequence[str] = (),
     dbc: Path | str | None = None,
     rate_hz: float | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
 ) -> Recording:
     """Read a recording; of several files, or sensors of a log, one, joined by their time stamps. Readings in memory are
     taken as `Recording.from_arrays` has it, and a Recording as it is.
@@ -73,12 +75,13 @@ def load(
     is left out if it cannot be read.
     `no_time`: the time column is not read. `skip_bad`: lines of a text that are no row are left out and counted.
     `sources`: names of the sensors to read of a log that has several, or one name. `dbc`: what decodes CAN frames.
+    `start_s`, `end_s`: the stretch that is kept (`Recording.between`).
     The recording's `notes` are printed on stderr.
     Raises UserError for any file that is not a sound recording, or is larger than `limits.py` says. O(n); about 2 s
     for 10^6 CSV rows of 7 columns.
     """
     if isinstance(path, Recording):
-        return path
+        return path.between(start_s, end_s)
     rate = _rate(rate if rate_hz is None else rate_hz)
     if not isinstance(units, str | Mapping | None):
         raise UserError(
@@ -116,7 +119,7 @@ def load(
     )
     for text in recording.notes:
         note(f"{recording.path}: {text}")
-    return recording
+    return recording.between(start_s, end_s)
 
 
 def _rate(rate: Any) -> float | None:

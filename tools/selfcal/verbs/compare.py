@@ -36,8 +36,6 @@ def compare(
     limits: shared.LimitsFile = None,
     junit: shared.Junit = None,
     verdicts: shared.Verdicts = None,
-    start_s: shared.Start = None,
-    end_s: shared.End = None,
     gate: shared.Gate = False,
     json: shared.Json = None,
     report: shared.Report = None,
@@ -75,8 +73,7 @@ def compare(
     judged: list[Judged] = []
     by_log: dict[str, dict[str, Any]] = {}
     curves: dict[str, dict[str, Any]] = {}
-    part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
-    part |= reading
+    part: dict[str, Any] = {"axes": axes, "model": model, "gate": gate, **reading}
     names = [
         str(log if isinstance(log, Path | str) else getattr(log, "path", f"arrays {number}"))
         for number, log in enumerate(logs, 1)

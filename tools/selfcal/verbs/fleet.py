@@ -52,8 +52,6 @@ def fleet(
     ] = None,
     axes: shared.Axes = (),
     model: shared.ModelFile = None,
-    start_s: shared.Start = None,
-    end_s: shared.End = None,
     since_power_on_s: shared.SincePowerOn = 0.0,
     gate: shared.Gate = False,
     **reading: Unpack[Reading],
@@ -105,8 +103,8 @@ def fleet(
         None if model is None else str(Path(model).absolute()),
         tuple(axes),
         diagnose,
-        {**reading, **({} if dbc is None else {"dbc": str(Path(dbc).absolute())})},
-        {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
+        {**reading, "since_power_on_s": since_power_on_s, "gate": gate}
+        | ({} if dbc is None else {"dbc": str(Path(dbc).absolute())}),
     )
     version = str(selfcal.__version__)
     kept = Kept(folder, settings_of(options, model_settings_of(loaded), version), key=itemgetter(1))  # its content

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Unpack
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import End, Gate, Json, Logs, ModelFile, Start, to_stderr
+from selfcal.verbs._shared import Gate, Json, Logs, ModelFile, to_stderr
 
 
 def response(
@@ -28,8 +28,6 @@ def response(
     plot: Annotated[
         Path | str | None, option("Save gain, phase and coherence (.png .pdf .svg)", metavar="FILE")
     ] = None,
-    start_s: Start = None,
-    end_s: End = None,
     gate: Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
@@ -40,7 +38,6 @@ def response(
     the user can put right.
     """
     from selfcal.adequacy.document import recording_entry
-    from selfcal.adequacy.identify import stretch_of
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.diagnosis.diagnose import BELOW_LATTICE
     from selfcal.diagnosis.record import of_recording
@@ -56,11 +53,13 @@ def response(
     )
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
+    from selfcal.readings.gate import gated
 
     check_writable(json, plot, inputs=(*list_of(log), model))
     check_picture(plot)
     loaded = Model.load(model)
-    recording = stretch_of(load(log, **reading), loaded, start_s, end_s, gate)
+    recording = load(log, **reading)
+    recording = gated(recording, loaded) if gate else recording
     names = [input] if isinstance(input, str) else list(dict.fromkeys(input))
     if plot is not None and len(names) > 1:
         raise UserError("--plot is of one input: leave it out, or give one --input")

@@ -79,6 +79,12 @@ def _pairs(help: str, name: str, metavar: str) -> Option:
 class Reading(TypedDict, total=False):
     """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
 
+    start_s: Annotated[
+        float | None, option("Begin here, seconds of the recording; default: its start", "--start", metavar="S")
+    ]
+    end_s: Annotated[
+        float | None, option("End before this, seconds of the recording; default: its end", "--end", metavar="S")
+    ]
     rate: Annotated[float | None, option("Sampling rate, for recordings without a t column", metavar="HZ")]
     rate_hz: float | None
     columns: Annotated[
