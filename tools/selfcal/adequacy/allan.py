@@ -101,9 +101,9 @@ def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int 
     return Terms(
         parameters["N"] ** 2 / dt_s * white,
         lag1,
-        sum(term.step for term in terms),
-        tuple(pole for term in terms for pole in term.poles),
-        sum(term.lacking for term in terms),
+        sum(step for step, _, _ in terms),
+        tuple(pole for _, poles, _ in terms for pole in poles),
+        sum(lacking for _, _, lacking in terms),
     )
 
 

@@ -67,7 +67,7 @@ def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Arr
             covariance += term.square * walk
             continue
         x = term.alpha * length
-        mean = np.where(x > 1e-6, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0)
+        mean = -np.expm1(-x) / x
         own = np.where(x > 1e-3, 2.0 * (x + np.expm1(-x)) / np.maximum(x, 1e-3) ** 2, 1.0 - x / 3.0)
         half = 0.5 * length
         gap = np.maximum(apart - half[:, None] - half[None, :], 0.0)

@@ -67,15 +67,9 @@ class Sized(NamedTuple):
     damping: float
 
 
-class Averages(NamedTuple):
-    """A term in readings: variance of a walk's `step`, variance and rate a reading of a Gauss-Markov drift (`poles`),
-    and the white noise that the means are `lacking`. An oscillation is the real part of a drift of complex numbers."""
-
-    step: float = 0.0
-    poles: tuple[tuple[complex, complex], ...] = ()
-    lacking: float = 0.0
-
-
+#: A term in readings: the variance of a walk's step, variances and rates a reading of Gauss-Markov drifts, and the
+#: white noise that the means lack. An oscillation is the real part of a drift of complex numbers.
+Averages = tuple[float, tuple[tuple[complex, complex], ...], float]
 #: Weight of each state now in a term some time on, and the variance that the term gains until then.
 Later = tuple[tuple[_Floats, ...], _Floats]
 
@@ -107,7 +101,7 @@ def _walk_later(term: Sized, time_s: float) -> Later:
 
 def _walk_averages(term: Sized, dt_s: float, block: int) -> Averages:
     step = term.variance * dt_s
-    return Averages(step, lacking=(1.0 - 1.0 / block**2) * step / 6.0)
+    return step, (), (1.0 - 1.0 / block**2) * step / 6.0
 
 
 def _markov_later(term: Sized, time_s: float) -> Later:
@@ -117,7 +111,7 @@ def _markov_later(term: Sized, time_s: float) -> Later:
 
 def _markov_averages(term: Sized, dt_s: float, block: int) -> Averages:
     gain, without = averaged(term.rate * dt_s, block)
-    return Averages(0.0, ((term.variance * gain, term.rate * dt_s),), term.variance * without)
+    return 0.0, ((term.variance * gain, term.rate * dt_s),), term.variance * without
 
 
 def _oscillation_later(term: Sized, time_s: float) -> Later:
@@ -129,7 +123,7 @@ def _oscillation_later(term: Sized, time_s: float) -> Later:
 def _oscillation_averages(term: Sized, dt_s: float, block: int) -> Averages:
     x, share = term.rate * dt_s, math.sqrt(1.0 - term.damping**2)
     variance = term.variance * (1.0 - x**2 * (1.0 - 1.0 / block**2) / 12.0)
-    return Averages(0.0, ((variance * complex(1.0, -term.damping / share), x * complex(term.damping, -share)),))
+    return 0.0, ((variance * complex(1.0, -term.damping / share), x * complex(term.damping, -share)),), 0.0
 
 
 #: Kinds of terms, in the order of `selfcal_term_kind_t`.

@@ -17,7 +17,7 @@ from selfcal.bank.priors import OF_RECORD
 from selfcal.bank.result import FAINT, likeliest
 from selfcal.base import units
 from selfcal.base.errors import called, few, printable
-from selfcal.base.output import TABLE_WIDTH, console_of, table_of
+from selfcal.base.output import TABLE_WIDTH, console_of, print_line, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
@@ -62,7 +62,7 @@ def show(
     if any("regressors" in axis for axis in axes.values()):
         console.print(_regressor_table(axes))
     for line in _notes(document, axes):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        print_line(console, line)
 
 
 def _fitting(console: Console, tables: Sequence[Table]) -> Table:

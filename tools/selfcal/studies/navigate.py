@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import optimize
 
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
@@ -160,8 +160,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
                 last = name == list(filters)[-1]
                 table.add_row(law if name == "sheet" else "", TITLES[name], *cells, word, end_section=last)
         console.print(table)
-    console.print(
+    print_line(
+        console,
         f"NEES: squared error over what the filter states, {document['nees_expected']} of one that is consistent; its "
         f"mean over {document['parts']} parts then lies between {low:.1f} and {high:.1f} in 95 % of cases",
-        highlight=False,
     )

@@ -8,8 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from selfcal.base.errors import printable
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.show.chart import Figure, draw
 from selfcal.show.template import render
 from selfcal.studies.paper_figures import section4
@@ -58,4 +57,4 @@ def show(figures: Sequence[Reproduction], output: Path | str) -> None:
         table.add_row(figure.name, figure.here, figure.verdict)
     console.width = max(console.width, 100)
     console.print(table)
-    console.print(printable(f"page: {output}"), highlight=False, markup=False, soft_wrap=True)
+    print_line(console, f"page: {output}")

@@ -120,8 +120,7 @@ class Table:
         if count < 2:
             what = "one row only" if count else "no rows"
             raise UserError(f"{path}: {self.where}{what}, a recording needs two or more")
-        if count * len(fields) > MOST_NUMBERS:
-            raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns")
+        bound_numbers(path, count * len(fields))
 
         def fail(row: int, number: int | None, what: str) -> NoReturn:
             column = "" if number is None else f"column '{fields[number].name}': "
@@ -211,10 +210,16 @@ def room(data: bytes) -> int:
     return min(MOST_UNPACKED_BYTES, max(MOST_UNPACKED_SMALL, MOST_GROWTH * len(data)))
 
 
+def bound_numbers(path: Path, numbers: int) -> None:
+    """Raise UserError for more numbers than are read."""
+    if numbers > MOST_NUMBERS:
+        more = "cut it in parts, or read fewer columns, those that --column names"
+        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: {more}")
+
+
 def check_numbers(path: Path, numbers: int) -> None:
     """Raise UserError for more numbers than are read, or than a packed file of this size may hold."""
-    if numbers > MOST_NUMBERS:
-        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts")
+    bound_numbers(path, numbers)
     if 8 * numbers > max(MOST_UNPACKED_SMALL, MOST_GROWTH * path.stat().st_size):
         raise UserError(f"{path}: unpacks to more than {MOST_GROWTH} times its size, as no sensor's readings do")
 

@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, short
-from selfcal.base.limits import MOST_NUMBERS
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import TIMES
-from selfcal.logs.loaders.table import Hints, Table, heading, left_out, of_groups
+from selfcal.logs.loaders.table import Hints, Table, bound_numbers, heading, left_out, of_groups
 
 #: Bytes before a segment's content.
 _LEAD = 28
@@ -35,8 +34,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         for group in file.groups():
             for channel in group.channels():
                 numbers += len(channel)
-                if numbers > MOST_NUMBERS:
-                    raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers")
+                bound_numbers(path, numbers)
                 if unknown := _unknown_scale(channel.properties, group.properties, file.properties):
                     unscaled[channel.name] = unknown
                     continue

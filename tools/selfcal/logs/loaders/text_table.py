@@ -31,12 +31,12 @@ from selfcal.base.limits import (
     LONGEST_HEADING,
     MOST_COLUMNS,
     MOST_LEADING_LINES,
-    MOST_NUMBERS,
     MOST_TEXT_GROWTH,
     reading,
 )
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import RECEIVED, number_of
+from selfcal.logs.loaders.table import bound_numbers
 
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
 #: What begins a comment.
@@ -211,11 +211,7 @@ class TextReader:
                 self._fail(lines, None, "an empty line")
             blank = blank or filled < len(batch)
             wanted = [place for place, part in enumerate(parts) if part is not None]
-            if (rows + filled) * len(wanted) > MOST_NUMBERS:
-                raise UserError(
-                    f"{self.path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns, those "
-                    "that --column names"
-                )
+            bound_numbers(self.path, (rows + filled) * len(wanted))
             skipped = len(self._skipped)
             dated = None if time is None else wanted.index(time)
             table = self._parse(batch[:filled], [index[place] for place in wanted], dated)
