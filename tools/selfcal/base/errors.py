@@ -60,7 +60,7 @@ def short(text: str, most: int = 60) -> str:
     return clean if len(clean) <= most else clean[: most - 3] + "..."
 
 
-def few(names: Sequence[str], most: int, more: str = "more") -> str:
+def few(names: Sequence[str], most: int = 5, more: str = "more") -> str:
     """The first of the names, and how many more there are."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} {more}" if rest > 0 else "")

@@ -68,6 +68,8 @@ Scheduler = Annotated[
 Workers = Annotated[
     int | None, option("Processes on this machine; default: one for each processor", metavar="N", min=1)
 ]
+#: Default number of simulated parts.
+PARTS = 200
 Results = Annotated[
     Path | str | None,
     option("Folder that keeps finished records: a later run continues from them", metavar="DIR"),

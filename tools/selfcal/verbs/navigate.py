@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from selfcal.base.options import option
-from selfcal.verbs._shared import Json, Results, Scheduler, shown_by
+from selfcal.verbs._shared import PARTS, Json, Results, Scheduler, shown_by
 
 
 def navigate(
     *,
-    records: Annotated[int, option("Simulated parts of each law", metavar="N")] = 200,
+    records: Annotated[int, option("Simulated parts of each law", metavar="N")] = PARTS,
     seed: Annotated[int, option("Same seed, same parts", metavar="N", min=0)] = 1,
     json: Json = None,
     scheduler: Scheduler = None,

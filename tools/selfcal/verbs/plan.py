@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import Json, Scheduler, to_stderr
+from selfcal.verbs._shared import PARTS, Json, Scheduler, to_stderr
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
@@ -36,7 +36,7 @@ def plan(
     axis: Annotated[
         str | None, option("Axis of the part; default: the first that `simulate` states", metavar="NAME")
     ] = None,
-    records: Annotated[int, option("Simulated parts", metavar="N")] = 200,
+    records: Annotated[int, option("Simulated parts", metavar="N")] = PARTS,
     seed: Annotated[int, option("Same seed, same parts", metavar="N", min=0)] = 1,
     plot: Annotated[Path | str | None, option("Save what is reached over the length", metavar="FILE")] = None,
     response: Annotated[

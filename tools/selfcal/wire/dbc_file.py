@@ -28,8 +28,10 @@ PATTERN = Path(__file__).parent / "frames.dbc"
 AXIS_UNITS = {"gx": "deg/s", "gy": "deg/s", "gz": "deg/s", "ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}
 #: Identifier of node 0's first message, identifiers of a node, and nodes of a bus.
 BASE, NODE_IDS, NODES = 0x200, 128, 12
-#: Signals every frame carries, first bit and number of bits: the value, whose meaning is the item's, has bits 0 to 31.
+#: Signals every frame carries, first bit and number of bits, and the bits before them: those of the value, whose
+#: meaning is the item's.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
+VALUE_BITS = COMMON["item"][0]
 #: Hypotheses and regressor columns that telemetry has room for: as many as a model.
 HYPOTHESES, COLUMNS = MOST_HYPOTHESES, MOST_COLUMNS
 #: Names of the places of a hypothesis' parameters where no model gives better ones.

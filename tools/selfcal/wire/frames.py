@@ -871,7 +871,7 @@ def serial_ports() -> str:
     ports = sorted(port.device for port in comports())
     if not ports:
         return "this machine has none: is the module plugged in?"
-    return f"there are {few(ports, 8)}"
+    return f"there are {few(ports)}"
 
 
 def _can_devices() -> str:

@@ -45,7 +45,7 @@ from selfcal.readings.readings import look
 from selfcal.wire.ahead import error_ahead, of_report
 from selfcal.wire.c_tables import check_forms, write_tables
 from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
-from selfcal.wire.live import View, frame_counts
+from selfcal.wire.live import SILENT_S, View, frame_counts
 
 MAGIC = b"SELFCAL2"
 #: Channels of every sample apart from the model's (port/port.h); not a number if the recording lacks them.
@@ -402,8 +402,7 @@ def _watch(
             if frame is None:
                 silent_s = time.monotonic() - heard
                 ended = module is not None and module.poll() is not None
-                # None will come from firmware that has ended 2 s ago.
-                if link.closed or silent_s > patience_s or (ended and silent_s > 2.0):
+                if link.closed or silent_s > (SILENT_S if ended else patience_s):
                     break
                 continue
             heard = time.monotonic()

@@ -113,7 +113,7 @@ class Reading(TypedDict, total=False):
 
 
 #: Bytes from a file's begin that tell its format.
-_HEAD = 520
+_HEAD = max(at + len(sign) for form in FORMATS for at, sign in form.magic)
 #: What a ROS 2 folder holds.
 _ROS_FOLDER = ("metadata.yaml", "*.db3", "*.mcap")
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from selfcal.base.errors import UserError, printable, short
+from selfcal.base.errors import UserError, few, printable, short
 
 #: Sources that a message lists.
 _MOST_LISTED = 30
@@ -111,9 +111,8 @@ def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
 def _listed(sources: dict[str, list[Part]], axes: dict[str, frozenset[str]], names: Sequence[str]) -> str:
     """The option to type for each source, with its axes, rate and length."""
     lines = []
-    for name in names[:_MOST_LISTED]:
+    for name in names:
         part = max(sources[name], key=lambda one: (bool(one.axes), one.rate_hz))
         of = " ".join(sorted(axes[name], key=lambda axis: (axis[0] != "g", axis))) or "no axis"
         lines.append(f"--source '{printable(name)}' ({of}; {part.rate_hz:.4g} Hz, {part.span()[1]:.4g} s)")
-    more = f"; {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
-    return f"give {', '.join(lines)}{more}"
+    return f"give {few(lines, _MOST_LISTED)}"

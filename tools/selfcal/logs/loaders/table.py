@@ -117,9 +117,7 @@ class Table:
                 raise UserError(f"{column} holds no numbers (its type is {short(str(member.dtype))})")
             if member.shape[0] != count:
                 raise UserError(f"{column} has {member.shape[0]} rows, '{fields[0].name}' has {count}")
-        if count < 2:
-            what = "one row only" if count else "no rows"
-            raise UserError(f"{path}: {self.where}{what}, a recording needs two or more")
+        check_rows(f"{path}: {self.where}", count)
         bound_numbers(path, count * len(fields))
 
         def fail(row: int, number: int | None, what: str) -> NoReturn:
@@ -167,7 +165,7 @@ def of_groups(
 
 def left_out(names: Sequence[str], by: str) -> tuple[str, ...]:
     """The note on channels that are left out, if there are any. `by`: what their values take that is not done."""
-    named = few(list(map(short, names)), 6)
+    named = few(list(map(short, names)))
     return (f"left out: {named}: their values come by {by}: export them as physical values",) if names else ()
 
 
@@ -208,6 +206,12 @@ def content(path: Path) -> bytes:
 def room(data: bytes) -> int:
     """Bytes that a whole file may unpack to."""
     return min(MOST_UNPACKED_BYTES, max(MOST_UNPACKED_SMALL, MOST_GROWTH * len(data)))
+
+
+def check_rows(where: str, count: int) -> None:
+    """Raise UserError for fewer rows than a recording needs. `where`: the file, and the place in it."""
+    if count < 2:
+        raise UserError(f"{where}{'one row only' if count else 'no rows'}, a recording needs two or more")
 
 
 def bound_numbers(path: Path, numbers: int) -> None:

@@ -36,7 +36,7 @@ from selfcal.base.limits import (
 )
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import RECEIVED, number_of
-from selfcal.logs.loaders.table import bound_numbers
+from selfcal.logs.loaders.table import bound_numbers, check_rows
 
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
 #: What begins a comment.
@@ -226,9 +226,9 @@ class TextReader:
             lines += len(batch) if self._skip_bad else filled
             rows += len(table)
             batch = self._lines.more()
-        if rows < 2:
-            what = "one row only, a recording needs two or more" if rows else "there is a header but no rows"
-            raise UserError(f"{self.path}: line {self._row + rows - 1}: {what}")
+        if not rows:
+            raise UserError(f"{self.path}: line {self._row - 1}: there is a header but no rows")
+        check_rows(f"{self.path}: line {self._row + rows - 1}: ", rows)
         self.places = np.concatenate(places) if self._skip_bad else None
         whole: list[NDArray[np.float64] | None] = []
         while parts:  # no column stays in both forms

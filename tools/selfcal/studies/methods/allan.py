@@ -26,7 +26,7 @@ def slopes(problem: Problem) -> Answer:
     ln_tau, ln_deviation = np.log(m * problem.dt_s), np.log(deviation)
     slope = np.gradient(ln_deviation, ln_tau) if m.size > 1 else np.array([-0.5])
     # A slope within 1/4 of +-1/2 is half-way to the flat part.
-    falling, rising = np.abs(slope + 0.5) <= 0.25, np.abs(slope - 0.5) <= 0.25
+    falling, rising = (np.abs(slope - own) <= 0.25 for own in (-0.5, 0.5))
     falling &= np.cumsum(~falling) == 0  # the first stretch alone: later points may fall by chance
     if not falling.any():
         falling[0] = True
