@@ -327,5 +327,7 @@ def duration_words(seconds: float) -> str:
     return f"{math.ceil(seconds / 86400.0)} days"
 
 
+#: Usual unit of each axis of an inertial unit: of its counts, on the wire, and of a simulated part.
+SENSOR_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in ("gx", "gy", "gz", "ax", "ay", "az")}
 #: Axes of an inertial unit: sensor columns unless a model names others.
-SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
+SENSORS = tuple(SENSOR_UNITS)

@@ -16,7 +16,7 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, short
 from selfcal.base.limits import LONGEST_HEADING, MOST_HEADINGS
 from selfcal.base.options import Scale
-from selfcal.base.units import SENSORS
+from selfcal.base.units import SENSOR_UNITS
 from selfcal.logs import written
 from selfcal.logs.loaders.damage import SOUND
 from selfcal.logs.loaders.headings import PART, Meaning, Sensor, sensors_of, split
@@ -25,8 +25,6 @@ from selfcal.logs.loaders.text_table import is_clock, is_date, is_row
 from selfcal.logs.loaders.texts import Text
 from selfcal.logs.recorded import SIDE_UNITS
 
-#: Unit of a scaled LSB column where the scale states none.
-LSB_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in SENSORS}
 #: What to type where no heading is a sensor's.
 NAME_YOURS = "name yours with --column gx=NAME, and --unit gx=UNIT where its heading has none"
 #: Columns without a unit that begin with a whole number, from which on they may be counts.
@@ -179,7 +177,7 @@ class Header:
         if not any(name in self.sensors for name in names):
             none = f"{self.path}: {where}no sensor column ({', '.join(self.sensors)}) among '{short(','.join(keys))}'; "
             if is_row(",".join(keys)):
-                headings = ",".join(["t[s]", *(f"{name}[{unit}]" for name, unit in LSB_UNITS.items())])
+                headings = ",".join(["t[s]", *(f"{name}[{unit}]" for name, unit in SENSOR_UNITS.items())])
                 raise UserError(f"{none}put a line of headings before it, such as {headings}, in the columns' order")
             raise UserError(f"{none}{NAME_YOURS}")
         return fields
@@ -287,7 +285,7 @@ class Header:
         dates = dates and name == "t" and stated is None
         unit = "s" if dates else unit
         known = isinstance(unit, str) and units.known(unit)
-        example = {"t": "s", **SIDE_UNITS, **LSB_UNITS}.get(name, "UNIT")
+        example = {"t": "s", **SIDE_UNITS, **SENSOR_UNITS}.get(name, "UNIT")
         to_scale = (
             f"give --scale {shlex.quote(f'{name}=SIZE[{example}]')}, SIZE the {example} of one '{short(str(unit))}'"
         )
@@ -314,9 +312,9 @@ class Header:
         if unit == units.LSB:
             given = self.scale.get("") if scaled is None else scaled
             if given is None:
-                self.without_size.append((key, name, LSB_UNITS.get(name, "UNIT")))
+                self.without_size.append((key, name, SENSOR_UNITS.get(name, "UNIT")))
                 return []
-            size, unit = given[0], units.plain(given[1]) if given[1] else LSB_UNITS.get(name)
+            size, unit = given[0], units.plain(given[1]) if given[1] else SENSOR_UNITS.get(name)
             if unit is None or not units.known(unit) or unit == units.LSB:
                 raise UserError(f"{column} is in LSB: --scale needs a unit, --scale {name}={size:g}[unit]")
         elif scaled is not None:

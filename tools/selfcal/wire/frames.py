@@ -24,16 +24,17 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from selfcal import _firmware, _library32
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, few, install
+from selfcal.base.units import SENSOR_UNITS, SENSORS
 from selfcal.logs.framelog import LONGEST_FRAME
 from selfcal.model.file import Model
-from selfcal.wire.dbc_file import AXIS_UNITS, BASE, BY_PLACE, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
+from selfcal.wire.dbc_file import BASE, BY_PLACE, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
 
 if TYPE_CHECKING:
     import can
     from cantools.database.can import Database, Message
 
 #: Axis messages are named after the axis, in capitals.
-AXES = tuple(AXIS_UNITS)
+AXES = SENSORS
 STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "ANSWER", "TUMBLE"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 #: Moduli of the counter and of the time, s. Beyond half of them forward and backward are alike.
@@ -69,7 +70,7 @@ def axis_unit(axis: str) -> str:
     """Unit of an axis's readings on the wire. Raises UserError for an axis that has no message."""
     if axis not in AXES:
         raise UserError(f"axis '{axis}' has no telemetry message (there are {', '.join(AXES)})")
-    return AXIS_UNITS[axis]
+    return SENSOR_UNITS[axis]
 
 
 def names_of(model: Model) -> Names:
