@@ -236,11 +236,8 @@ class Handling:
 NOT_HANDLED = Handling()
 
 
-@dataclass(frozen=True)
-class GridNodes:
-    """Filter nodes of one target, by hypothesis: of rho, and of alpha or the ratio if the law has one."""
-
-    of: Mapping[str, tuple[int, ...]]
+#: Filter nodes of one target, by hypothesis: of rho, and of alpha or the ratio if the law has one.
+GridNodes = Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -703,7 +700,7 @@ class _Reader:
                 shape = f"[{', '.join(what)}]" if len(what) > 1 else f"a number of {what[0]}"
                 raise self.fail(f"{where}.{name}", f"must be {shape}")
             of_laws[name] = tuple(self.count(count, f"{where}.{name}", *NODES) for count in counts)
-        return GridNodes(of_laws)
+        return of_laws
 
     def term(self, tree: Any, where: str) -> Term:
         fields = {"kind": tree} if isinstance(tree, str) else tree

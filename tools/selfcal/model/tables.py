@@ -245,7 +245,7 @@ def make_tables(
     _check_times(model, block / rate_hz)
 
     def grids(name: str) -> tuple[Grid | None, Grid | None]:
-        counts = nodes.of.get(name, ())
+        counts = nodes.get(name, ())
         rho, alpha = (*(make_grid(count) for count in counts), None, None)[:2]
         return rho, alpha
 

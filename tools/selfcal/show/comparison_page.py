@@ -12,18 +12,12 @@ import numpy as np
 from markupsafe import Markup
 
 from selfcal.base.errors import short
-from selfcal.base.output import write_text
 from selfcal.base.units import typeset
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
 from selfcal.show.template import render
 
 #: Allan deviations by axis and recording: the key `allan` of `selfcal.identify/1`.
 Curves = Mapping[str, Mapping[str, Mapping[str, Any]]]
-
-
-def write_page(path: Path | str, document: Mapping[str, Any], curves: Curves) -> None:
-    """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
-    write_text(path, page(document, curves))
 
 
 def page(document: Mapping[str, Any], curves: Curves) -> str:

@@ -51,7 +51,7 @@ def compare(
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     from selfcal.base.ending import Held
-    from selfcal.base.output import check_writable, write_json
+    from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.batch.compare import LIMIT, SCHEMA, compared_of, quantities, verdict
     from selfcal.batch.fail_on import CHANGED, check
     from selfcal.batch.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
@@ -114,9 +114,9 @@ def compare(
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
     if report is not None and not none:
-        from selfcal.show.comparison_page import write_page
+        from selfcal.show.comparison_page import page
 
-        write_page(report, document, curves)
+        write_text(report, page(document, curves))
     if none:
         reasons = "; ".join(f"{name}: {', '.join(axis.errors)}" for name, axis in compared.items())
         raise UserError(f"no axis can be compared ({reasons})")

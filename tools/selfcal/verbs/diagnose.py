@@ -72,7 +72,7 @@ def diagnose(
     from selfcal.adequacy.identify import chosen_axes
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.ending import held
-    from selfcal.base.output import check_writable, write_json
+    from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.base.progress import Doing
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
@@ -88,7 +88,7 @@ def diagnose(
     from selfcal.show.results import Diagnosis
 
     if report is not None:
-        from selfcal.show.diagnosis_page import write_page
+        from selfcal.show.diagnosis_page import page
 
     check(fail_on)
     check_options(limits, junit, verdicts)
@@ -111,7 +111,7 @@ def diagnose(
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
-                        write_page(report, document, record, {})
+                        write_text(report, page(document, record, {}))
                     write_json(document, json)
                 raise _unjudged(recording, errors, ending)
             doing.now("held-out gain")
@@ -144,7 +144,7 @@ def diagnose(
                 write_extended(write_model, tree, recording.path, read_out, out)
             if report is not None:
                 doing.now("pictures")
-                write_page(report, document, record, diagnosed, options_given(axes, model, decimate, recording))
+                write_text(report, page(document, record, diagnosed, options_given(axes, model, decimate, recording)))
     add_verdicts(document, bounds, junit, verdicts)
     write_json(document, json)
     return Diagnosis(document)

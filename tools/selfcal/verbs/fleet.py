@@ -68,7 +68,7 @@ def fleet(
     from operator import itemgetter
 
     import selfcal
-    from selfcal.base.output import check_writable, write_json
+    from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.batch.batch_summary import document_of, lines_of, summed_up
     from selfcal.batch.fail_on import check
     from selfcal.batch.fleet import document_with, judged_units
@@ -136,13 +136,13 @@ def fleet(
         document["words"] += lines_of_priors(write_priors(write_model, loaded, summary), loaded)
     write_json(document, json)
     if report is not None:
-        from selfcal.batch.fleet_page import write_page
+        from selfcal.batch.fleet_page import page
 
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
         pages: dict[str, str] = {}
         if diagnose:
             pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, kept, workers)
-        write_page(report, document, summary, pages)
+        write_text(report, page(document, summary, pages))
     return document
 
 
