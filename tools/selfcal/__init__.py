@@ -118,7 +118,7 @@ def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
         for name in options if known is not None else ():
             if name not in known.parameters:
                 near = get_close_matches(name, list(known.parameters), 1)
-                raise UserError(f"{function.__name__}() has no keyword {name}" + "".join(f": {one}?" for one in near))
+                raise UserError(f"{function.__name__}() has no keyword {name}" + "".join(f": {word}?" for word in near))
         try:
             return function(*arguments, **options)
         except UserError as error:

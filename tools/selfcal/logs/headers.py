@@ -88,11 +88,11 @@ class Header:
 
     def of_part(self, several: bool) -> Header:
         """The same for one of the file's parts."""
-        one = copy(self)
-        one.several, one.notes, one.without_unit, one.without_size = several, [], [], []
-        one.damaged = SOUND
-        one.whole = set()
-        return one
+        part = copy(self)
+        part.several, part.notes, part.without_unit, part.without_size = several, [], [], []
+        part.damaged = SOUND
+        part.whole = set()
+        return part
 
     def knows_in(self, text: Text) -> Callable[[Sequence[str]], bool]:
         """Whether one of a line's headings is a sensor's, in a text. Only so many are looked at."""
@@ -110,8 +110,8 @@ class Header:
         """The sensors of a table with these headings, after the lines `before` of a text."""
         found = []
         for sensor in sensors_of(file or self.path.name, keys, self.sensors, self.mapped(keys), before):
-            meant = {key: one for key, one in sensor.meant.items() if not one.optional or self._asks(key, one.name)}
-            if any(one.name in self.sensors for one in meant.values()) or len(meant) == len(sensor.meant):
+            meant = {key: own for key, own in sensor.meant.items() if not own.optional or self._asks(key, own.name)}
+            if any(own.name in self.sensors for own in meant.values()) or len(meant) == len(sensor.meant):
                 found.append(replace(sensor, meant=meant))
         return found
 
@@ -237,7 +237,7 @@ class Header:
         name = split(key)[0]
         matrix, _, number = name.rpartition(":")
         here = {"t", *self.sensors, *SIDE_UNITS}
-        return [one for one in (key, name, *([matrix] if number.isdigit() else [])) if one not in here]
+        return [own for own in (key, name, *([matrix] if number.isdigit() else [])) if own not in here]
 
     def _what_to_state(self) -> str:
         """The options to type for the columns without a unit or a size, by the file's own names."""
@@ -247,10 +247,10 @@ class Header:
                 f"column '{name}' has no unit: write {name}[{unit}] in the header or give --unit {name}={unit}, or the "
                 "unit that it is in"
             )
-        counts = [one for one in self.without_unit if one[0] in self.whole]
+        counts = [column for column in self.without_unit if column[0] in self.whole]
         if len({name for _, name, _ in counts}) < _COUNTS_FROM:  # one alone may be a whole number by chance
             counts = []
-        stated = [one for one in self.without_unit if one not in counts]
+        stated = [column for column in self.without_unit if column not in counts]
         typed = [f"--unit {name}={unit}" for name, unit in self._by_own_names(stated)]
         typed += [f"--unit {name}={units.LSB}" for name, _ in self._by_own_names(counts)]
         typed += [f"--scale {name}=SIZE[{unit}]" for name, unit in self._by_own_names([*counts, *self.without_size])]
@@ -266,7 +266,7 @@ class Header:
         """For each option to type the name, quoted, and the unit. Columns of one matrix and kind share an option."""
         typed: dict[str, str] = {}
         for key, name, unit in columns:
-            own = [one for one in self._own_names(key) if "=" not in one]
+            own = [heading for heading in self._own_names(key) if "=" not in heading]
             typed[shlex.quote(own[-1] if own and split(key)[0] != name else name)] = unit
         return list(typed.items())
 

@@ -51,10 +51,10 @@ class Laid:
 def laid_out(recording: Recording) -> Laid:
     """The table of a recording."""
     of: dict[int, list[str]] = {id(None): []}
-    for name, one in recording.columns.items():
-        of.setdefault(id(one.clock), []).append(name)
+    for name, column in recording.columns.items():
+        of.setdefault(id(column.clock), []).append(name)
     clocks = [recording.clock_of(names[0]) for names in of.values()]
-    stamps = [one.time_s if one.off_grid_s is None else one.time_s + one.off_grid_s for one in clocks]
+    stamps = [clock.time_s if clock.off_grid_s is None else clock.time_s + clock.off_grid_s for clock in clocks]
     t, rows = _rows(stamps, _ONE_ROW / recording.rate_hz)
 
     def cells(values: NDArray[Any], at: Rows) -> Array:
@@ -63,15 +63,15 @@ def laid_out(recording: Recording) -> Laid:
         return full
 
     at = {name: place for names, place in zip(of.values(), rows, strict=True) for name in names}
-    table = {name: (one.unit, cells(one.values, at[name])) for name, one in recording.columns.items()}
+    table = {name: (column.unit, cells(column.values, at[name])) for name, column in recording.columns.items()}
     for ending, clock, own in zip(_endings(len(clocks)), clocks, rows, strict=True):
         if len(clocks) > 1 or clock.missing_before.any():
             table[SAMPLE + ending] = ("", cells(clock.place, own))
         if clock.off_grid_s is not None and not np.array_equal(t[own] - clock.time_s, clock.off_grid_s):
             table[LATE + ending] = ("", cells(clock.off_grid_s, own))
     entries = [
-        {"columns": names, "rate_hz": one.rate_hz, "start_s": one.start_s, "stamped": one.off_grid_s is not None}
-        for names, one in zip(of.values(), clocks, strict=True)
+        {"columns": names, "rate_hz": clock.rate_hz, "start_s": clock.start_s, "stamped": clock.off_grid_s is not None}
+        for names, clock in zip(of.values(), clocks, strict=True)
     ]
     kept = {key: value for key, value in recording.meta.items() if key not in _OF_TABLE}
     notes = [note for note in recording.notes if note != recording.damaged.words]  # this file is sound
@@ -98,7 +98,7 @@ def _rows(stamps: Sequence[Array], near_s: float) -> tuple[Array, list[Rows]]:
     than `near_s` share a row; each sample of one clock has a row of its own."""
     if len(stamps) == 1:
         return stamps[0], [np.arange(stamps[0].size)]
-    time, clock = np.concatenate(stamps), np.repeat(np.arange(len(stamps)), [one.size for one in stamps])
+    time, clock = np.concatenate(stamps), np.repeat(np.arange(len(stamps)), [own.size for own in stamps])
     order = np.argsort(time, kind="stable")
     time, clock = time[order], clock[order]
     group = np.cumsum(np.diff(time, prepend=-np.inf) >= near_s)

@@ -256,7 +256,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
     for said, chosen in (("identified with", True), ("strongest suspicion", False)) if suspicions else ():
         from selfcal.diagnosis.words import named  # it takes a second
 
-        of = _by_reason((named(one), name) for name, one in suspicions.items() if ("added_law" in axes[name]) is chosen)
+        of = _by_reason((named(why), name) for name, why in suspicions.items() if ("added_law" in axes[name]) is chosen)
         failed += [f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in of.items())}"] if of else []
     more = _by_reason(
         (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > FAINT), name)
@@ -289,7 +289,7 @@ def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
             same[1].append(name)
             same[2].append(outcome)
     for check, outcomes in lasting.items():
-        for names, intervals in events_of({name: one["intervals"] for name, one in outcomes.items()}).items():
+        for names, intervals in events_of({name: outcome["intervals"] for name, outcome in outcomes.items()}).items():
             events.append((check, [*names], [{**outcomes[names[0]], "intervals": intervals}]))
     return events
 
@@ -301,7 +301,9 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
     once = [{*names} for check, names, _ in events if check in ("turn_on", "jump")]
     # An axis goes like another one by an event of both.
     events = [
-        one for one in events if one[0] != "channel" or not any({one[2][0]["column"], *one[1]} <= both for both in once)
+        event
+        for event in events
+        if event[0] != "channel" or not any({event[2][0]["column"], *event[1]} <= both for both in once)
     ]
     lines = []
     for check, names, outcomes in events:
@@ -322,21 +324,21 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
         elif failed:
             alike.setdefault(tuple(failed), []).append(name)
     for checks, names in alike.items():
-        told = [_range_of(one, [axes[name]["checks"][one] for name in names]) for one in checks if one != "allan"]
+        said = [_range_of(test, [axes[name]["checks"][test] for name in names]) for test in checks if test != "allan"]
         off = [each for name in names for each in _off(axes[name])]
         each = off if len(names) == 1 else [min(off), max(off)]  # allan_16s model -9 %, 128s +22 %
-        told += (
+        said += (
             [f"allan_{', '.join(f'{tau} {most:+.0f} %' for most, tau in each).replace(' ', ' model ', 1)}"]
             if off
             else []
         )
-        lines.append(f"not adequate: {', '.join(names)}: {'; '.join(told)}")
+        lines.append(f"not adequate: {', '.join(names)}: {'; '.join(said)}")
     return [*lines, *([f"not adequate: statistics of {', '.join(beside)} as well"] if beside else [])]
 
 
 def _failed(axis: Mapping[str, Any]) -> list[str]:
     """Statistics of an axis that speak against its law."""
-    return [check for check, one in axis["checks"].items() if check.startswith(STATISTICS) and not one["passed"]]
+    return [check for check, own in axis["checks"].items() if check.startswith(STATISTICS) and not own["passed"]]
 
 
 def _off(axis: Mapping[str, Any]) -> list[tuple[float, str]]:

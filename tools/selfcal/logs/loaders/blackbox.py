@@ -290,7 +290,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         tables += [table] if table is not None else []
     if not tables:
         raise UserError(f"{path}: no log in it has frames with gyroADC")
-    tables = [replace(one, damaged=damaged) for one in tables]
+    tables = [replace(table, damaged=damaged) for table in tables]
     return [replace(tables[0], source="")] if len(tables) == 1 else tables
 
 

@@ -250,7 +250,7 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
         )
     found = []
     for source, meant in axes.items():
-        named = [one.name for one in meant.values()]
+        named = [meaning.name for meaning in meant.values()]
         if len(set(named)) < len(named):
             return []  # not this form's
         found.append(Sensor(source, {**meant, **_time(form, free, taken, source), **_temperature(form, free, source)}))
@@ -261,7 +261,7 @@ def _axes(form: _Form, keys: Sequence[str]) -> Iterator[tuple[str, str, re.Match
     """Letter, heading, match and stated unit of a form's axes. In the last form a stated unit tells the sensor, and
     where no name is a gyro's or an accelerometer's, the unit alone does."""
     found = [
-        (letter, *one) for pattern, letter in ((form.gyro, "g"), (form.accel, "a")) for one in _matching(pattern, keys)
+        (letter, *own) for pattern, letter in ((form.gyro, "g"), (form.accel, "a")) for own in _matching(pattern, keys)
     ]
     if form is not FORMS[-1]:
         yield from found
@@ -319,13 +319,13 @@ def _temperature(form: _Form, keys: Sequence[str], source: str) -> dict[str, Mea
         ((match.groupdict().get("source") or "").strip("/. "), key, stated)
         for key, match, stated in _matching(form.temperature, keys)
     ]
-    of = [one for one in found if one[0] == source] or (found if len(found) == 1 else [])
+    of = [entry for entry in found if entry[0] == source] or (found if len(found) == 1 else [])
     return {key: Meaning("temp", stated or (None if form is FORMS[-1] else "degC")) for _, key, stated in of[:1]}
 
 
 def _matching(pattern: str | tuple[str, ...], keys: Sequence[str]) -> Iterator[tuple[str, re.Match[str], str | None]]:
     """Heading, match and the unit that it states, of the headings that one of the patterns fits."""
-    patterns = [one for one in ([pattern] if isinstance(pattern, str) else pattern) if one]
+    patterns = [choice for choice in ([pattern] if isinstance(pattern, str) else pattern) if choice]
     for key in keys if patterns else ():
         match, unit = _first(patterns, key), None
         if match is None:

@@ -106,8 +106,8 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: rename it: a ROS 2 bag with '%', '?' or '#' in a name cannot be opened")
     topics: dict[tuple[str, str], Topic] = {}
     with (Reader1 if first else Reader2)(path) as bag:
-        kinds = {one.id: one.msgtype for one in bag.connections}
-        wanted = [one for one in bag.connections if one.msgtype in LAYOUTS]
+        kinds = {connection.id: connection.msgtype for connection in bag.connections}
+        wanted = [connection for connection in bag.connections if connection.msgtype in LAYOUTS]
         for connection, _received, data in bag.messages(wanted) if wanted else ():
             topic = topics.setdefault((connection.topic, connection.msgtype), Topic(connection.msgtype))
             topic.take(data, cdr=not first)

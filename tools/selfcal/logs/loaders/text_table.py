@@ -566,7 +566,7 @@ def _with_units(line: str, after: Sequence[str]) -> str:
     """A line of headings with the units of the line after it, where that is nothing but units; else empty."""
     for sign in (*_SEPARATORS, " "):
         names, stated = (
-            [cell.strip(signs) for one in lines for cell in one.split(None if sign == " " else sign)]
+            [cell.strip(signs) for text in lines for cell in text.split(None if sign == " " else sign)]
             for lines, signs in (([line], ' "'), (after, ' "[]'))
         )
         if len(names) != len(stated) or not 1 < len(names) <= MOST_COLUMNS or max(map(len, stated)) > LONGEST_HEADING:
