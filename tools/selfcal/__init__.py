@@ -29,7 +29,7 @@ from typing import Any
 #: File of each verb; it has a function of its name.
 VERBS = {path.stem: path for path in sorted((Path(__file__).parent / "verbs").glob("[a-z]*.py"))}
 
-#: What scripts take beside the verbs, and where it is.
+#: Names that scripts take apart from the verbs, and their modules.
 _OTHERS = {
     "load": "logs.recording",
     "save": "logs.recording",
@@ -38,7 +38,7 @@ _OTHERS = {
 }
 #: Instructions of newer processors that a compiled module has a build for.
 _BUILDS = {"_library32": "fma", "_likelihood": "avx2", "_joint": "avx2"}
-#: Lines of /proc/cpuinfo that tell of the first core.
+#: Lines of /proc/cpuinfo that describe the first core.
 MOST_LINES = 100
 
 

@@ -168,7 +168,7 @@ def main() -> NoReturn:
     install()
     # The matrices are small, and axes run side by side: threads of one product wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if not sys.warnoptions:  # a library's warning is none for the user
+    if not sys.warnoptions:  # a library's warnings are not for the user
         warnings.simplefilter("ignore")
     try:
         name, *rest = sys.argv[1:] or ["--help"]

@@ -151,7 +151,7 @@ def compared_of(
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """Print for each pair of recordings a line a change, the largest first, then the findings of each recording that
-    matter, as `diagnose` tells them."""
+    matter, as `diagnose` words them."""
     from selfcal.show.comparison_page import names_of, told_of
 
     console, names = console_of(to_stderr=to_stderr), names_of(document)

@@ -21,9 +21,9 @@ from selfcal.logs.loaders.damage import SOUND, Damaged
 if TYPE_CHECKING:
     import can
 
-#: What `monitor --log` writes, and what --read reads.
+#: Suffixes that `monitor --log` writes and --read reads.
 WRITTEN = (".asc", ".blf", ".csv", ".log", ".mcap", ".trc")
-#: Those that are no text.
+#: Suffixes of binary logs.
 BINARY = (".blf", ".mcap")
 
 #: Of Vector's BLF: sizes of the file's header and of the file, then an object's signature, size and kind; a
@@ -74,7 +74,7 @@ class FrameLog:
     def __init__(self, path: Path | str, speed: float | None = None) -> None:
         import can
 
-        logging.getLogger("can").setLevel(logging.CRITICAL)  # its readers tell of lines that they leave out
+        logging.getLogger("can").setLevel(logging.CRITICAL)  # its readers report the lines that they skip
         self.path = Path(path)
         self.closed = False
         self.damage = ""
@@ -340,7 +340,7 @@ def _check_blf(path: Path) -> Damaged:
     checksum not to fit, holds up to there, and does not look for the end that the header states. Raises UserError for a
     BLF file on which it would take all memory, or go round for ever.
 
-    A file is a header and objects; an object's header tells its size, and a container holds objects, packed by zlib.
+    A file is a header and objects; an object's header has its size, and a container holds objects, packed by zlib.
     """
     damaged = SOUND
     with path.open("rb") as file:

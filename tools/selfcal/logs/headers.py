@@ -334,7 +334,7 @@ def _called(keys: Sequence[str], wanted: str) -> list[str]:
 
 
 def number_in(value: Any) -> float:
-    """A JSON value as a number; NaN if it is none."""
+    """A JSON value as a number; NaN for any other value."""
     try:
         return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     except OverflowError:

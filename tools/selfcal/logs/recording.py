@@ -2,7 +2,7 @@
 
 Text has one header row of `name[unit]`. An npz has one 1-D array a column, named like the header, or named plainly
 with unit and LSB in a JSON text `meta`: {"rate_hz": 100.0, "columns": {"gx": {"unit": "deg/s", "lsb": 0.05}}}. A text
-file may have such a text beside it, LOG.meta.json. Every fault raises UserError with file, line and column in one line.
+file may have such a text as LOG.meta.json. Every fault raises UserError with file, line and column in one line.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def load(
     true rate.
     `columns`: name here -> header in the file. `units`: name here -> unit; it takes the header's place.
     `scale`: size of one LSB, for all LSB columns or by name, with its unit (default deg/s for g*, m/s^2 for a*).
-    `sensors`: columns of which at least one must be there. A column that is none of these, nor temperature or supply,
+    `sensors`: columns of which at least one must be there. Any other column, except temperature and supply,
     is left out if it cannot be read.
     `no_time`: the time column is not read. `skip_bad`: lines of a text that are no row are left out and counted.
     `sources`: names of the sensors to read of a log that has several, or one name. `dbc`: what decodes CAN frames.
@@ -157,7 +157,7 @@ def list_of(paths: Data) -> list[Path]:
 
 
 def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
-    """The sensors of one file that are meant, or of the tables that are `there`, and the temperatures beside them, each
+    """The sensors of one file that are meant, or of the tables that are `there`, and their temperatures, each
     by its own clock."""
     path, wanted = header.path, header.asked.sources
     hints: Hints = {} if header.asked.dbc is None else {"dbc": str(header.asked.dbc)}

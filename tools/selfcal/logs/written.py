@@ -29,7 +29,7 @@ from selfcal.logs.loaders.table import heading, meta_place
 from selfcal.logs.recorded import Recording
 from selfcal.logs.timebase import Clock
 
-#: Headings, without a unit, of the columns beside those of the recording.
+#: Headings, without a unit, of the columns that are not the recording's.
 SAMPLE, LATE = "sample", "late"
 #: Stamps of several clocks closer than this, as a share of the fastest axes' interval, are one row.
 _ONE_ROW = 0.01
@@ -83,7 +83,7 @@ def _endings(clocks: int) -> list[str]:
 
 
 def marks_of(meta: Mapping[str, Any]) -> set[str]:
-    """Headings of the columns beside the recording's in a table with this `meta`; none where it states no clocks."""
+    """Headings of the columns that are not the recording's in a table with this `meta`; empty without clocks."""
     endings = _endings(len(meta["clocks"])) if stated(meta) else []
     return {name + ending for ending in endings for name in (SAMPLE, LATE)}
 
@@ -118,7 +118,7 @@ def clocks_of(
     path: object, meta: Mapping[str, Any], t: Array, marks: Mapping[str, Array], places: Rows | None
 ) -> list[tuple[list[str], Clock, Rows]]:
     """Of each clock that `meta` states the columns' names, the clock and the rows of its samples in a table with the
-    stamps `t` [n], s, and the columns `marks` beside the recording's. `places` [n]: lines of the rows, some of which
+    stamps `t` [n], s, and the further columns `marks`. `places` [n]: lines of the rows, some of which
     were skipped. Raises UserError."""
     found = []
     for number, (entry, ending) in enumerate(zip(meta["clocks"], _endings(len(meta["clocks"])), strict=True)):
@@ -166,8 +166,8 @@ def save(
 ) -> None:
     """Write a recording that `load` reads back; the suffix (.csv, .csv.gz, .npz) chooses the form.
 
-    `columns`: name -> (unit, float[n]); a unit "" is none. `t` float[n], s: time stamps; None is an even grid from 0.
-    `meta`: JSON values, kept in the npz or beside the CSV file as LOG.meta.json. `lsb`: name -> size of one LSB in the
+    `columns`: name -> (unit, float[n]); "" is no unit. `t` float[n], s: time stamps; None is an even grid from 0.
+    `meta`: JSON values, kept in the npz or next to the CSV file as LOG.meta.json. `lsb`: name -> size of one LSB in the
     column's unit: npz stores such a column as whole numbers of it. CSV values carry 9 digits, with `exact` as many as a
     float64 takes; an empty cell is NaN then. Raises UserError for an unwritable file.
     """

@@ -166,7 +166,7 @@ class Law:
 
     @property
     def noise_states(self) -> int:
-        """States of the white noise beside the drift's: e_i and e_(i-1) of coloured noise."""
+        """States of the white noise: e_i and e_(i-1) of coloured noise."""
         return 2 if self.coloured_noise else 0
 
     @property

@@ -1,4 +1,4 @@
-"""`selfcal navigate`: a GPS/INS filter that is told the data sheet's noise, ten times it, or what the bank finds."""
+"""`selfcal navigate`: a GPS/INS filter with the noise of the data sheet, ten times that, or the bank's."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from selfcal.bank.result import AxisResult
 
 SCHEMA = "selfcal.navigate/1"
-#: What filter designers multiply a data sheet's noise by.
+#: Factor by which filter designers inflate a data sheet's noise.
 INFLATION = 10.0
 #: The filters, in the order of the table.
 TITLES = {
@@ -31,9 +31,9 @@ TITLES = {
     "identified": f"identified in {REST_S // 60} min of rest",
     "true": "the true one",
 }
-#: When they are judged.
+#: Times at which the filters are judged.
 TIMES = {"with_gps": "with GPS", "after_outage": f"{OUTAGE_S} s without"}
-#: What of: columns of the table.
+#: Errors that are judged: columns of the table.
 FIGURES = {
     "position_m": "position, m",
     "gyro_bias_deg_s": "gyro bias, deg/s",

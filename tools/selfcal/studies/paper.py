@@ -1,4 +1,4 @@
-"""`selfcal paper`: the figures of Stepanov & Motorin (2017) made anew, on one page beside the paper's words."""
+"""`selfcal paper`: the figures of Stepanov & Motorin (2017) made anew, on one page with the paper's words."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from selfcal.show.template import render
 from selfcal.studies.paper_figures import section4
 from selfcal.studies.paper_figures.reproduction import Reproduction
 
-#: Folder of the real recordings: beside the repository by default.
+#: Folder of the real recordings: next to the repository by default.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
 #: A look at the real records that explains a difference: this recording, by 1 s means.
 EXPLAINED = "adis16405_run1.npz"

@@ -1,6 +1,6 @@
 """What several verbs share: options, and files of verdicts that are written in each case.
 
-The options of one verb stand beside its own function. A verb imports at its top only `base` and this file, so that the
+A verb has its own options with its function. A verb imports at its top only `base` and this file, so that the
 command starts at once; what a verb runs is imported when it runs.
 """
 

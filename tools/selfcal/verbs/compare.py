@@ -45,7 +45,7 @@ def compare(
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
     distance in standard deviations; the `findings` of each recording as `diagnose` has them, with its `recording`; the
-    `verdicts` by recording and axis; and the `quantities` that were set beside each other, by recording, axis and name.
+    `verdicts` by recording and axis; and the `quantities` that were compared, by recording, axis and name.
     An axis that two successive recordings do not both have, judged and in the same unit, is {"error": ..., "changes":
     [...]}. `fail_on` is only checked here.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.

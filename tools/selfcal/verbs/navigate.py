@@ -1,4 +1,4 @@
-"""Errors and consistency of a GPS/INS filter, by the noise that it is told."""
+"""Errors and consistency of a GPS/INS filter, by the noise that it assumes."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def navigate(
     results: Results = None,
 ) -> dict[str, Any]:
     """Fly `records` simulated parts of each law after a rest, each with the four filters of `TITLES`, which differ in
-    the noise that they are told (navigation.py).
+    the noise that they assume (navigation.py).
 
     Returns the document `selfcal.navigate/1`: rms errors and the mean NEES by law, filter and time, and the 95 % band
     of the NEES of filters that are consistent. A bias has the rms of its three axes.

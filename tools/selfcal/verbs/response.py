@@ -32,7 +32,7 @@ def response(
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """The answer of the axis `output` to the column `input`: temperature, supply or another axis. Of several, each
-    answer is beside those to the others.
+    answer is fitted together with those to the others.
 
     Returns the document `selfcal.response/1` and writes it to `json`; `plot` is of one input. Raises UserError for what
     the user can put right.

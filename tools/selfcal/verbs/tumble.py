@@ -47,7 +47,7 @@ def tumble(
     Several `logs` are in order of time. `model`: the part's own law, noise and range; without one the law is of a rest
     of 20 min in the log, else the default model's prior. `fail_on` is only checked here.
     Returns the document `selfcal.tumble/1` and writes it to `json`; gyros without an answer have an `error` there.
-    Raises UserError for what the user can put right: fewer than three rests, a place that is none, logs that are not of
+    Raises UserError for what the user can put right: fewer than three rests, an invalid place, logs that are not of
     accelerometers.
     """
     from selfcal.base.output import check_picture, check_writable, write_json

@@ -28,7 +28,7 @@ ZIP = ".zip"
 class Format:
     """A format: how a message calls its files, suffixes, and bytes at places by which a file is known.
 
-    `module` reads it. `library` is the import name of what it takes beside numpy and scipy, and `extra` the group of
+    `module` reads it. `library` is the import name of what it takes but numpy and scipy, and `extra` the group of
     `pip install` that brings the library, "" where every installation has it. `here`: sizes are checked before anything
     is read, and columns are read when they are wanted, so it needs no process of its own.
     """
@@ -112,9 +112,9 @@ class Reading(TypedDict, total=False):
     dbc: Annotated[Path | str | None, option("Signals of a log of CAN frames", metavar="FILE.dbc")]
 
 
-#: Bytes from a file's begin that tell its format.
+#: Bytes at the beginning of a file that identify its format.
 _HEAD = max(at + len(sign) for form in FORMATS for at, sign in form.magic)
-#: What a ROS 2 folder holds.
+#: Content of a ROS 2 folder.
 _ROS_FOLDER = ("metadata.yaml", "*.db3", "*.mcap")
 
 

@@ -26,7 +26,7 @@ BEGIN = b"H Product:Blackbox"
 _AXES = {"gyroADC": "g", "accSmooth": "a"}
 #: Fields of a frame at most.
 _MOST_FIELDS = 256
-#: Bytes of an event's data, by its number; a log's end is told apart by its text.
+#: Bytes of an event's data, by its number; a log's end is known by its text.
 _EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30: "vv", 40: "v"}
 
 

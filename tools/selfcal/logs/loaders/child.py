@@ -34,11 +34,11 @@ from selfcal.logs.loaders.table import Hints, Table, bound_numbers, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
 _LEAST_S, _S_PER_BYTE = 60.0, 4e-6
-#: What comes before the JSON: its size.
+#: Head of the answer: the size of the JSON.
 _SIZE = struct.Struct("=Q")
 
-#: What starts a reader: (format, path, hints, descriptor for the answer, folder for what it unpacks) -> number of its
-#: process. The folder goes after it, however it ended; "" is none.
+#: Starts a reader: (format, path, hints, descriptor for the answer, folder for what it unpacks) -> number of its
+#: process. The folder goes after it, however it ended; "" is no folder.
 Start = Callable[[Format, Path, Hints, int, str], int]
 
 

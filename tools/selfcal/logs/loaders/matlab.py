@@ -55,7 +55,7 @@ def _mat4(data: bytes) -> _Variables:
         kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, at)
         place = kind // 10 % 10
         if not 0 <= kind < 5000 or min(rows, columns, length) < 0 or place >= len(_MAT4_TYPES):
-            raise ValueError("a variable's header is none")
+            raise ValueError("a variable's header is invalid")
         name = bytes(_piece(data, at + 20, length)).rstrip(b"\0").decode("latin-1")
         dtype = np.dtype(order + _MAT4_TYPES[place])
         size = rows * columns * dtype.itemsize

@@ -117,7 +117,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _has_wal(path: Path) -> bool:
-    """Whether what is newest in a database is in a -wal beside it. Source: sqlite.org/fileformat2.html, 1.3.3 and 4."""
+    """Whether the newest content of a database is in its -wal. Source: sqlite.org/fileformat2.html, 1.3.3 and 4."""
     log = path.with_name(f"{path.name}-wal")
     # The content follows a head of 32 bytes.
     if not log.is_file() or log.stat().st_size <= 32:

@@ -97,7 +97,7 @@ def _by_rate(
 
 
 def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
-    """The temperatures beside the sensors: the only one, else the one whose name has the longest begin in common."""
+    """The temperatures of the sensors: the only one, else the one whose name has the longest begin in common."""
     if len(sides) == 1:
         return list(sides)
 

@@ -24,7 +24,7 @@ from selfcal.base.limits import (
 )
 from selfcal.logs.loaders.damage import SOUND, Damaged
 
-#: What the user states beside the file: `dbc`, the path of a CAN database.
+#: Hints of the user about a file: `dbc`, the path of a CAN database.
 Hints = Mapping[str, str]
 
 
@@ -189,7 +189,7 @@ def parse_meta(path: Path, text: str) -> Mapping[str, Any]:
 
 
 def meta_place(path: Path) -> Path:
-    """Where the metadata of a text recording stand: beside it. An npz holds its own."""
+    """Place of the metadata of a text recording, next to it. An npz holds its own."""
     return path.with_name(path.name + ".meta.json")
 
 

@@ -31,7 +31,7 @@ def read(path: Path, _: Hints) -> list[Table]:
     clocks: dict[tuple[str, int], NDArray[Any]] = {}
     unscaled: dict[str, str] = {}
     numbers = 0
-    with path.open("rb") as stream, TdmsFile.open(stream) as file:  # of a path it would read the _index beside it too
+    with path.open("rb") as stream, TdmsFile.open(stream) as file:  # of a path it would read its _index too
         for group in file.groups():
             for channel in group.channels():
                 numbers += len(channel)

@@ -39,7 +39,7 @@ from selfcal.logs.loaders.headings import RECEIVED, number_of
 from selfcal.logs.loaders.table import bound_numbers, check_rows
 
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
-#: What begins a comment.
+#: Beginning of a comment.
 _COMMENT = re.compile(r"\s*(#|//|%)[#/% \t]*")
 #: The last heading of LabVIEW's texts, in small letters.
 _COMMENT_OF_ROWS = "comment"
@@ -68,7 +68,7 @@ _OF_DAY = re.compile(
     re.ASCII,
 )
 _DAY_S = 86400.0
-#: What a serial monitor puts before a line.
+#: Stamp that a serial monitor puts before a line.
 _MONITOR = re.compile(r"(\d\d:\d\d:\d\d\.\d{1,6}) -> ", re.ASCII)
 #: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
 _NO_TEXT = re.compile("[\0\udc80-\udcff]")
@@ -86,7 +86,7 @@ LOOKED_AT, _WORD = 1000, re.compile(r"\w[\w ./:-]{0,59}")
 #: Turns of a sensor at least.
 _TURNS = 5
 
-#: What opens a text in an archive: its bytes, and its packed size.
+#: Function that opens a text in an archive: its bytes, and its packed size.
 Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
 
 

@@ -46,8 +46,8 @@ def read(path: Path, _: Hints) -> list[Table]:
         log = ULog(stream, [*_SOURCES, "sensor_selection"])
     found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
     order = list(_SOURCES)
-    topics = [topic for topic in log.data_list if topic.name in _SOURCES]
-    for topic in sorted(topics, key=lambda topic: order.index(topic.name)):
+    known = [topic for topic in log.data_list if topic.name in _SOURCES]
+    for topic in sorted(known, key=lambda topic: order.index(topic.name)):
         found.setdefault((_SOURCES[topic.name], topic.multi_id), {})[topic.name] = topic.data
     if not found:
         raise UserError(f"{path}: no topic {', '.join(_SOURCES)}")

@@ -41,7 +41,7 @@ ALIKE = {
     SECOND: {"N": 1.0, "sigma_m": 1.0, "alpha": 0.15**2 / 2.0, "bias": 0.0},
 }
 #: Samples of each, and of a piece of Welch's method; records by which the tools choose a law; a tool that errs in this
-#: share of them hardly tells the laws apart (chance: 0.5).
+#: share of them hardly separates the laws (chance: 0.5).
 ALIKE_SAMPLES, PIECE, CHOICES, HARD = 600, 128, 100, 0.2
 SHOWN = {SECOND: "Gauss–Markov", "random_walk": "random walk"}
 PAPER = DEFAULT.with_name("paper.yaml")
