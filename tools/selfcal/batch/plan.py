@@ -76,9 +76,10 @@ class Wish:
         coefficients that may be wanted. Raises UserError."""
         plain = " ".join(text.split())
         if match := _LAW.fullmatch(plain):
-            if not 50.0 <= float(match[1]) < 100.0:
+            share = float(match[1]) / 100.0
+            if not 0.5 <= share < 1.0:
                 raise UserError(f"--want '{short(text)}': a law is decided by 50 % or more, and by less than 100 %")
-            return Wish(plain, "", 1.0 - float(match[1]) / 100.0)
+            return Wish(plain, "", 1.0 - share)
         match = _SHARE.fullmatch(plain) or _VALUE.fullmatch(plain)
         if match is None or match[1] not in ("bias", *PLACES, *regressors):
             also = "".join(f", '{name} within 10 %'" for name in regressors)

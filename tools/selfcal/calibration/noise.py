@@ -96,7 +96,7 @@ def of_laws(
     total, terms = sum(probability.values()), list[Term]()
     for name, share in probability.items():
         law, own = laws[name], values[name]
-        if len(law.parameters) < 2 or not share > 0.0:
+        if not law.terms or not share > 0.0:
             continue
         square = share / total * own[law.parameters[1]][0]
         sized = law.sized(math.sqrt(square), own[law.second][1] if law.second else 1.0)

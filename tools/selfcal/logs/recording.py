@@ -340,8 +340,9 @@ def _check_gravity(recording: Recording, header: Header) -> None:
     of none."""
     if written.stated(recording.meta):
         return
-    axes = [recording.columns[name] for name in ("ax", "ay", "az") if name in recording.columns]
-    if len(axes) < 3 or any(axis.unit != axes[0].unit or axis.name in header.decided for axis in axes):
+    names = ("ax", "ay", "az")
+    axes = [recording.columns[name] for name in names if name in recording.columns]
+    if len(axes) < len(names) or any(axis.unit != axes[0].unit or axis.name in header.decided for axis in axes):
         return
     if not units.same_kind(axes[0].unit, "m/s^2") or axes[1].clock != axes[0].clock or axes[2].clock != axes[0].clock:
         return

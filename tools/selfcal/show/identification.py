@@ -74,7 +74,9 @@ def _fitting(console: Console, tables: Sequence[Table]) -> Table:
     return next(fitting, tables[-1])
 
 
-#: Names of the numbers of summary.py, of an angular rate, of an acceleration, and of anything else.
+#: Units of axes that have data sheets.
+_SHEETS = ("rad/s", "m/s^2")
+#: Names of the numbers of summary.py, of the axes with data sheets, and of anything else.
 _NUMBERS = {
     "arw": ("ARW", "VRW", "white noise"),
     "rrw": ("RRW", "RRW", "random walk"),
@@ -89,13 +91,13 @@ def _summary_table(axes: Mapping[str, Any], left_out: int) -> Table:
     table = table_of(headings, pad_edge=left_out == 0, collapse_padding=left_out > 0)
     for name, axis in axes.items():
         unit = axis["bias_now"]["unit"]
-        kind = next((k for k, of in enumerate(("rad/s", "m/s^2")) if units.same_kind(unit, of)), 2)
+        kind = next((k for k, of in enumerate(_SHEETS) if units.same_kind(unit, of)), len(_SHEETS))
         for key, number in axis["summary"].items():
             table.add_row(
                 name if key == "arw" else "",
                 _NUMBERS[key][kind],
                 _number(number, number, brief=left_out > 1),
-                _number(number["datasheet"], number, brief=left_out > 0) if kind < 2 else "-",
+                _number(number["datasheet"], number, brief=left_out > 0) if kind < len(_SHEETS) else "-",
                 end_section=key == list(axis["summary"])[-1],
             )
     return table
