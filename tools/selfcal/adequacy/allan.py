@@ -96,10 +96,10 @@ class Terms:
 def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
     """A law at `parameters` (continuous time, units.py), for readings every `dt_s`, means of `block` samples."""
     drift, second = law.node(parameters)
-    white, lag1 = law.noise(second)
+    variance, lag1 = law.noise(parameters["N"] ** 2 / dt_s, second)
     terms = [KINDS[term.kind].averages(term, dt_s, block) for term in law.sized(drift, second)]
     return Terms(
-        parameters["N"] ** 2 / dt_s * white,
+        variance,
         lag1,
         sum(step for step, _, _ in terms),
         tuple(pole for _, poles, _ in terms for pole in poles),

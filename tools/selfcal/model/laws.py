@@ -215,12 +215,12 @@ class Law:
         drift, second = (*self.parameters[1:], "", "")[:2]
         return parameters[drift] if drift else 0.0, parameters[second] if second else 1.0
 
-    def noise(self, second: float) -> tuple[float, float]:
-        """Variance of the white noise over that of N, and its correlation with the reading before."""
+    def noise(self, variance: float, second: float) -> tuple[float, float]:
+        """Variance of the white noise in readings (without colour `variance`), and its correlation at one reading."""
         if not self.coloured_noise:
-            return 1.0, 0.0
+            return variance, 0.0
         theta = (second - 1.0) / (second + 1.0)
-        return (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
+        return variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
 
     def sized(self, drift: Any, second: Any) -> Iterator[Sized]:
         """Each term at the drift parameter and the second one, as `node` has them. Beside a walk the drift parameter is
