@@ -40,22 +40,12 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
         raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
     for group in model.groups:
         own = tree["groups"][group.name].get("own_priors") or {}
-        own |= {
-            axis: {
-                **own.get(axis, {}),
-                **(
-                    {
-                        name: {
-                            key: value if isinstance(value, str) else _rounded(value)
-                            for key, value in prior_tree(prior).items()
-                        }
-                        for name, prior in priors[axis].items()
-                    }
-                ),
+        for axis in (axis for axis in group.axes if axis in priors):
+            trees = {name: prior_tree(prior) for name, prior in priors[axis].items()}
+            own[axis] = own.get(axis, {}) | {
+                name: {key: value if isinstance(value, str) else _rounded(value) for key, value in stated.items()}
+                for name, stated in trees.items()
             }
-            for axis in group.axes
-            if axis in priors
-        }
         if own:
             tree["groups"][group.name]["own_priors"] = own
     for law, odds in _odds(model, batch).items():
