@@ -74,12 +74,12 @@ def _prior(population: Population, batch: Batch) -> Prior:
     fit = population.fit
     mean = float(fit.weight @ fit.mean)
     variance = float(fit.weight @ (fit.t**2 + fit.variance + (fit.mean - mean) ** 2))
-    shift = _of_lots(population, batch)
+    shift = _of_lots(population)
     sd = math.sqrt(variance + float(np.var(shift)))
     return Prior.log_normal(math.exp(mean + float(np.mean(shift))), min(max(sd, LOG_NORMAL_SD[0]), LOG_NORMAL_SD[1]))
 
 
-def _of_lots(population: Population, batch: Batch) -> np.ndarray:
+def _of_lots(population: Population) -> np.ndarray:
     """By how much each unit [n] is off for its lot, or for the one of two groups: its own, unlike a station's part."""
     shift = np.zeros(population.measured.at.size)
     for apart in population.apart:

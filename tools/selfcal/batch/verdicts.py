@@ -47,6 +47,11 @@ class Limit:
     unit: str
 
     @property
+    def key(self) -> tuple[str, str, str]:
+        """What it bounds, and the side."""
+        return self.axis, self.parameter, self.side
+
+    @property
     def name(self) -> str:
         """As a report has it."""
         return f"{self.axis}.{self.parameter} {'<=' if self.side == 'max' else '>='} {self.value:g} {self.unit}"
@@ -67,9 +72,8 @@ class Verdict:
     @property
     def words(self) -> str:
         """Verdict with its reason."""
-        return f"{self.limit.name}: {self.verdict}{', ' if self.verdict == OPEN else ': '}{self.reason}".removesuffix(
-            ": "
-        )
+        reason = self.reason and f"{', ' if self.verdict == OPEN else ': '}{self.reason}"
+        return f"{self.limit.name}: {self.verdict}{reason}"
 
     def entry(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -95,13 +99,9 @@ class Limits:
 
     def of(self, axes: Collection[str]) -> list[Limit]:
         """The limits of a batch whose recordings have these axes. An axis' own limit replaces its group's."""
-        own = {(limit.axis, limit.parameter, limit.side) for limit in self.stated}
-        group = [
-            limit
-            for limit in self.of_group
-            if limit.axis in axes and (limit.axis, limit.parameter, limit.side) not in own
-        ]
-        return sorted([*self.stated, *group], key=lambda limit: (limit.axis, limit.parameter, limit.side))
+        group = [limit for limit in self.of_group if limit.axis in axes]
+        by_key = {limit.key: limit for limit in (*group, *self.stated)}
+        return [by_key[key] for key in sorted(by_key)]
 
     @staticmethod
     def load(path: Path | str, model: Model) -> Limits:
@@ -131,7 +131,7 @@ class Limits:
         if not stated and not of_group:
             raise UserError(f"{file}: no limit is in it: write one as gx.N: {{max: 0.01 deg/s/sqrt(Hz)}}")
         limits = Limits(tuple(stated), tuple(of_group))
-        by_side = {(limit.axis, limit.parameter, limit.side): limit for limit in limits.of(model.axes)}
+        by_side = {limit.key: limit for limit in limits.of(model.axes)}
         for (axis, parameter, side), low in by_side.items():
             high = by_side.get((axis, parameter, "max"))
             if side == "min" and high is not None and low.value * units.factor(low.unit, high.unit) > high.value:

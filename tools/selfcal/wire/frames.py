@@ -451,7 +451,7 @@ class Decoder:
             elif name == ANSWER:
                 self.answer.update(values)
             return self.flush()
-        order = _order(kind, item)
+        order = _starts()[-1] if "end_items" in values else _starts()[kind.part] + item
         named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
         return self._assemble(kind.axis, order, jump, second, begun_ms / 1000.0, named)
 
@@ -582,27 +582,14 @@ def _ahead(second: int, known: int, modulus: int) -> int:
 
 
 @lru_cache(maxsize=1)
-def _end_item() -> int:
-    """Item of an axis message that closes a report."""
-    ids = load_dbc().get_message_by_name(AXES[0].upper()).get_signal_by_name("end_items").multiplexer_ids
-    assert ids
-    return ids[0]
-
-
-@lru_cache(maxsize=1)
 def _starts() -> tuple[int, ...]:
-    """Place of the first frame of each part of a report."""
+    """Place of the first frame of each part of a report among all frames that it may have, and of the last frame."""
     items = dict.fromkeys(range(len(_PARTS) + 1), 1)
     for kind in _kinds().values():
         if kind.axis == AXES[0]:
-            ids = [signal.multiplexer_ids[0] for signal in kind.message.signals if signal.multiplexer_ids]
-            items[kind.part] = 1 + max(id_ for id_ in ids if kind.part or id_ != _end_item())
+            inner = [signal for signal in kind.message.signals if not signal.name.startswith("end_")]
+            items[kind.part] = 1 + max(signal.multiplexer_ids[0] for signal in inner if signal.multiplexer_ids)
     return tuple(sum(items[before] for before in range(part)) for part in items)
-
-
-def _order(kind: _Kind, item: int) -> int:
-    """Place of a frame among all that a report may have. Two places differ by the most frames between them."""
-    return _starts()[-1] if kind.part == 0 and item == _end_item() else _starts()[kind.part] + item
 
 
 def _values(kind: _Kind, data: bytes) -> dict[str, float] | None:
