@@ -20,7 +20,7 @@ from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.bank.result import AxisResult, in_unit
 from selfcal.bank.subsets import Scored, combine
 from selfcal.base.errors import OutsidePriors, UserError
-from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float
+from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, check_column
 from selfcal.model.file import Group, Model, Regressor
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
 from selfcal.model.tables import Tables, make_tables
@@ -43,8 +43,7 @@ def chosen_axes(recording: Recording, model: Model, wanted: Sequence[str]) -> tu
     """The axes to work on, in the model's order: those asked for, else all that the recording has."""
     for name in wanted:
         model.group_of(name)
-        if name not in recording.columns:
-            raise UserError(f"{recording.path}: there is no column '{name}' (there are {', '.join(recording.columns)})")
+        check_column(recording, name)
     names = tuple(name for name in model.axes if name in (wanted or recording.columns))
     if not names:
         raise UserError(

@@ -162,14 +162,8 @@ def plain(name: str) -> str:
         meant = parse(product)
     except UserError:
         return spelled
-    return next(
-        (
-            unit
-            for unit in RECORDING_UNITS
-            if unit != LSB and (same := parse(unit)).dimension == meant.dimension and same.size == meant.size
-        ),
-        product,
-    )
+    alike = ((unit, parse(unit)) for unit in RECORDING_UNITS if unit != LSB)
+    return next((name for name, unit in alike if (unit.dimension, unit.size) == (meant.dimension, meant.size)), product)
 
 
 def _word(word: str) -> str:

@@ -156,6 +156,13 @@ def list_of(paths: Data) -> list[Path]:
     return [Path(paths)] if isinstance(paths, Path | str) else [Path(path) for path in paths]
 
 
+def check_column(recording: Recording, name: str, asked: str = "", needed: str = "") -> None:
+    """Raise UserError for a column that the recording has not: `asked` by which option, `needed` for what."""
+    if name not in recording.columns:
+        there = ", ".join(recording.columns)
+        raise UserError(f"{recording.path}: {asked}there is no column '{name}' (there are {there}){needed}")
+
+
 def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
     """The sensors of one file that are meant, or of the tables that are `there`, and their temperatures, each
     by its own clock."""

@@ -13,7 +13,7 @@ from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
 from selfcal.model.file import MOST_AXES, MOST_HYPOTHESES, MOST_TAPS, NODES, REGRESSORS, SCHEMA
-from selfcal.model.forms import FORMS
+from selfcal.model.forms import FORMS, INPUTS
 from selfcal.model.laws import KINDS, NAMED, PLACES
 from selfcal.show.results import Comparison, Diagnosis, Identification, Object
 
@@ -74,7 +74,7 @@ def model() -> Json:
     ]
     term = {"anyOf": [{"enum": [name for name, kind in KINDS.items() if not kind.needs_time]}, *kinds]}
     law = _only({"probability": NUMBER, "terms": _list(term), "coloured_noise": {"type": "boolean"}}, ["terms"])
-    special = {"column": TEXT, "unit": TEXT, "input": {"enum": ["value", "variance"]}, "form": {"enum": list(FORMS)}}
+    special = {"column": TEXT, "unit": TEXT, "input": {"enum": list(INPUTS)}, "form": {"enum": list(FORMS)}}
     special["knots"] = _list(_list(NUMBER, minItems=2, maxItems=2), minItems=2)
     regressors = [
         _only(

@@ -51,7 +51,7 @@ def response(
         plot_response,
         without_wild,
     )
-    from selfcal.logs.recording import list_of, load
+    from selfcal.logs.recording import check_column, list_of, load
     from selfcal.model.file import Model
     from selfcal.readings.gate import gated
 
@@ -64,9 +64,7 @@ def response(
     if plot is not None and len(names) > 1:
         raise UserError("--plot is of one input: leave it out, or give one --input")
     for asked, name in (*(("--input", name) for name in names), ("--output", output)):
-        if name not in recording.columns:
-            there = ", ".join(recording.columns)
-            raise UserError(f"{recording.path}: {asked}: there is no column '{name}' (there are {there})")
+        check_column(recording, name, f"{asked}: ")
     if output in names:
         raise UserError(f"--input and --output are both {output}: give two columns")
     loaded.group_of(output)

@@ -92,13 +92,8 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
 
 def _criteria(rows: Sequence[Row]) -> list[str]:
     """Criteria by which a method weighs the laws."""
-    keys = {
-        key.split(".")[1]
-        for row in rows
-        for key, value in row.items()
-        if key.startswith("weight.") and value is not None
-    }
-    return sorted(keys)
+    stated = (key for row in rows for key, value in row.items() if value is not None)
+    return sorted({key.split(".")[1] for key in stated if key.startswith("weight.")})
 
 
 def _column(rows: Sequence[Row], key: str) -> Floats:
