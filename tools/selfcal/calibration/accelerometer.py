@@ -151,6 +151,6 @@ def causes(accel: Accelerometer) -> list[tuple[str, float]]:
     moved = tumble.moved(ACCEL)
     where = [f"the rest at {rest.at_s[0]:.6g} to {rest.at_s[1]:.6g} s" for rest in tumble.rests]
     for k in np.flatnonzero(moved >= FALSE_ALARM).tolist():
-        tried.append((f"{where[k]} was no rest, or its mount was not still", np.eye(count)[:, [k]]))
+        tried.append((f"{where[k]} was none, or its mount was not still", np.eye(count)[:, [k]]))
     sure = np.flatnonzero(moved < FALSE_ALARM).tolist()
     return [(f"the mount moved within {where[k]}", float(moved[k])) for k in sure] + accel.fit.surest(tried)
