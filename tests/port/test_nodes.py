@@ -210,7 +210,7 @@ def test_a_module_of_version_3_is_refused_by_the_monitor(tmp_path: Path) -> None
 def test_a_firmware_of_another_version_is_refused_by_replay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Here it is the tool that is of another version."""
     part_of_shipped(tmp_path / "part.npz", 60.0)
-    monkeypatch.setattr(wire, "VERSION", 5)
+    monkeypatch.setattr(wire, "version", lambda: 5)
     with pytest.raises(UserError, match="the module speaks wire version 4, this tool reads version 5: "):
         replay(tmp_path / "part.npz", axes=("gx",))
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from selfcal.base.units import SENSOR_UNITS
 from selfcal.logs import recording as recording_module
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.verbs.replay import replay
-from selfcal.wire.dbc_file import AXIS_UNITS
 from selfcal.wire.frames import AXES, REASONS, choices, reasons
 from selfcal.wire.replay import build, run
 
@@ -35,7 +35,7 @@ def at_rest(seconds: float, seed: int) -> Readings:
 
 def told(tmp_path: Path, readings: Readings, *, every: float | None = None, gate: bool = False) -> dict[str, str]:
     """The reasons at the end of a recording."""
-    columns = {axis: (AXIS_UNITS[axis], values) for axis, values in readings.items()}
+    columns = {axis: (SENSOR_UNITS[axis], values) for axis, values in readings.items()}
     recording_module.save(tmp_path / "log.npz", columns, RATE_HZ, {})
     recording, model, axes = load(tmp_path / "log.npz"), Model.load(), tuple(readings)
     return run(build(model, RATE_HZ, axes), recording, model, axes, every, gate=gate)[1]
@@ -93,7 +93,7 @@ def test_each_axis_has_its_own_reason(tmp_path: Path) -> None:
 
 
 def test_the_document_tells_the_reason(tmp_path: Path) -> None:
-    columns = {axis: (AXIS_UNITS[axis], values) for axis, values in at_rest(5.0, 3).items() if axis in ("gx", "ax")}
+    columns = {axis: (SENSOR_UNITS[axis], values) for axis, values in at_rest(5.0, 3).items() if axis in ("gx", "ax")}
     recording_module.save(tmp_path / "log.npz", columns, RATE_HZ, {})
     replay(tmp_path / "log.npz", json=tmp_path / "out.json")
     axes = json.loads((tmp_path / "out.json").read_text())["axes"]

@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from selfcal.base.errors import UserError
+from selfcal.base.output import write_text
 from selfcal.diagnosis import integrity
 from selfcal.diagnosis.causes import colored_noise, periodic, ramp, step, variance_change
 from selfcal.diagnosis.causes import outliers as outliers_cause
@@ -38,7 +39,7 @@ from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, outside_of
-from selfcal.show.diagnosis_page import page, write_page
+from selfcal.show.diagnosis_page import page
 
 from conftest import run
 
@@ -492,17 +493,17 @@ def test_a_page_with_many_findings_stays_small(case: Case) -> None:
 
 def test_the_page_is_written_whole_or_not_at_all(case: Case, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "report.html"
-    write_page(path, case.document, case.record, case.found)
+    write_text(path, page(case.document, case.record, case.found))
     assert path.read_text(encoding="utf-8") == case.text
     with pytest.raises(UserError, match="cannot be written"):
-        write_page(tmp_path / "none" / "report.html", case.document, case.record, case.found)
+        write_text(tmp_path / "none" / "report.html", page(case.document, case.record, case.found))
 
     def full(self: Path, target: Path) -> Path:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "replace", full)
     with pytest.raises(UserError, match="No space left"):
-        write_page(path, case.document, case.record, case.found)
+        write_text(path, page(case.document, case.record, case.found))
     assert [one.name for one in tmp_path.iterdir()] == ["report.html"]
     assert path.read_text(encoding="utf-8") == case.text
 

@@ -24,7 +24,7 @@ from test_replay_can import COMMAND, demonstration
 from websockets.sync.client import connect
 
 from selfcal.base.errors import UserError
-from selfcal.logs.framelog import LARGEST, FrameLog
+from selfcal.logs.framelog import LONGEST_LINE, FrameLog
 from selfcal.verbs.monitor import monitor
 from selfcal.wire.frames import Decoder
 from selfcal.wire.streams import McapLog, check
@@ -139,7 +139,7 @@ def test_a_killed_mcap_is_read_and_a_hostile_one_takes_no_memory(tmp_path: Path)
     with (tmp_path / "big.mcap").open("wb") as file:
         writer = McapLog(file)
         file.write(struct.pack("<BQ", 5, 1 << 32))
-        file.write(b"\0" * (2 * LARGEST))
+        file.write(b"\0" * (2 * LONGEST_LINE))
         assert writer is not None
     with pytest.raises(UserError, match="no frame log"):
         FrameLog(tmp_path / "big.mcap")

@@ -29,7 +29,7 @@ from typing import Any
 #: File of each verb; it has a function of its name.
 VERBS = {path.stem: path for path in sorted((Path(__file__).parent / "verbs").glob("[a-z]*.py"))}
 
-#: What scripts take beside the verbs, and where it is.
+#: Names that scripts take apart from the verbs, and their modules.
 _OTHERS = {
     "load": "logs.recording",
     "save": "logs.recording",
@@ -38,7 +38,7 @@ _OTHERS = {
 }
 #: Instructions of newer processors that a compiled module has a build for.
 _BUILDS = {"_library32": "fma", "_likelihood": "avx2", "_joint": "avx2"}
-#: Lines of /proc/cpuinfo that tell of the first core.
+#: Lines of /proc/cpuinfo that describe the first core.
 MOST_LINES = 100
 
 
@@ -118,7 +118,7 @@ def _in_python(function: Callable[..., Any]) -> Callable[..., Any]:
         for name in options if known is not None else ():
             if name not in known.parameters:
                 near = get_close_matches(name, list(known.parameters), 1)
-                raise UserError(f"{function.__name__}() has no keyword {name}" + "".join(f": {one}?" for one in near))
+                raise UserError(f"{function.__name__}() has no keyword {name}" + "".join(f": {word}?" for word in near))
         try:
             return function(*arguments, **options)
         except UserError as error:

@@ -6,6 +6,7 @@ A verb's options are annotated on its function (`base/options.py`). A verb is im
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import warnings
 from collections.abc import Sequence
@@ -28,7 +29,7 @@ from selfcal.base.options import Option
 #: Exit code of everything the user can put right.
 USER_ERROR = 2
 #: ... after Ctrl-C.
-INTERRUPTED = 130
+INTERRUPTED = 128 + signal.SIGINT
 #: Folder of what compares the method with others; the verb of a file there stands apart in the help.
 _STUDIES = Path(__file__).parent / "studies"
 
@@ -167,7 +168,7 @@ def main() -> NoReturn:
     install()
     # The matrices are small, and axes run side by side: threads of one product wait for each other.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    if not sys.warnoptions:  # a library's warning is none for the user
+    if not sys.warnoptions:  # a library's warnings are not for the user
         warnings.simplefilter("ignore")
     try:
         name, *rest = sys.argv[1:] or ["--help"]

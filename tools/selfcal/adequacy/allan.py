@@ -24,14 +24,14 @@ from scipy.special import gammaincinv, ndtri
 from selfcal.bank.result import HALF_90, Estimate
 from selfcal.base.grid import runs
 from selfcal.model.file import Group
-from selfcal.model.laws import Law, averaged, named
+from selfcal.model.laws import KINDS, Law, named
 
 _Floats = NDArray[np.float64]
 
 #: Least length of a record over its longest averaging time: fewer windows say little.
 LONGEST = 5
 #: Step in the ln of a parameter for derivatives.
-_STEP = 1e-3
+STEP = 1e-3
 #: Correlation times after which a Gauss-Markov drift is forgotten.
 _FORGOTTEN = 14.0
 #: Least share of S that S - V keeps (curve_of): nearly equal numbers have a small difference.
@@ -96,24 +96,15 @@ class Terms:
 def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
     """A law at `parameters` (continuous time, units.py), for readings every `dt_s`, means of `block` samples."""
     drift, second = law.node(parameters)
-    variance, lag1 = parameters["N"] ** 2 / dt_s, 0.0
-    if law.coloured_noise:
-        theta = (second - 1.0) / (second + 1.0)
-        variance, lag1 = variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
-    sized = list(law.sized(drift, second))
-    step = sum(term.variance * dt_s for term in sized if term.kind == "walk")
-    lacking = (1.0 - 1.0 / block**2) * step / 6.0
-    markov: list[tuple[complex, complex]] = []
-    for kind, own, alpha, damping in sized:
-        if kind == "oscillation":
-            share = math.sqrt(1.0 - damping**2)
-            mean = 1.0 - (alpha * dt_s) ** 2 * (1.0 - 1.0 / block**2) / 12.0
-            markov.append((own * mean * complex(1.0, -damping / share), alpha * dt_s * complex(damping, -share)))
-        elif kind == "markov":
-            gain, without = averaged(alpha * dt_s, block)
-            markov.append((own * gain, alpha * dt_s))
-            lacking += own * without
-    return Terms(variance, lag1, step, tuple(markov), lacking)
+    variance, lag1 = law.noise(parameters["N"] ** 2 / dt_s, second)
+    terms = [KINDS[term.kind].averages(term, dt_s, block) for term in law.sized(drift, second)]
+    return Terms(
+        variance,
+        lag1,
+        sum(step for step, _, _ in terms),
+        tuple(pole for _, poles, _ in terms for pole in poles),
+        sum(lacking for _, _, lacking in terms),
+    )
 
 
 def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
@@ -171,7 +162,7 @@ def _around(
         terms = terms_of(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
-    steps = np.eye(ln_estimate.size) * _STEP
+    steps = np.eye(ln_estimate.size) * STEP
     return terms_at, [(terms_at(ln_estimate + step), terms_at(ln_estimate - step)) for step in steps]
 
 
@@ -185,7 +176,7 @@ def information_of(
     _, sides = _around(of, ln_estimate, dt_s, white, block)
     k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
     omega = 2.0 * math.pi * k / n
-    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * _STEP)
+    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * STEP)
     return np.asarray((slopes * np.gradient(k)) @ slopes.T, np.float64)
 
 
@@ -206,7 +197,7 @@ def fit_of(
     information = information_of(of, parameters, dt_s, n, white, block)
     prior = [group.priors[name].ln_sd ** -2 for name in of.parameters]
     terms_at, sides = _around(of, ln_estimate, dt_s, white, block)
-    jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * _STEP)
+    jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * STEP)
     covariance = np.linalg.inv(information + np.diag(prior))
     terms = terms_at(ln_estimate)
     return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.asarray(covariance, np.float64))

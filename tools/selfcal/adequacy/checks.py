@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from selfcal.adequacy.allan import Curve, curve_of, ratio_at, terms_of
-from selfcal.bank.blocks import MOST_DENSE, Blocks
+from selfcal.bank.blocks import FEWEST, MOST_DENSE, Blocks
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base import units
 from selfcal.logs.recording import Recording
@@ -31,8 +31,6 @@ BATCH_LIMIT = 3.5
 BATCH_LAW = 0.1
 #: Least share of the prior's variance by which a record and the prior are compared.
 LEFT_LEAST = 0.1
-#: Fewest bank samples that are checked.
-FEWEST = 20
 #: Largest share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at
 #: 0.9, where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84

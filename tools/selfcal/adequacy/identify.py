@@ -18,24 +18,17 @@ from selfcal.adequacy.one_over_f import weigh, with_white
 from selfcal.adequacy.summary import halved_after, summarize
 from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.bank.result import AxisResult, in_unit
-from selfcal.bank.subsets import combine
+from selfcal.bank.subsets import Scored, combine
 from selfcal.base.errors import OutsidePriors, UserError
-from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float
+from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, check_column
 from selfcal.model.file import Group, Model, Regressor
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
 from selfcal.model.tables import Tables, make_tables
-from selfcal.readings.gate import gated
 from selfcal.readings.readings import Readings, copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
 
 #: Largest spacing of float32 in the noise of a reading that is fed without taking a nominal offset off.
 SPACING_LEAST = 0.01
-
-
-def stretch_of(recording: Recording, model: Model, start_s: float | None, end_s: float | None, gate: bool) -> Recording:
-    """The part of a recording that a verb looks at: `--start`, `--end`, `--gate`."""
-    stretch = recording.between(start_s, end_s)
-    return gated(stretch, model) if gate else stretch
 
 
 def with_reasons(axes: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
@@ -50,8 +43,7 @@ def chosen_axes(recording: Recording, model: Model, wanted: Sequence[str]) -> tu
     """The axes to work on, in the model's order: those asked for, else all that the recording has."""
     for name in wanted:
         model.group_of(name)
-        if name not in recording.columns:
-            raise UserError(f"{recording.path}: there is no column '{name}' (there are {', '.join(recording.columns)})")
+        check_column(recording, name)
     names = tuple(name for name in model.axes if name in (wanted or recording.columns))
     if not names:
         raise UserError(
@@ -80,8 +72,8 @@ def identify_axis(
         results = _by_reference(fed, model, advance)
     else:
         results = _by_library(fed, engine == "fixed", advance)
-    group, tables, readings = fed.group, fed.tables, fed.readings
-    unit, means = recording.columns[name].unit, (tables.dt_s, fed.blocks.mean.size, tables.block)
+    group, unit = fed.group, recording.columns[name].unit
+    means = fed.tables.dt_s, fed.blocks.mean.size, fed.tables.block
     converted = [in_unit(with_white(result, group, *means), group.unit, unit) for result in results]
     best, inside, scored, answer = 0, results[0], None, converted[0]
     if fed.regressors:
@@ -91,14 +83,34 @@ def identify_axis(
         best, inside = combined.best, combined.result
         scored = combine(fed.choices, converted, model.hypotheses, unit)
         answer = scored.result
-    result, mask = results[best], mask_of(fed.regressors, fed.choices[best])
-    used = _used(mask)
-    others = may_act(model, fed.recording, name)
+    others, mask = may_act(model, fed.recording, name), mask_of(fed.regressors, fed.choices[best])
+    identified = concluded(fed, unit, others, results[best], mask, inside, answer, scored, draw=draw)
+    return replace(identified, kept_out=kept_out_of(fed.blocks, fed.recording, int(fed.readings.moving.sum())))
+
+
+def concluded(
+    fed: Fed,
+    unit: str,
+    others: Sequence[str],
+    result: AxisResult,
+    mask: int,
+    inside: AxisResult,
+    answer: AxisResult,
+    scored: Scored | None,
+    *,
+    draw: bool = False,
+    as_fed: bool = False,
+) -> Identified:
+    """What the input of an engine and its results say of an axis in `unit`. `result`: of the regressors of `mask`, by
+    which the record is judged; `inside` of all choices; `answer` the same in `unit`. `others`: `may_act`. `as_fed`: the
+    engine took every reading."""
+    group, tables, readings = fed.group, fed.tables, fed.readings
+    means, used = (tables.dt_s, fed.blocks.mean.size, tables.block), _used(mask)
     judged = judge(fed.blocks, tables, group, result, fed.recording, others, used)
     if "drift_in_average" in against(judged.checks):
         step = 0.0 if readings.lattice is None else readings.lattice.step
         judged = with_rate(judged, fed.used, fed.recording.missing_before, step, tables, result)
-    judged = with_readings(judged, readings, group, unit, tables.dt_s)
+    judged = with_readings(judged, readings, group, unit, tables.dt_s, as_fed=as_fed)
     explained = fed.columns[:, used].astype(np.float64) @ coefficients_of(result) if used else 0.0
     missing, columns = fed.recording.missing_before, fed.columns if fed.regressors else None
     again = tables, group, fed.samples, missing, columns, mask, fed.offset
@@ -109,7 +121,7 @@ def identify_axis(
         group.unit,
         answer,
         judged,
-        kept_out_of(fed.blocks, fed.recording, int(readings.moving.sum())),
+        fed.blocks.kept_out,
         scored,
         fed.curve(explained) if draw else None,
         summarize(inside, group, *means, beside, counted),
@@ -119,7 +131,7 @@ def identify_axis(
 
 
 @dataclass(frozen=True)
-class _Fed:
+class Fed:
     """Input of an engine for an axis: its `samples` [n] less `offset` and `columns` [n, p] of the `regressors`, both as
     float32; and the `blocks` of the bank. `recording`: of the rows that `readings` have."""
 
@@ -150,7 +162,7 @@ class _Fed:
         return sampled(values - explained, self.recording.missing_before, self.recording.rate_hz, lengths)
 
 
-def _fed(recording: Recording, name: str, model: Model, decimate: float | None) -> _Fed:
+def _fed(recording: Recording, name: str, model: Model, decimate: float | None) -> Fed:
     """The samples of an axis without wrong readings. Raises UserError where it has no result."""
     group, regressors = model.group_of(name), offered(model, name)
     if most := mostly_beyond(recording.in_unit(name, group.unit), group):
@@ -177,10 +189,10 @@ def _fed(recording: Recording, name: str, model: Model, decimate: float | None) 
             raise UserError(f"the regressor {name_of} is {column[beyond][0]:g} at {int(beyond.sum())} samples")
     blocks = usable_blocks(samples, recording.missing_before, tables, group, columns, readings.counted)
     blocks = replace(blocks, mean=blocks.mean + offset)
-    return _Fed(recording, readings, group, tables, regressors, samples, offset, columns, blocks)
+    return Fed(recording, readings, group, tables, regressors, samples, offset, columns, blocks)
 
 
-def _by_library(fed: _Fed, fixed: bool, advance: Callable[[], object]) -> list[AxisResult]:
+def _by_library(fed: Fed, fixed: bool, advance: Callable[[], object]) -> list[AxisResult]:
     """The result of each choice of regressors by the C code."""
     from selfcal.bank.library import Bank
 
@@ -193,7 +205,7 @@ def _by_library(fed: _Fed, fixed: bool, advance: Callable[[], object]) -> list[A
     return results
 
 
-def _by_reference(fed: _Fed, model: Model, advance: Callable[[], object]) -> list[AxisResult]:
+def _by_reference(fed: Fed, model: Model, advance: Callable[[], object]) -> list[AxisResult]:
     """The result of each choice of regressors by the textbook bank in double."""
     from selfcal.bank import reference
 

@@ -24,7 +24,7 @@ from selfcal.bank.result import in_unit
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError, note, remark, short
 from selfcal.base.units import SENSORS, factor, parameter_unit
-from selfcal.logs.recording import Recording
+from selfcal.logs.recording import Recording, check_column
 from selfcal.model.file import DEFAULT, LONGEST_TEXT, Model, Prior
 from selfcal.readings.lattice import step_of
 from selfcal.readings.readings import ROUNDED, Readings, look
@@ -332,9 +332,7 @@ def tree_of(
     said: list[str] = []
     if recording is not None:
         for axis in axes:
-            if axis not in recording.columns:
-                there = ", ".join(recording.columns)
-                raise UserError(f"{recording.path}: there is no column '{axis}' (there are {there})")
+            check_column(recording, axis)
         tree["groups"] = groups(tree["groups"], recording, axes)
         tree["gate"]["N"] = dict.fromkeys(tree["groups"], 1.0)  # until N is known
         said += of_recording(tree, recording)

@@ -19,6 +19,8 @@ from selfcal.readings.readings import mostly_beyond
 
 #: Bank intervals, gaps included, that the checks and the reference compute one by one.
 MOST_DENSE = 10_000_000
+#: Fewest bank samples that are checked.
+FEWEST = 20
 
 
 @dataclass(frozen=True)
@@ -66,7 +68,7 @@ def usable_blocks(
         more = alone if tables.block > 1 and each >= needed else ""
         raise UserError(f"too short: {averages}, {needed} are needed (samples kept out: {kept}){more}")
     # Other averages have lost most of their samples.
-    if present.size < 20 and whole < 0.25 * each:
+    if present.size < FEWEST and whole < 0.25 * each:
         raise UserError(f"too few whole averages: {averages} hold {whole:.0f} of the {each} readings{alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"

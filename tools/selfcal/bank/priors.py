@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.bank.result import AxisResult
+from selfcal.bank.result import FAINT, AxisResult
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
@@ -307,7 +307,7 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
     gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
     whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
     return whole[1] > whole[0] + LEANS_GAIN or any(
-        gain[law] > LEANS_GAIN and second.probability[law] > 0.01
+        gain[law] > LEANS_GAIN and second.probability[law] > FAINT
         for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )

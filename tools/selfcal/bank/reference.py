@@ -20,7 +20,7 @@ from selfcal import _reference
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError
 from selfcal.model.file import Group, Prior
-from selfcal.model.laws import Law, swing
+from selfcal.model.laws import KINDS, Law
 
 _Floats = NDArray[np.float64]
 _Indices = NDArray[np.int64]
@@ -121,7 +121,7 @@ def _posterior(
     z, sd = (None, None) if columns is None else columns
     of = group.laws[law]
     means = len(of.read) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
-    beside = means + (2 if of.coloured_noise else 0)
+    beside = means + of.noise_states
     columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
     constant = np.concatenate([np.zeros(beside), [1.0], columns_now])
     own_from = max(len(of.read), 1) + beside + 1
@@ -180,19 +180,9 @@ def _posterior(
 def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Floats, _Floats]:
     """Weight of each state now in the drift some time on [m, states], and the variance that it gains until then [m],
     at the drift and second parameters [m]."""
-    taken: list[_Floats] = []
-    gained = np.zeros(drift.size)
-    for kind, variance, rate, damping in of.sized(drift, second):
-        if kind == "walk":
-            taken.append(np.ones(drift.size))
-            gained = gained + variance * time_s
-        elif kind == "oscillation":
-            row = swing(2.0 * math.pi / rate, damping, time_s)[0]
-            taken += [np.full(drift.size, share) for share in row]
-            gained = gained + variance * (1.0 - float(row @ row))
-        else:
-            taken.append(np.exp(-rate * time_s) * np.ones(drift.size))
-            gained = gained - variance * np.expm1(-2.0 * rate * time_s)
+    terms = [KINDS[term.kind].later(term, time_s) for term in of.sized(drift, second)]
+    taken = [weight for weights, _ in terms for weight in weights]
+    gained = sum((variance for _, variance in terms), np.zeros(drift.size))
     return np.column_stack(taken or [np.ones(drift.size)]), gained
 
 

@@ -16,6 +16,8 @@ from selfcal.model.laws import RATIOS
 
 #: Standard deviations from the middle of a normal to either end of its 90 % interval.
 HALF_90 = 1.6448536269514722
+#: Least probability of a law that a table, a picture or a prior takes into account.
+FAINT = 0.01
 
 
 def likeliest(probability: Mapping[str, float]) -> str:

@@ -54,13 +54,13 @@ def cell(text: str) -> str:
     return _FORMULA.sub(r"\1'", printable(text))
 
 
-def short(text: str) -> str:
-    """At most 60 printable characters of something found in a file."""
-    clean = "".join(letter if letter.isprintable() else "?" for letter in text[:61])
-    return clean if len(clean) <= 60 else clean[:57] + "..."
+def short(text: str, most: int = 60) -> str:
+    """At most so many printable characters of something found in a file."""
+    clean = "".join(letter if letter.isprintable() else "?" for letter in text[: most + 1])
+    return clean if len(clean) <= most else clean[: most - 3] + "..."
 
 
-def few(names: Sequence[str], most: int, more: str = "more") -> str:
+def few(names: Sequence[str], most: int = 5, more: str = "more") -> str:
     """The first of the names, and how many more there are."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} {more}" if rest > 0 else "")

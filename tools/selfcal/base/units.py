@@ -13,7 +13,7 @@ import re
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cache, partial
-from typing import overload
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +29,7 @@ FLICKER_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: Counts of the sensor's least significant bit; a scale turns them into a unit.
 LSB = "LSB"
 
+_Value = TypeVar("_Value", float, NDArray[np.float64])
 # Dimensions: exponents of (angle, length, time, temperature, voltage, current, magnetic flux density, pressure).
 _Dimension = tuple[Fraction, ...]
 
@@ -161,14 +162,8 @@ def plain(name: str) -> str:
         meant = parse(product)
     except UserError:
         return spelled
-    return next(
-        (
-            unit
-            for unit in RECORDING_UNITS
-            if unit != LSB and (same := parse(unit)).dimension == meant.dimension and same.size == meant.size
-        ),
-        product,
-    )
+    alike = ((unit, parse(unit)) for unit in RECORDING_UNITS if unit != LSB)
+    return next((name for name, unit in alike if (unit.dimension, unit.size) == (meant.dimension, meant.size)), product)
 
 
 def _word(word: str) -> str:
@@ -233,11 +228,7 @@ def factor(unit: str, to: str) -> float:
     return source.size / target.size
 
 
-@overload
-def convert(value: float, unit: str, to: str) -> float: ...
-@overload
-def convert(value: NDArray[np.float64], unit: str, to: str) -> NDArray[np.float64]: ...
-def convert(value: float | NDArray[np.float64], unit: str, to: str) -> float | NDArray[np.float64]:
+def convert(value: _Value, unit: str, to: str) -> _Value:
     """`value` (any shape) of `unit` in `to`, unchanged if alike; temperatures as points on their scales. Raises
     UserError as `factor`."""
     scale = factor(unit, to)
@@ -289,9 +280,7 @@ def parameter_unit(parameter: str, unit: str) -> str:
 
 #: Units of data sheets, of a parameter of an angular rate and of an acceleration; below, of the numbers of summary.py.
 _DATASHEET = {
-    "bias": ("deg/h", "ug"),
-    "sigma_m": ("deg/h", "ug"),
-    "B": ("deg/h", "ug"),
+    **dict.fromkeys(("bias", "sigma_m", "B"), ("deg/h", "ug")),
     "N": ("deg/sqrt(h)", "ug/sqrt(Hz)"),
     "K": ("deg/h/sqrt(h)", "ug/sqrt(h)"),
     "arw": ("deg/sqrt(h)", "m/s/sqrt(h)"),
@@ -314,7 +303,7 @@ def datasheet_unit(parameter: str, unit: str) -> str:
 def typeset(unit: str) -> str:
     """A unit as print has it: `deg/s/sqrt(Hz)` -> `°/s/√Hz`."""
     text = re.sub(r"sqrt\((\w+)\)", r"√\1", unit)
-    for plain, print_ in (("deg", "°"), ("ug", "µg"), ("^2", "²"), ("^3", "³"), ("°C", "°C")):
+    for plain, print_ in (("deg", "°"), ("ug", "µg"), ("^2", "²"), ("^3", "³")):
         text = text.replace(plain, print_)
     return text
 
@@ -327,5 +316,7 @@ def duration_words(seconds: float) -> str:
     return f"{math.ceil(seconds / 86400.0)} days"
 
 
+#: Usual unit of each axis of an inertial unit: of its counts, on the wire, and of a simulated part.
+SENSOR_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in ("gx", "gy", "gz", "ax", "ay", "az")}
 #: Axes of an inertial unit: sensor columns unless a model names others.
-SENSORS = ("gx", "gy", "gz", "ax", "ay", "az")
+SENSORS = tuple(SENSOR_UNITS)

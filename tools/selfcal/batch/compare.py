@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -12,7 +13,7 @@ from rich.markup import escape
 
 from selfcal.bank.result import bias_of, likeliest, sd_of
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
 
@@ -150,14 +151,11 @@ def compared_of(
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """Print for each pair of recordings a line a change, the largest first, then the findings of each recording that
-    matter, as `diagnose` tells them."""
+    matter, as `diagnose` words them."""
     from selfcal.show.comparison_page import names_of, told_of
 
     console, names = console_of(to_stderr=to_stderr), names_of(document)
-
-    def say(line: str) -> None:
-        console.print(printable(line), highlight=False, markup=False, soft_wrap=True)
-
+    say = partial(print_line, console)
     errors = {name: axis["error"] for name, axis in document["axes"].items() if isinstance(axis, Mapping)}
     which = ", ".join(name for name in document["axes"] if name not in errors) + ": " if errors else ""
     for (first, second), rows in told_of(document).items():

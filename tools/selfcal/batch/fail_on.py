@@ -8,7 +8,7 @@ from typing import Any
 
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, note
-from selfcal.batch.verdicts import PASS, Verdict, code_of
+from selfcal.batch.verdicts import PASS, Verdict, code_of, worst
 
 #: Words for any finding that is unexplained or material, for a material one, and for a change between two recordings.
 INADEQUATE, MATERIAL, CHANGED = "inadequate", "material", "changed"
@@ -101,4 +101,4 @@ def exit_code(document: Mapping[str, Any], wanted: str | None) -> int:
             if verdict.verdict != PASS:
                 note(f"{entry['recording']}: {verdict.words}" if "recording" in entry else verdict.words)
         codes.append(code_of(verdicts))
-    return 1 if 1 in codes else 2 if 2 in codes else 0
+    return worst(codes)

@@ -25,8 +25,6 @@ FROM_NAME, FROM_FIELD = "name", "field"
 #: A date of ISO 8601 in its extended form, with or without a time of day.
 _DATE = re.compile(r"\d{4}-\d\d-\d\d(?:[T ]\d\d:\d\d.*)?", re.ASCII)
 DATE_FORM = "2026-03-01 or 2026-03-01T14:30:00Z (ISO 8601)"
-#: Most rows of a table of units in a message.
-MOST_ROWS_NAMED = 5
 
 
 @dataclass(frozen=True)
@@ -220,7 +218,7 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
         )
     unknown = [cell.strip() for cell, name in zip(rows[0], header, strict=True) if name not in TABLE_COLUMNS]
     if unknown:
-        named = few(list(map(short, unknown)), MOST_ROWS_NAMED, "more columns")
+        named = few(list(map(short, unknown)), more="more columns")
         note(f"{table}: does not read {named} (known: {', '.join(TABLE_COLUMNS)})")
     by_place: dict[Path, list[str]] = {}
     by_name: dict[str, list[str]] = {}
@@ -258,5 +256,5 @@ def _table(table: Path, paths: Sequence[str]) -> dict[str, dict[str, str]]:
                     f"{table}: line {number}: '{short(row['file'])}' is there twice, with different entries"
                 )
     if without:
-        note(f"{table}: no recording of the batch is {few(list(map(short, without)), MOST_ROWS_NAMED, 'more rows')}")
+        note(f"{table}: no recording of the batch is {few(list(map(short, without)), more='more rows')}")
     return units

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,6 @@ from markupsafe import Markup
 
 from selfcal.base import units as unit_module
 from selfcal.base.grid import Array
-from selfcal.base.output import write_text
 from selfcal.batch.batch_summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
 from selfcal.batch.population import Population
 from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, draw
@@ -33,13 +31,6 @@ KINDS = {
 }
 #: Limits of a chart of individuals and of a chart of moving ranges (n = 2), over the mean moving range.
 INDIVIDUALS, RANGES = 2.66, 3.267
-
-
-def write_page(
-    path: Path | str, document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str] | None = None
-) -> None:
-    """Write page() to `path`, whole or not at all."""
-    write_text(path, page(document, batch, pages or {}))
 
 
 def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> str:

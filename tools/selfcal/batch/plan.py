@@ -76,9 +76,10 @@ class Wish:
         coefficients that may be wanted. Raises UserError."""
         plain = " ".join(text.split())
         if match := _LAW.fullmatch(plain):
-            if not 50.0 <= float(match[1]) < 100.0:
+            share = float(match[1]) / 100.0
+            if not 0.5 <= share < 1.0:
                 raise UserError(f"--want '{short(text)}': a law is decided by 50 % or more, and by less than 100 %")
-            return Wish(plain, "", 1.0 - float(match[1]) / 100.0)
+            return Wish(plain, "", 1.0 - share)
         match = _SHARE.fullmatch(plain) or _VALUE.fullmatch(plain)
         if match is None or match[1] not in ("bias", *PLACES, *regressors):
             also = "".join(f", '{name} within 10 %'" for name in regressors)
@@ -379,9 +380,9 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         for rate in document["rates"]:
             times = math.nan if there is None or rate["wish"] != wish["wish"] else rate["duration_s"] / there
             factor = rate["rate_hz"] / document["rate_hz"]
-            if abs(factor / FASTER - 1.0) < 1e-6 and times < WORTH:
+            if math.isclose(factor, FASTER) and times < WORTH:
                 lines.append(f"  by means at {rate['rate_hz']:g} Hz: {duration_words(rate['duration_s'])}")
-            if abs(factor * FASTER - 1.0) < 1e-6 and times < 1.0 / WORTH:
+            if math.isclose(factor * FASTER, 1.0) and times < 1.0 / WORTH:
                 lines.append(f"  means at {rate['rate_hz']:g} Hz suffice: {duration_words(rate['duration_s'])}")
     if document["duration_s"] is not None:
         lines.append(

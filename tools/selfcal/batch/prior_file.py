@@ -40,22 +40,12 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
         raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
     for group in model.groups:
         own = tree["groups"][group.name].get("own_priors") or {}
-        own |= {
-            axis: {
-                **own.get(axis, {}),
-                **(
-                    {
-                        name: {
-                            key: value if isinstance(value, str) else _rounded(value)
-                            for key, value in prior_tree(prior).items()
-                        }
-                        for name, prior in priors[axis].items()
-                    }
-                ),
+        for axis in (axis for axis in group.axes if axis in priors):
+            trees = {name: prior_tree(prior) for name, prior in priors[axis].items()}
+            own[axis] = own.get(axis, {}) | {
+                name: {key: value if isinstance(value, str) else _rounded(value) for key, value in stated.items()}
+                for name, stated in trees.items()
             }
-            for axis in group.axes
-            if axis in priors
-        }
         if own:
             tree["groups"][group.name]["own_priors"] = own
     for law, odds in _odds(model, batch).items():
@@ -84,12 +74,12 @@ def _prior(population: Population, batch: Batch) -> Prior:
     fit = population.fit
     mean = float(fit.weight @ fit.mean)
     variance = float(fit.weight @ (fit.t**2 + fit.variance + (fit.mean - mean) ** 2))
-    shift = _of_lots(population, batch)
+    shift = _of_lots(population)
     sd = math.sqrt(variance + float(np.var(shift)))
     return Prior.log_normal(math.exp(mean + float(np.mean(shift))), min(max(sd, LOG_NORMAL_SD[0]), LOG_NORMAL_SD[1]))
 
 
-def _of_lots(population: Population, batch: Batch) -> np.ndarray:
+def _of_lots(population: Population) -> np.ndarray:
     """By how much each unit [n] is off for its lot, or for the one of two groups: its own, unlike a station's part."""
     shift = np.zeros(population.measured.at.size)
     for apart in population.apart:

@@ -33,6 +33,7 @@ from rich.progress import BarColumn, TextColumn
 from selfcal.base.errors import UserError, first_line, install, printable, shown
 from selfcal.base.output import temporary_folder, whole
 from selfcal.base.progress import Doing
+from selfcal.base.units import duration_words
 
 #: Argument of the function for a record; it is pickled.
 Job = Any
@@ -163,8 +164,7 @@ class _Remaining(Doing):
         self.left -= self.weights[k]
         self.jobs += self.sizes[k]
         rest_s = (time.monotonic() - self.began) * self.left / self.worked if self.worked else 0.0
-        left = f"{rest_s:.0f} s" if rest_s < 120.0 else f"{rest_s / 60.0:.0f} min"
-        said = f"{self.jobs} of {sum(self.sizes)}, {left} more"
+        said = f"{self.jobs} of {sum(self.sizes)}, {duration_words(rest_s)} more"
         self.progress.update(self.task, advance=self.weights[k], said=said)
         self.tell(said)
 

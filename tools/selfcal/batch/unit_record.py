@@ -40,18 +40,17 @@ class Verbs(NamedTuple):
 
 @dataclass(frozen=True)
 class Options:
-    """How each recording is looked at. `reading` and `stretch`: keywords of `identify` and `diagnose` alike."""
+    """How each recording is looked at. `reading`: keywords of `identify` and `diagnose` alike."""
 
     model: str | None = None
     axes: tuple[str, ...] = ()
     diagnose: bool = False
     reading: Mapping[str, Any] = field(default_factory=dict)
-    stretch: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def given(self) -> dict[str, Any]:
         """Keywords of both."""
-        return {"axes": self.axes, "model": self.model, **self.reading, **self.stretch}
+        return {"axes": self.axes, "model": self.model, **self.reading}
 
 
 def examined(verbs: Verbs, options: Options, job: Job) -> list[Row]:

@@ -16,9 +16,11 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from statistics import NormalDist
 from typing import Any
 
 from selfcal.bank.result import HALF_90, bias_of, likeliest
+from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, shown
 from selfcal.base.grid import bisected
@@ -45,6 +47,11 @@ class Limit:
     unit: str
 
     @property
+    def key(self) -> tuple[str, str, str]:
+        """What it bounds, and the side."""
+        return self.axis, self.parameter, self.side
+
+    @property
     def name(self) -> str:
         """As a report has it."""
         return f"{self.axis}.{self.parameter} {'<=' if self.side == 'max' else '>='} {self.value:g} {self.unit}"
@@ -65,9 +72,8 @@ class Verdict:
     @property
     def words(self) -> str:
         """Verdict with its reason."""
-        return f"{self.limit.name}: {self.verdict}{', ' if self.verdict == OPEN else ': '}{self.reason}".removesuffix(
-            ": "
-        )
+        reason = self.reason and f"{', ' if self.verdict == OPEN else ': '}{self.reason}"
+        return f"{self.limit.name}: {self.verdict}{reason}"
 
     def entry(self) -> dict[str, Any]:
         """As JSON has it."""
@@ -93,13 +99,9 @@ class Limits:
 
     def of(self, axes: Collection[str]) -> list[Limit]:
         """The limits of a batch whose recordings have these axes. An axis' own limit replaces its group's."""
-        own = {(limit.axis, limit.parameter, limit.side) for limit in self.stated}
-        group = [
-            limit
-            for limit in self.of_group
-            if limit.axis in axes and (limit.axis, limit.parameter, limit.side) not in own
-        ]
-        return sorted([*self.stated, *group], key=lambda limit: (limit.axis, limit.parameter, limit.side))
+        group = [limit for limit in self.of_group if limit.axis in axes]
+        by_key = {limit.key: limit for limit in (*group, *self.stated)}
+        return [by_key[key] for key in sorted(by_key)]
 
     @staticmethod
     def load(path: Path | str, model: Model) -> Limits:
@@ -129,7 +131,7 @@ class Limits:
         if not stated and not of_group:
             raise UserError(f"{file}: no limit is in it: write one as gx.N: {{max: 0.01 deg/s/sqrt(Hz)}}")
         limits = Limits(tuple(stated), tuple(of_group))
-        by_side = {(limit.axis, limit.parameter, limit.side): limit for limit in limits.of(model.axes)}
+        by_side = {limit.key: limit for limit in limits.of(model.axes)}
         for (axis, parameter, side), low in by_side.items():
             high = by_side.get((axis, parameter, "max"))
             if side == "min" and high is not None and low.value * units.factor(low.unit, high.unit) > high.value:
@@ -203,7 +205,7 @@ def _estimate(parameter: str, axis: Mapping[str, Any]) -> dict[str, Any] | str:
     if not having:
         return f"no law of the model has {parameter}"
     law = best if best in having else max(having, key=lambda law: probability[law])
-    if law != best and not constant and probability[law] < 0.05:
+    if law != best and not constant and probability[law] < LIKELY:
         there = ", ".join(name for name in axis["parameters"][best] if name != "N")
         return f"its drift is {best}, which has no {parameter}: limit {there}"
     return {**axis["parameters"][law][parameter], "sharpens": True}
@@ -238,15 +240,16 @@ def _rest_s(
     def chance(times: float) -> float:
         """Probability of a verdict at `times` the length."""
         left, moves = sd / math.sqrt(times), sd * math.sqrt(1.0 - 1.0 / times)
-        return _normal((abs(middle) - HALF_90 * left) / moves) + _normal((-abs(middle) - HALF_90 * left) / moves)
+        return sum(NormalDist().cdf((side * abs(middle) - HALF_90 * left) / moves) for side in (1.0, -1.0))
 
     if chance(MOST_TIMES) < CHANCE:
         return None
     return duration_s * math.expm1(bisected(lambda ln: chance(math.exp(ln)) >= CHANCE, 0.0, math.log(MOST_TIMES))[1])
 
 
-def _normal(x: float) -> float:
-    return 0.5 * math.erfc(-x / math.sqrt(2.0))
+def worst(codes: Iterable[int]) -> int:
+    """The exit code of several: 1 goes before 2, and 2 before 0."""
+    return min(filter(None, codes), default=0)
 
 
 def code_of(verdicts: Iterable[Verdict]) -> int:

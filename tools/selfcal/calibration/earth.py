@@ -42,7 +42,7 @@ def gravity_at(latitude_deg: float, height_m: float) -> float:
 
 def place(latitude_deg: float | None, height_m: float | None, gravity: float | None) -> Place:
     """Gravity and the Earth's rate at a place. Raises UserError for numbers that no place on Earth has."""
-    if latitude_deg is not None and not -90.0 <= latitude_deg <= 90.0:
+    if latitude_deg is not None and not abs(latitude_deg) <= 90.0:
         raise UserError(f"--latitude {latitude_deg:g}: takes degrees from -90 to 90, north is positive")
     if height_m is not None and latitude_deg is None:
         raise UserError("--height changes the gravity of a latitude: give --latitude too")

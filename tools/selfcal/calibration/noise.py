@@ -67,7 +67,7 @@ def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Arr
             covariance += term.square * walk
             continue
         x = term.alpha * length
-        mean = np.where(x > 1e-6, -np.expm1(-x) / np.maximum(x, 1e-300), 1.0)
+        mean = -np.expm1(-x) / x
         own = np.where(x > 1e-3, 2.0 * (x + np.expm1(-x)) / np.maximum(x, 1e-3) ** 2, 1.0 - x / 3.0)
         half = 0.5 * length
         gap = np.maximum(apart - half[:, None] - half[None, :], 0.0)
@@ -96,7 +96,7 @@ def of_laws(
     total, terms = sum(probability.values()), list[Term]()
     for name, share in probability.items():
         law, own = laws[name], values[name]
-        if len(law.parameters) < 2 or not share > 0.0:
+        if not law.terms or not share > 0.0:
             continue
         square = share / total * own[law.parameters[1]][0]
         sized = law.sized(math.sqrt(square), own[law.second][1] if law.second else 1.0)

@@ -15,7 +15,7 @@ from selfcal.base.grid import Array, Mask, block_means, runs
 from selfcal.base.units import factor
 from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
 from selfcal.calibration.tumble_fit import Fit, Problem, fit, linearized
-from selfcal.logs.recording import Recording
+from selfcal.logs.recording import Recording, check_column
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
 from selfcal.readings.rest import PIECE_S, rest_of
@@ -237,9 +237,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
 def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
     """A log and its rests."""
     for name in ACCEL:
-        if name not in whole.columns:
-            there = ", ".join(whole.columns)
-            raise UserError(f"{whole.path}: there is no column '{name}' (there are {there}): tumble takes ax, ay, az")
+        check_column(whole, name, needed=": tumble takes ax, ay, az")
     clock = whole.columns[max(axes, key=lambda name: whole.clock_of(name).rate_hz)].clock
     recording = whole.along(*(name for name in axes if whole.columns[name].clock is clock))
     own = {name: recording.in_unit(name, UNITS[name]) for name in axes}

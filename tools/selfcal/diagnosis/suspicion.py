@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import yaml
 
-from selfcal.adequacy.checks import FEWEST
 from selfcal.adequacy.document import to_document
 from selfcal.adequacy.identify import identify_axis
+from selfcal.bank.blocks import FEWEST
 from selfcal.bank.priors import add_sources, for_record
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import UNEXPLAINED

@@ -63,10 +63,13 @@ def tables_of(
         )
     if rate_hz is None and {split(heading)[0] for heading in arrays} <= {*sensors, *SIDE_UNITS} and "t" not in known:
         raise UserError("arrays: no time column: give rate_hz=100.0, or a column 't[s]'")
-    words = {key: one[:LOOKED_AT].astype(str).tolist() for key, one in arrays.items() if one.dtype.kind in "OUSiu"}
+    words = {
+        key: cells[:LOOKED_AT].astype(str).tolist() for key, cells in arrays.items() if cells.dtype.kind in "OUSiu"
+    }
     turns = in_turn([*words], [*words.values()])
     rows = {f"{key}:{word}": arrays[key].astype(str) == word for key, word in turns} or {"": slice(None)}
-    return [of_arrays(source, {name: one[own] for name, one in arrays.items()}) for source, own in rows.items()], stated
+    parts = [of_arrays(source, {name: cells[own] for name, cells in arrays.items()}) for source, own in rows.items()]
+    return parts, stated
 
 
 def _columns(data: Any) -> Iterator[tuple[str, NDArray[Any]]]:

@@ -63,7 +63,7 @@ def assembled(rows: Rows, header: Header) -> Recording:
         return _as_written(rows, columns, units.convert(stamps.values, stamps.unit, "s"), header)
     ordered, kept = _ordered(rows, stamps, part, header)
     if kept.size < count or (np.diff(kept) < 0).any():
-        columns = {name: replace(one, values=one.values[kept]) for name, one in columns.items()}
+        columns = {name: replace(column, values=column.values[kept]) for name, column in columns.items()}
     return _on_clocks(rows, header.rate, columns, kept.size, ordered, header)
 
 
@@ -131,7 +131,7 @@ def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: He
     if not any(name in header.sensors for name in made):
         raise UserError(f"{path}: no sensor column holds a number")
     started, notes = number_in(meta.get("started_s")), meta.get("notes")
-    of_log = [one for one in notes if isinstance(one, str) and one.isprintable()] if isinstance(notes, list) else []
+    of_log = [text for text in notes if isinstance(text, str) and text.isprintable()] if isinstance(notes, list) else []
     return Recording(
         path,
         main.rate_hz,
@@ -255,7 +255,7 @@ def _check_truth(path: Path, meta: Mapping[str, Any]) -> None:
         raise UserError(f"{path}: meta: 'truth' must be a mapping of axes")
     for axis, entry in truth.items():
         for key, value in entry.items():
-            if key == "units" or (isinstance(value, str) and len(value) <= 60 and value.isprintable()):
+            if key == "units" or (isinstance(value, str) and value == short(value)):
                 continue
             if not math.isfinite(number_in(value)):
                 raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {shown(value)}")

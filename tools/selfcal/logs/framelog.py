@@ -21,9 +21,9 @@ from selfcal.logs.loaders.damage import SOUND, Damaged
 if TYPE_CHECKING:
     import can
 
-#: What `monitor --log` writes, and what --read reads.
+#: Suffixes that `monitor --log` writes and --read reads.
 WRITTEN = (".asc", ".blf", ".csv", ".log", ".mcap", ".trc")
-#: Those that are no text.
+#: Suffixes of binary logs.
 BINARY = (".blf", ".mcap")
 
 #: Of Vector's BLF: sizes of the file's header and of the file, then an object's signature, size and kind; a
@@ -42,7 +42,7 @@ CANDUMP = re.compile(
 GVRET = "Time Stamp,ID,Extended,"
 #: Lines that are looked at for candump's screen form: the first may be damaged.
 CANDUMP_WITHIN = 20
-#: Characters of a line at most: the rest of a longer one counts as another line.
+#: Characters of a line, and bytes of an MCAP record, at most: the rest of a longer line counts as another line.
 LONGEST_LINE = 1 << 16
 #: Sound lines without a frame, by suffix.
 PASSED = {
@@ -54,6 +54,8 @@ PASSED = {
     ".csv": re.compile(rf"timestamp,arbitration_id,|{GVRET}"),
     ".trc": re.compile(r";|\d+\)?\s+[\d.]+\s+(\d\s+)?(Warng|Error|ST|EC|ER|EV)\s", re.ASCII),
 }
+#: Topic of raw frames in an MCAP file.
+FRAMES = "/selfcal/frames"
 #: Bytes of a frame at most, but for CAN FD.
 LONGEST_FRAME = 8
 
@@ -72,7 +74,7 @@ class FrameLog:
     def __init__(self, path: Path | str, speed: float | None = None) -> None:
         import can
 
-        logging.getLogger("can").setLevel(logging.CRITICAL)  # its readers tell of lines that they leave out
+        logging.getLogger("can").setLevel(logging.CRITICAL)  # its readers report the lines that they skip
         self.path = Path(path)
         self.closed = False
         self.damage = ""
@@ -338,7 +340,7 @@ def _check_blf(path: Path) -> Damaged:
     checksum not to fit, holds up to there, and does not look for the end that the header states. Raises UserError for a
     BLF file on which it would take all memory, or go round for ever.
 
-    A file is a header and objects; an object's header tells its size, and a container holds objects, packed by zlib.
+    A file is a header and objects; an object's header has its size, and a container holds objects, packed by zlib.
     """
     damaged = SOUND
     with path.open("rb") as file:
@@ -392,8 +394,8 @@ def _check_objects(path: Path, data: bytes) -> bytes:
 
 
 class McapFrames:
-    """The frames of a file that McapLog wrote, as python-can's readers give them. A record of more than LARGEST bytes
-    ends it."""
+    """The frames of a file that McapLog wrote, as python-can's readers give them. A record of more than
+    LONGEST_LINE bytes ends it."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
@@ -404,7 +406,7 @@ class McapFrames:
         from mcap.stream_reader import StreamReader
 
         frames: set[int] = set()
-        for record in StreamReader(self._file, emit_chunks=True, record_size_limit=LARGEST).records:
+        for record in StreamReader(self._file, emit_chunks=True, record_size_limit=LONGEST_LINE).records:
             if isinstance(record, Channel) and record.topic == FRAMES:
                 frames.add(record.id)
             elif isinstance(record, Message) and record.channel_id in frames:
@@ -430,10 +432,3 @@ def check_suffix(path: Path | str) -> None:
         raise UserError(f"{path}: the name of a frame log ends in {', '.join(WRITTEN)}")
     if str(path).lower().endswith(".mcap") and find_spec("mcap") is None:
         raise UserError(f"{path}: mcap is not installed: {install('selfcal[mcap]')}")
-
-
-#: Topic and schema of raw frames in an MCAP file, and the size of one record there at most.
-FRAMES = "/selfcal/frames"
-
-
-LARGEST = 1 << 16

@@ -16,7 +16,7 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, short
 from selfcal.base.limits import LONGEST_HEADING, MOST_HEADINGS
 from selfcal.base.options import Scale
-from selfcal.base.units import SENSORS
+from selfcal.base.units import SENSOR_UNITS
 from selfcal.logs import written
 from selfcal.logs.loaders.damage import SOUND
 from selfcal.logs.loaders.headings import PART, Meaning, Sensor, sensors_of, split
@@ -25,8 +25,6 @@ from selfcal.logs.loaders.text_table import is_clock, is_date, is_row
 from selfcal.logs.loaders.texts import Text
 from selfcal.logs.recorded import SIDE_UNITS
 
-#: Unit of a scaled LSB column where the scale states none.
-LSB_UNITS = {name: {"g": "deg/s", "a": "m/s^2"}[name[0]] for name in SENSORS}
 #: What to type where no heading is a sensor's.
 NAME_YOURS = "name yours with --column gx=NAME, and --unit gx=UNIT where its heading has none"
 #: Columns without a unit that begin with a whole number, from which on they may be counts.
@@ -90,11 +88,11 @@ class Header:
 
     def of_part(self, several: bool) -> Header:
         """The same for one of the file's parts."""
-        one = copy(self)
-        one.several, one.notes, one.without_unit, one.without_size = several, [], [], []
-        one.damaged = SOUND
-        one.whole = set()
-        return one
+        part = copy(self)
+        part.several, part.notes, part.without_unit, part.without_size = several, [], [], []
+        part.damaged = SOUND
+        part.whole = set()
+        return part
 
     def knows_in(self, text: Text) -> Callable[[Sequence[str]], bool]:
         """Whether one of a line's headings is a sensor's, in a text. Only so many are looked at."""
@@ -112,8 +110,8 @@ class Header:
         """The sensors of a table with these headings, after the lines `before` of a text."""
         found = []
         for sensor in sensors_of(file or self.path.name, keys, self.sensors, self.mapped(keys), before):
-            meant = {key: one for key, one in sensor.meant.items() if not one.optional or self._asks(key, one.name)}
-            if any(one.name in self.sensors for one in meant.values()) or len(meant) == len(sensor.meant):
+            meant = {key: own for key, own in sensor.meant.items() if not own.optional or self._asks(key, own.name)}
+            if any(own.name in self.sensors for own in meant.values()) or len(meant) == len(sensor.meant):
                 found.append(replace(sensor, meant=meant))
         return found
 
@@ -179,7 +177,7 @@ class Header:
         if not any(name in self.sensors for name in names):
             none = f"{self.path}: {where}no sensor column ({', '.join(self.sensors)}) among '{short(','.join(keys))}'; "
             if is_row(",".join(keys)):
-                headings = ",".join(["t[s]", *(f"{name}[{unit}]" for name, unit in LSB_UNITS.items())])
+                headings = ",".join(["t[s]", *(f"{name}[{unit}]" for name, unit in SENSOR_UNITS.items())])
                 raise UserError(f"{none}put a line of headings before it, such as {headings}, in the columns' order")
             raise UserError(f"{none}{NAME_YOURS}")
         return fields
@@ -239,7 +237,7 @@ class Header:
         name = split(key)[0]
         matrix, _, number = name.rpartition(":")
         here = {"t", *self.sensors, *SIDE_UNITS}
-        return [one for one in (key, name, *([matrix] if number.isdigit() else [])) if one not in here]
+        return [own for own in (key, name, *([matrix] if number.isdigit() else [])) if own not in here]
 
     def _what_to_state(self) -> str:
         """The options to type for the columns without a unit or a size, by the file's own names."""
@@ -249,10 +247,10 @@ class Header:
                 f"column '{name}' has no unit: write {name}[{unit}] in the header or give --unit {name}={unit}, or the "
                 "unit that it is in"
             )
-        counts = [one for one in self.without_unit if one[0] in self.whole]
+        counts = [column for column in self.without_unit if column[0] in self.whole]
         if len({name for _, name, _ in counts}) < _COUNTS_FROM:  # one alone may be a whole number by chance
             counts = []
-        stated = [one for one in self.without_unit if one not in counts]
+        stated = [column for column in self.without_unit if column not in counts]
         typed = [f"--unit {name}={unit}" for name, unit in self._by_own_names(stated)]
         typed += [f"--unit {name}={units.LSB}" for name, _ in self._by_own_names(counts)]
         typed += [f"--scale {name}=SIZE[{unit}]" for name, unit in self._by_own_names([*counts, *self.without_size])]
@@ -268,7 +266,7 @@ class Header:
         """For each option to type the name, quoted, and the unit. Columns of one matrix and kind share an option."""
         typed: dict[str, str] = {}
         for key, name, unit in columns:
-            own = [one for one in self._own_names(key) if "=" not in one]
+            own = [heading for heading in self._own_names(key) if "=" not in heading]
             typed[shlex.quote(own[-1] if own and split(key)[0] != name else name)] = unit
         return list(typed.items())
 
@@ -287,7 +285,7 @@ class Header:
         dates = dates and name == "t" and stated is None
         unit = "s" if dates else unit
         known = isinstance(unit, str) and units.known(unit)
-        example = {"t": "s", **SIDE_UNITS, **LSB_UNITS}.get(name, "UNIT")
+        example = {"t": "s", **SIDE_UNITS, **SENSOR_UNITS}.get(name, "UNIT")
         to_scale = (
             f"give --scale {shlex.quote(f'{name}=SIZE[{example}]')}, SIZE the {example} of one '{short(str(unit))}'"
         )
@@ -314,9 +312,9 @@ class Header:
         if unit == units.LSB:
             given = self.scale.get("") if scaled is None else scaled
             if given is None:
-                self.without_size.append((key, name, LSB_UNITS.get(name, "UNIT")))
+                self.without_size.append((key, name, SENSOR_UNITS.get(name, "UNIT")))
                 return []
-            size, unit = given[0], units.plain(given[1]) if given[1] else LSB_UNITS.get(name)
+            size, unit = given[0], units.plain(given[1]) if given[1] else SENSOR_UNITS.get(name)
             if unit is None or not units.known(unit) or unit == units.LSB:
                 raise UserError(f"{column} is in LSB: --scale needs a unit, --scale {name}={size:g}[unit]")
         elif scaled is not None:
@@ -336,7 +334,7 @@ def _called(keys: Sequence[str], wanted: str) -> list[str]:
 
 
 def number_in(value: Any) -> float:
-    """A JSON value as a number; NaN if it is none."""
+    """A JSON value as a number; NaN for any other value."""
     try:
         return float(value) if isinstance(value, int | float) and not isinstance(value, bool) else math.nan
     except OverflowError:

@@ -2,7 +2,7 @@
 
 Text has one header row of `name[unit]`. An npz has one 1-D array a column, named like the header, or named plainly
 with unit and LSB in a JSON text `meta`: {"rate_hz": 100.0, "columns": {"gx": {"unit": "deg/s", "lsb": 0.05}}}. A text
-file may have such a text beside it, LOG.meta.json. Every fault raises UserError with file, line and column in one line.
+file may have such a text as LOG.meta.json. Every fault raises UserError with file, line and column in one line.
 """
 
 from __future__ import annotations
@@ -61,6 +61,8 @@ def load(
     sources: Sequence[str] = (),
     dbc: Path | str | None = None,
     rate_hz: float | None = None,
+    start_s: float | None = None,
+    end_s: float | None = None,
 ) -> Recording:
     """Read a recording; of several files, or sensors of a log, one, joined by their time stamps. Readings in memory are
     taken as `Recording.from_arrays` has it, and a Recording as it is.
@@ -69,16 +71,17 @@ def load(
     true rate.
     `columns`: name here -> header in the file. `units`: name here -> unit; it takes the header's place.
     `scale`: size of one LSB, for all LSB columns or by name, with its unit (default deg/s for g*, m/s^2 for a*).
-    `sensors`: columns of which at least one must be there. A column that is none of these, nor temperature or supply,
+    `sensors`: columns of which at least one must be there. Any other column, except temperature and supply,
     is left out if it cannot be read.
     `no_time`: the time column is not read. `skip_bad`: lines of a text that are no row are left out and counted.
     `sources`: names of the sensors to read of a log that has several, or one name. `dbc`: what decodes CAN frames.
+    `start_s`, `end_s`: the stretch that is kept (`Recording.between`).
     The recording's `notes` are printed on stderr.
     Raises UserError for any file that is not a sound recording, or is larger than `limits.py` says. O(n); about 2 s
     for 10^6 CSV rows of 7 columns.
     """
     if isinstance(path, Recording):
-        return path
+        return path.between(start_s, end_s)
     rate = _rate(rate if rate_hz is None else rate_hz)
     if not isinstance(units, str | Mapping | None):
         raise UserError(
@@ -100,7 +103,7 @@ def load(
     if len(paths) > 1 and (rate is not None or no_time):
         raise UserError("several files are joined by their time stamps: leave --rate and --no-time out")
     asked = Asked(rate, columns, units, by_name, sensors, no_time, skip_bad, sources, dbc)
-    headers = [Header(one, asked, len(paths) > 1) for one in paths]
+    headers = [Header(file, asked, len(paths) > 1) for file in paths]
     found = [part for header in headers for part in _load(header, tables)]
     there = {text for header in headers for key in header.seen for text in (key, split(key)[0])}
     for name, wanted in columns.items():
@@ -116,7 +119,7 @@ def load(
     )
     for text in recording.notes:
         note(f"{recording.path}: {text}")
-    return recording
+    return recording.between(start_s, end_s)
 
 
 def _rate(rate: Any) -> float | None:
@@ -150,11 +153,18 @@ def list_of(paths: Data) -> list[Path]:
     """The files of a recording."""
     if isinstance(paths, Recording) or arrays.in_memory(paths):
         return []
-    return [Path(paths)] if isinstance(paths, Path | str) else [Path(one) for one in paths]
+    return [Path(paths)] if isinstance(paths, Path | str) else [Path(path) for path in paths]
+
+
+def check_column(recording: Recording, name: str, asked: str = "", needed: str = "") -> None:
+    """Raise UserError for a column that the recording has not: `asked` by which option, `needed` for what."""
+    if name not in recording.columns:
+        there = ", ".join(recording.columns)
+        raise UserError(f"{recording.path}: {asked}there is no column '{name}' (there are {there}){needed}")
 
 
 def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
-    """The sensors of one file that are meant, or of the tables that are `there`, and the temperatures beside them, each
+    """The sensors of one file that are meant, or of the tables that are `there`, and their temperatures, each
     by its own clock."""
     path, wanted = header.path, header.asked.sources
     hints: Hints = {} if header.asked.dbc is None else {"dbc": str(header.asked.dbc)}
@@ -174,8 +184,8 @@ def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
         header.seen = {key for table in tables for key in table.keys}
         parts = [part for table in tables for part in _parts(header, table, several)]
         if not parts or (several and not any(part.axes for part in parts)):
-            listed = ", ".join(f"{one.source}: {', '.join(one.keys)}" for one in tables)
-            why = next((f"; {one}" for table in tables for one in table.notes), "")
+            listed = ", ".join(f"{table.source}: {', '.join(table.keys)}" for table in tables)
+            why = next((f"; {remark}" for table in tables for remark in table.notes), "")
             raise UserError(
                 f"{path}: no sensor column ({', '.join(header.sensors)}) among '{short(listed)}'; {NAME_YOURS}{why}"
             )
@@ -183,13 +193,13 @@ def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
             raise UserError(f"{path}: it has one source alone: leave --source out")
         found, sides, notes = chosen(path, parts, wanted)
         recordings = [part.read(len(found) > 1, part in sides) for part in found]
-    sound = [one for one in recordings if one is not None]
-    damaged = sum((one.damaged for one in [*tables[:1], *sound]), SOUND)
+    sound = [part for part in recordings if part is not None]
+    damaged = sum((part.damaged for part in [*tables[:1], *sound]), SOUND)
     if damaged:
         damaged = replace(damaged, whole=damaged.whole or bytes_of(path))
         notes[:0] = [damaged.words] if form is not None else []  # a text's lines have lines of their own
     first = replace(sound[0], notes=(*notes, *sound[0].notes), damaged=damaged)
-    return [first, *(replace(one, damaged=SOUND) for one in sound[1:])]
+    return [first, *(replace(part, damaged=SOUND) for part in sound[1:])]
 
 
 def _parts(header: Header, table: Table, several: bool) -> list[Part]:
@@ -201,12 +211,12 @@ def _parts(header: Header, table: Table, several: bool) -> list[Part]:
         return []
     found = []
     for sensor in sensors or [sides or Sensor("", {})]:
-        others = {key for one in sensors if one is not sensor for key in one.meant} - sensor.meant.keys()
+        others = {key for other in sensors if other is not sensor for key in other.meant} - sensor.meant.keys()
         kept = [key for key in keys if key not in others]
-        one = _Sensor(header, table, sensor, kept, bool(sides))
-        names = set(map(one.name, kept))
+        own = _Sensor(header, table, sensor, kept, bool(sides))
+        names = set(map(own.name, kept))
         source = "/".join(name for name in (table.source, sensor.source) if name)
-        found.append(Part(source, frozenset(names & set(header.sensors)), "temp" in names, one.span, one.read))
+        found.append(Part(source, frozenset(names & set(header.sensors)), "temp" in names, own.span, own.read))
     return found
 
 
@@ -277,31 +287,31 @@ def _span(stamps: NDArray[Any], unit: str | None) -> tuple[int, float]:
 
 def _joined(files: Sequence[Path], found: Sequence[Recording], header: Header) -> Recording:
     """Parts of one recording as one: the columns of the fastest sensor keep its clock, others have their own."""
-    sensors = [one for one in found if not header.sensors or any(name in header.sensors for name in one.columns)]
-    main = max(sensors, key=lambda one: one.rate_hz)
+    sensors = [part for part in found if not header.sensors or any(name in header.sensors for name in part.columns)]
+    main = max(sensors, key=lambda part: part.rate_hz)
     paths = Path(" ".join(map(str, files)))
-    header.check_options([name for one in found for name in one.columns])
-    for one in found:
-        if one.started_s is None or main.started_s is None:
-            raise UserError(f"{one.path}: there is no time column: several files are joined by their time stamps")
-        shift = one.started_s - main.started_s
-        if shift > main.duration_s or -shift > one.duration_s:
+    header.check_options([name for part in found for name in part.columns])
+    for part in found:
+        if part.started_s is None or main.started_s is None:
+            raise UserError(f"{part.path}: there is no time column: several files are joined by their time stamps")
+        shift = part.started_s - main.started_s
+        if shift > main.duration_s or -shift > part.duration_s:
             raise UserError(f"{paths}: the files do not overlap in time: are they of one recording?")
     columns: dict[str, Column] = dict(main.columns)
     notes = [*main.notes]
-    for one in found:
-        if one is main:
+    for part in found:
+        if part is main:
             continue
-        assert one.started_s is not None and main.started_s is not None
-        shift = one.started_s - main.started_s
-        notes += one.notes
+        assert part.started_s is not None and main.started_s is not None
+        shift = part.started_s - main.started_s
+        notes += part.notes
         clocks: dict[int, Clock] = {}
-        for name, column in one.columns.items():
+        for name, column in part.columns.items():
             if name in columns and name not in header.sensors and (len(files) == 1 or name not in SIDE_UNITS):
                 continue  # each sensor's own temperature, or a column of no meaning here
             if name in columns:
                 raise UserError(f"{paths}: column '{name}' is in more than one of them")
-            own = one.clock_of(name)
+            own = part.clock_of(name)
             clock = clocks.setdefault(id(column.clock), replace(own, start_s=own.start_s + shift))
             if clock.alike(main.clock):
                 columns[name] = replace(column, clock=None)
@@ -314,18 +324,18 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: Header) -
         path=paths,
         columns=columns,
         notes=tuple(dict.fromkeys(notes)),
-        damaged=sum((one.damaged for one in found), SOUND),
+        damaged=sum((part.damaged for part in found), SOUND),
         paths=tuple(files) if len(files) > 1 else (),
     )
 
 
 def _rates(recording: Recording) -> list[str]:
     """A line on columns that are sampled at times of their own."""
-    if all(one.clock is None for one in recording.columns.values()):
+    if all(column.clock is None for column in recording.columns.values()):
         return []
     alike: dict[tuple[int, float], list[str]] = {}
-    for name, one in recording.columns.items():
-        alike.setdefault((id(one.clock), recording.clock_of(name).rate_hz), []).append(name)
+    for name, column in recording.columns.items():
+        alike.setdefault((id(column.clock), recording.clock_of(name).rate_hz), []).append(name)
     told = "; ".join(f"{', '.join(names)} at {rate:.6g} Hz" for (_, rate), names in alike.items())
     return [f"columns sampled at different times: {told}"]
 
@@ -337,14 +347,15 @@ def _check_gravity(recording: Recording, header: Header) -> None:
     of none."""
     if written.stated(recording.meta):
         return
-    axes = [recording.columns[name] for name in ("ax", "ay", "az") if name in recording.columns]
-    if len(axes) < 3 or any(one.unit != axes[0].unit or one.name in header.decided for one in axes):
+    names = ("ax", "ay", "az")
+    axes = [recording.columns[name] for name in names if name in recording.columns]
+    if len(axes) < len(names) or any(axis.unit != axes[0].unit or axis.name in header.decided for axis in axes):
         return
     if not units.same_kind(axes[0].unit, "m/s^2") or axes[1].clock != axes[0].clock or axes[2].clock != axes[0].clock:
         return
     block = max(1, round(recording.clock_of("ax").rate_hz * _GRAVITY_S))
     count = axes[0].values.size // block
-    means = np.array([one.values[: count * block].reshape(count, block).mean(axis=1) for one in axes])
+    means = np.array([axis.values[: count * block].reshape(count, block).mean(axis=1) for axis in axes])
     means = means[:, np.isfinite(means).all(axis=0)]
     if not means.size:
         return
@@ -356,7 +367,7 @@ def _check_gravity(recording: Recording, header: Header) -> None:
         return
     for unit, length in _GRAVITY.items():
         if abs(norm / length - 1.0) < _GRAVITY_OFF:
-            typed = " ".join(f"--unit {one.name}={unit}" for one in axes)
+            typed = " ".join(f"--unit {axis.name}={unit}" for axis in axes)
             raise UserError(
                 f"{recording.path}: ax, ay, az are in {axes[0].unit} by their headings; at rest their norm is "
                 f"{norm:#.3g}, so the unit is {unit}: give {typed} (or their own unit, if it is right)"

@@ -29,7 +29,7 @@ from selfcal.logs.loaders.table import heading, meta_place
 from selfcal.logs.recorded import Recording
 from selfcal.logs.timebase import Clock
 
-#: Headings, without a unit, of the columns beside those of the recording.
+#: Headings, without a unit, of the columns that are not the recording's.
 SAMPLE, LATE = "sample", "late"
 #: Stamps of several clocks closer than this, as a share of the fastest axes' interval, are one row.
 _ONE_ROW = 0.01
@@ -51,10 +51,10 @@ class Laid:
 def laid_out(recording: Recording) -> Laid:
     """The table of a recording."""
     of: dict[int, list[str]] = {id(None): []}
-    for name, one in recording.columns.items():
-        of.setdefault(id(one.clock), []).append(name)
+    for name, column in recording.columns.items():
+        of.setdefault(id(column.clock), []).append(name)
     clocks = [recording.clock_of(names[0]) for names in of.values()]
-    stamps = [one.time_s if one.off_grid_s is None else one.time_s + one.off_grid_s for one in clocks]
+    stamps = [clock.time_s if clock.off_grid_s is None else clock.time_s + clock.off_grid_s for clock in clocks]
     t, rows = _rows(stamps, _ONE_ROW / recording.rate_hz)
 
     def cells(values: NDArray[Any], at: Rows) -> Array:
@@ -63,15 +63,15 @@ def laid_out(recording: Recording) -> Laid:
         return full
 
     at = {name: place for names, place in zip(of.values(), rows, strict=True) for name in names}
-    table = {name: (one.unit, cells(one.values, at[name])) for name, one in recording.columns.items()}
+    table = {name: (column.unit, cells(column.values, at[name])) for name, column in recording.columns.items()}
     for ending, clock, own in zip(_endings(len(clocks)), clocks, rows, strict=True):
         if len(clocks) > 1 or clock.missing_before.any():
             table[SAMPLE + ending] = ("", cells(clock.place, own))
         if clock.off_grid_s is not None and not np.array_equal(t[own] - clock.time_s, clock.off_grid_s):
             table[LATE + ending] = ("", cells(clock.off_grid_s, own))
     entries = [
-        {"columns": names, "rate_hz": one.rate_hz, "start_s": one.start_s, "stamped": one.off_grid_s is not None}
-        for names, one in zip(of.values(), clocks, strict=True)
+        {"columns": names, "rate_hz": clock.rate_hz, "start_s": clock.start_s, "stamped": clock.off_grid_s is not None}
+        for names, clock in zip(of.values(), clocks, strict=True)
     ]
     kept = {key: value for key, value in recording.meta.items() if key not in _OF_TABLE}
     notes = [note for note in recording.notes if note != recording.damaged.words]  # this file is sound
@@ -83,7 +83,7 @@ def _endings(clocks: int) -> list[str]:
 
 
 def marks_of(meta: Mapping[str, Any]) -> set[str]:
-    """Headings of the columns beside the recording's in a table with this `meta`; none where it states no clocks."""
+    """Headings of the columns that are not the recording's in a table with this `meta`; empty without clocks."""
     endings = _endings(len(meta["clocks"])) if stated(meta) else []
     return {name + ending for ending in endings for name in (SAMPLE, LATE)}
 
@@ -98,7 +98,7 @@ def _rows(stamps: Sequence[Array], near_s: float) -> tuple[Array, list[Rows]]:
     than `near_s` share a row; each sample of one clock has a row of its own."""
     if len(stamps) == 1:
         return stamps[0], [np.arange(stamps[0].size)]
-    time, clock = np.concatenate(stamps), np.repeat(np.arange(len(stamps)), [one.size for one in stamps])
+    time, clock = np.concatenate(stamps), np.repeat(np.arange(len(stamps)), [own.size for own in stamps])
     order = np.argsort(time, kind="stable")
     time, clock = time[order], clock[order]
     group = np.cumsum(np.diff(time, prepend=-np.inf) >= near_s)
@@ -118,7 +118,7 @@ def clocks_of(
     path: object, meta: Mapping[str, Any], t: Array, marks: Mapping[str, Array], places: Rows | None
 ) -> list[tuple[list[str], Clock, Rows]]:
     """Of each clock that `meta` states the columns' names, the clock and the rows of its samples in a table with the
-    stamps `t` [n], s, and the columns `marks` beside the recording's. `places` [n]: lines of the rows, some of which
+    stamps `t` [n], s, and the further columns `marks`. `places` [n]: lines of the rows, some of which
     were skipped. Raises UserError."""
     found = []
     for number, (entry, ending) in enumerate(zip(meta["clocks"], _endings(len(meta["clocks"])), strict=True)):
@@ -166,8 +166,8 @@ def save(
 ) -> None:
     """Write a recording that `load` reads back; the suffix (.csv, .csv.gz, .npz) chooses the form.
 
-    `columns`: name -> (unit, float[n]); a unit "" is none. `t` float[n], s: time stamps; None is an even grid from 0.
-    `meta`: JSON values, kept in the npz or beside the CSV file as LOG.meta.json. `lsb`: name -> size of one LSB in the
+    `columns`: name -> (unit, float[n]); "" is no unit. `t` float[n], s: time stamps; None is an even grid from 0.
+    `meta`: JSON values, kept in the npz or next to the CSV file as LOG.meta.json. `lsb`: name -> size of one LSB in the
     column's unit: npz stores such a column as whole numbers of it. CSV values carry 9 digits, with `exact` as many as a
     float64 takes; an empty cell is NaN then. Raises UserError for an unwritable file.
     """
@@ -219,7 +219,9 @@ def _save_npz(
     for name, (unit, values) in columns.items():
         if name in lsb:
             counts = np.rint(np.asarray(values, np.float64) / lsb[name])
-            arrays[name] = counts.astype(np.int16 if np.abs(counts).max(initial=0) <= 32767 else np.int32)
+            arrays[name] = counts.astype(
+                np.int16 if np.abs(counts).max(initial=0) <= np.iinfo(np.int16).max else np.int32
+            )
             described["columns"][name] = {"unit": unit, "lsb": float(lsb[name])}
         else:
             arrays[heading(name, unit)] = np.asarray(values, np.float64)

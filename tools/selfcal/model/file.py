@@ -24,6 +24,7 @@ from selfcal.model.forms import FORMS, INPUTS, NUMBER, POWER, Knots
 from selfcal.model.laws import (
     DAMPING_LIMITS,
     FACTORS,
+    KINDS,
     MOST_TERMS,
     NAMED,
     PARAMETERS,
@@ -76,8 +77,6 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
 MOST_KNOTS = 200
 #: Most hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
-#: Keys that a term of a law may state apart from its kind and deviation.
-KEYS_OF_TERM = {"walk": (), "markov": ("bandwidth", "correlation_time_s"), "oscillation": ("period_s", "damping")}
 #: Most columns of a bank's regressors together, and most that a model file may state.
 MOST_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
 
@@ -237,11 +236,8 @@ class Handling:
 NOT_HANDLED = Handling()
 
 
-@dataclass(frozen=True)
-class GridNodes:
-    """Filter nodes of one target, by hypothesis: of rho, and of alpha or the ratio if the law has one."""
-
-    of: Mapping[str, tuple[int, ...]]
+#: Filter nodes of one target, by hypothesis: of rho, and of alpha or the ratio if the law has one.
+GridNodes = Mapping[str, tuple[int, ...]]
 
 
 @dataclass(frozen=True)
@@ -704,35 +700,34 @@ class _Reader:
                 shape = f"[{', '.join(what)}]" if len(what) > 1 else f"a number of {what[0]}"
                 raise self.fail(f"{where}.{name}", f"must be {shape}")
             of_laws[name] = tuple(self.count(count, f"{where}.{name}", *NODES) for count in counts)
-        return GridNodes(of_laws)
+        return of_laws
 
     def term(self, tree: Any, where: str) -> Term:
         fields = {"kind": tree} if isinstance(tree, str) else tree
-        if not isinstance(fields, dict) or fields.get("kind") not in KEYS_OF_TERM:
-            raise self.fail(
-                where, f"must be walk, markov, or a mapping with one of these or oscillation as kind, not {shown(tree)}"
-            )
-        walk, swings = (fields["kind"] == kind for kind in ("walk", "oscillation"))
-        self.only(fields, ("kind", "deviation", *KEYS_OF_TERM[fields["kind"]]), where)
-        if "bandwidth" in fields and "correlation_time_s" in fields:
-            raise self.fail(where, "states bandwidth (times alpha) or correlation_time_s, not both")
+        name = fields.get("kind") if isinstance(fields, dict) else None
+        if name not in KINDS:
+            plain, more = ([key for key, kind in KINDS.items() if kind.needs_time == needs] for needs in (False, True))
+            kinds = f"{', '.join(plain)}, or a mapping with one of these or {', '.join(more)} as kind"
+            raise self.fail(where, f"must be {kinds}, not {shown(tree)}")
+        kind = KINDS[name]
+        self.only(fields, ("kind", "deviation", *kind.keys), where)
+        stated = kind.needs_time or kind.time in fields
+        if stated and "bandwidth" in fields:
+            raise self.fail(where, f"states bandwidth (times alpha) or {kind.time}, not both")
         by_ratio = fields.get("deviation") == "ratio"
-        if by_ratio and walk:
-            raise self.fail(f"{where}.deviation", "of a walk must be a number")
-        stated = swings or "correlation_time_s" in fields
+        if by_ratio and not kind.time:
+            raise self.fail(f"{where}.deviation", f"of a {name} must be a number")
         damping = 0.0
-        if swings:
+        if "damping" in kind.keys:
             damping = self.within(self.entry(fields, "damping", where), f"{where}.damping", DAMPING_LIMITS)
-            time_s = self.number(self.entry(fields, "period_s", where), f"{where}.period_s") / (2.0 * math.pi)
-        else:
-            time_s = self.number(fields["correlation_time_s"], f"{where}.correlation_time_s") if stated else 1.0
+        time_s = self.number(self.entry(fields, kind.time, where), f"{where}.{kind.time}") if stated else kind.turn
         numbers = {
             key: self.within(fields.get(key, 1.0), f"{where}.{key}", FACTORS)
             for key in ("deviation", "bandwidth")
             if not (key == "deviation" and by_ratio)
         }
-        bandwidth = 1.0 / time_s if stated else numbers["bandwidth"]
-        return Term(fields["kind"], numbers.get("deviation", 1.0), bandwidth, stated, by_ratio, damping)
+        bandwidth = kind.turn / time_s if stated else numbers["bandwidth"]
+        return Term(name, numbers.get("deviation", 1.0), bandwidth, stated, by_ratio, damping)
 
     def law(self, tree: Any, where: str) -> Law:
         terms = self.entry(tree, "terms", where)
@@ -742,7 +737,8 @@ class _Reader:
         most = MOST_TERMS - (1 if coloured else 0)
         law = Law(tuple(self.term(entry, f"{where}.terms[{i}]") for i, entry in enumerate(terms)), coloured)
         if len(law.read) > most:
-            beside = " beside coloured noise" * coloured + ", an oscillation counts as two" * law.has_oscillation
+            counts = dict.fromkeys(f", {remark}" for term in law.terms if (remark := KINDS[term.kind].counts))
+            beside = " beside coloured noise" * coloured + "".join(counts)
             raise self.fail(f"{where}.terms", f"has {len(law.read)}, {most} are the most{beside}")
         by_ratio = sum(term.by_ratio for term in law.terms)
         if coloured and not terms:

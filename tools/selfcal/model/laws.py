@@ -7,13 +7,15 @@ In C it is `selfcal_law_t` (lib/selfcal_tables.h).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+
+_Floats = NDArray[np.float64]
 
 #: Most terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
 MOST_TERMS = 3
@@ -30,11 +32,11 @@ RATIO_LIMITS = (1e-3, 1e3)
 #: Correlation times in an interval beyond which the means of a drift count as white: neighbours' correlate by 0.02.
 FORGOTTEN = 20.0
 
-#: Kinds of `selfcal_term_kind_t`. An oscillation is followed by its damping.
-KINDS = ("walk", "markov", "oscillation", "damping")
 #: Least bank intervals in a period of an oscillation, and limits of its damping ratio (SWING_MAX, DAMPING_MIN and
 #: DAMPING_MAX in lib/bank_states.c).
 SWING_LEAST, DAMPING_LIMITS = 8.0, (1e-3, 0.7)
+#: Bank intervals of a correlation time: ALPHA_DT_MAX in lib/averages.h, TIME_MAX in lib/bank_states.c.
+TIMES = (1.0 / 6.9, 1e6)
 #: (kind, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
 LawTuple = tuple[list[tuple[int, float, float, bool, bool]], bool]
 
@@ -47,7 +49,7 @@ class Term:
     it is 2 pi / period, always stated, and `damping` the damping ratio.
     """
 
-    kind: str  # "walk", "markov" or "oscillation"
+    kind: str  # a name of KINDS
     deviation: float = 1.0
     bandwidth: float = 1.0
     stated: bool = False
@@ -65,6 +67,85 @@ class Sized(NamedTuple):
     damping: float
 
 
+#: A term in readings: the variance of a walk's step, variances and rates a reading of Gauss-Markov drifts, and the
+#: white noise that the means lack. An oscillation is the real part of a drift of complex numbers.
+Averages = tuple[float, tuple[tuple[complex, complex], ...], float]
+#: Weight of each state now in a term some time on, and the variance that the term gains until then.
+Later = tuple[tuple[_Floats, ...], _Floats]
+
+
+@dataclass(frozen=True)
+class Kind:
+    """A kind of term: all that tools/ knows of it.
+
+    `later(term, time_s)` and `averages(term, dt_s, block)`: the term ahead, and in means of `block` readings. `keys`:
+    entries of a term in a model file, apart from kind and deviation. `time`: the entry of its time, which is `turn`
+    over the bandwidth and within `times` bank intervals; "" without one. `needs_time`: an unknown time is refused.
+    `read`: weight of each state in a reading. `counts`: remark on a law with too many terms.
+    """
+
+    later: Callable[[Sized, float], Later]
+    averages: Callable[[Sized, float, int], Averages]
+    keys: tuple[str, ...] = ()
+    time: str = ""
+    turn: float = 1.0
+    times: tuple[float, float] = TIMES
+    needs_time: bool = False
+    read: tuple[float, ...] = (1.0,)
+    counts: str = ""
+
+
+def _walk_later(term: Sized, time_s: float) -> Later:
+    return (np.ones(np.shape(term.variance)),), term.variance * time_s
+
+
+def _walk_averages(term: Sized, dt_s: float, block: int) -> Averages:
+    step = term.variance * dt_s
+    return step, (), (1.0 - 1.0 / block**2) * step / 6.0
+
+
+def _markov_later(term: Sized, time_s: float) -> Later:
+    kept = np.exp(-term.rate * time_s) * np.ones(np.shape(term.variance))
+    return (kept,), -term.variance * np.expm1(-2.0 * term.rate * time_s)
+
+
+def _markov_averages(term: Sized, dt_s: float, block: int) -> Averages:
+    gain, without = averaged(term.rate * dt_s, block)
+    return 0.0, ((term.variance * gain, term.rate * dt_s),), term.variance * without
+
+
+def _oscillation_later(term: Sized, time_s: float) -> Later:
+    row = swing(2.0 * math.pi / term.rate, term.damping, time_s)[0]
+    kept = tuple(np.full(np.shape(term.variance), share) for share in row)
+    return kept, term.variance * (1.0 - float(row @ row))
+
+
+def _oscillation_averages(term: Sized, dt_s: float, block: int) -> Averages:
+    x, share = term.rate * dt_s, math.sqrt(1.0 - term.damping**2)
+    variance = term.variance * (1.0 - x**2 * (1.0 - 1.0 / block**2) / 12.0)
+    return 0.0, ((variance * complex(1.0, -term.damping / share), x * complex(term.damping, -share)),), 0.0
+
+
+#: Kinds of terms, in the order of `selfcal_term_kind_t`.
+KINDS: dict[str, Kind] = {
+    "walk": Kind(_walk_later, _walk_averages),
+    "markov": Kind(_markov_later, _markov_averages, ("bandwidth", "correlation_time_s"), "correlation_time_s"),
+    "oscillation": Kind(
+        _oscillation_later,
+        _oscillation_averages,
+        ("period_s", "damping"),
+        "period_s",
+        2.0 * math.pi,
+        (SWING_LEAST, 2.0 * math.pi * TIMES[1]),
+        needs_time=True,
+        read=(1.0, 0.0),
+        counts="an oscillation counts as two",
+    ),
+}
+#: Names of `selfcal_term_kind_t`. An oscillation is followed by its damping.
+KIND_CODES = (*KINDS, "damping")
+
+
 @dataclass(frozen=True)
 class Law:
     """A law by its terms. `drift_name` is the drift parameter's name where it is neither K nor sigma_m."""
@@ -79,19 +160,19 @@ class Law:
         return any(term.kind == "walk" for term in self.terms)
 
     @property
-    def has_oscillation(self) -> bool:
-        """The module's own watch does not know it (SELFCAL_REASON_LAW_NOT_WATCHED)."""
-        return any(term.kind == "oscillation" for term in self.terms)
-
-    @property
     def read(self) -> tuple[float, ...]:
         """Weight of each state of the drift in a reading: 0 of the second state of an oscillation."""
-        return tuple(share for t in self.terms for share in ((1.0, 0.0) if t.kind == "oscillation" else (1.0,)))
+        return tuple(share for term in self.terms for share in KINDS[term.kind].read)
+
+    @property
+    def noise_states(self) -> int:
+        """States of the white noise: e_i and e_(i-1) of coloured noise."""
+        return 2 if self.coloured_noise else 0
 
     @property
     def has_alpha(self) -> bool:
         """A bandwidth is unknown."""
-        return any(term.kind == "markov" and not term.stated for term in self.terms)
+        return any(KINDS[term.kind].time and not term.stated for term in self.terms)
 
     @property
     def second(self) -> str:
@@ -119,9 +200,9 @@ class Law:
         """For the bindings."""
         terms = []
         for t in self.terms:
-            terms.append((KINDS.index(t.kind), t.deviation, self.bandwidth(t), t.stated, t.by_ratio))
+            terms.append((KIND_CODES.index(t.kind), t.deviation, self.bandwidth(t), t.stated, t.by_ratio))
             if t.kind == "oscillation":
-                terms.append((KINDS.index("damping"), t.deviation, t.damping * t.bandwidth, t.stated, t.by_ratio))
+                terms.append((KIND_CODES.index("damping"), t.deviation, t.damping * t.bandwidth, t.stated, t.by_ratio))
         return terms, self.coloured_noise
 
     @staticmethod
@@ -133,6 +214,13 @@ class Law:
         """Drift and second parameter from values by name; 0 and 1 where the law has none."""
         drift, second = (*self.parameters[1:], "", "")[:2]
         return parameters[drift] if drift else 0.0, parameters[second] if second else 1.0
+
+    def noise(self, variance: float, second: float) -> tuple[float, float]:
+        """Variance of the white noise in readings (without colour `variance`), and its correlation at one reading."""
+        if not self.coloured_noise:
+            return variance, 0.0
+        theta = (second - 1.0) / (second + 1.0)
+        return variance * (1.0 + theta**2) / (1.0 + theta) ** 2, theta / (1.0 + theta**2)
 
     def sized(self, drift: Any, second: Any) -> Iterator[Sized]:
         """Each term at the drift parameter and the second one, as `node` has them. Beside a walk the drift parameter is
@@ -169,7 +257,7 @@ def averaged(x: float, block: int) -> tuple[float, float]:
     return gain, gain - (1.0 + phi + 2.0 * phi * math.expm1(-x) / rate) / rate
 
 
-def swing(period_s: float, damping: float, time_s: float) -> NDArray[np.float64]:
+def swing(period_s: float, damping: float, time_s: float) -> _Floats:
     """[2, 2]: transition over `time_s` of x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / period_s.
 
     The states are x and x' / w: both have the stationary variance of x, and do not correlate."""

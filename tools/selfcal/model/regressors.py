@@ -16,6 +16,14 @@ from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import KIND, Source, curved, made, played, source_of, variance_of
 
+#: Columns of a kind of regressor without a channel: names in C, and the entries with their numbers.
+_SHAPES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "time": (("TIME",), ()),
+    "step": (("STEP",), ("time_s",)),
+    "turn_on": (("TURN_ON",), ("tau_s",)),
+    "pulse": (("PULSE",), ("start_s", "end_s")),
+    "periodic": (("SINE", "COSINE"), ("frequency_hz",)),
+}
 #: A subset of the regressors.
 Choice = tuple[Regressor, ...]
 
@@ -92,16 +100,10 @@ def _channel(regressor: Regressor) -> tuple[str, str, str]:
 
 def sources_of(regressor: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
     """`selfcal_source_t` of each column of a regressor."""
-    if regressor.kind == "time":
-        return [(KIND["TIME"], 0, 0.0, 0.0)]
-    if regressor.kind == "step":
-        return [(KIND["STEP"], 0, regressor.time_s, 0.0)]
-    if regressor.kind == "turn_on":
-        return [(KIND["TURN_ON"], 0, regressor.tau_s, 0.0)]
-    if regressor.kind == "pulse":
-        return [(KIND["PULSE"], 0, regressor.start_s, regressor.end_s)]
-    if regressor.kind == "periodic":
-        return [(KIND[name], 0, regressor.frequency_hz, 0.0) for name in ("SINE", "COSINE")]
+    if regressor.kind in _SHAPES:
+        names, keys = _SHAPES[regressor.kind]
+        number, second = (*(getattr(regressor, key) for key in keys), 0.0, 0.0)[:2]
+        return [(KIND[name], 0, number, second) for name in names]
     channel = channels.index(_channel(regressor))
     if regressor.kind == "rate":
         return [(KIND["RATE"], channel, regressor.window_s, 0.0)]

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import signal
 
-from selfcal.base.units import STANDARD_GRAVITY
+from selfcal.base.units import SENSOR_UNITS, STANDARD_GRAVITY
 
 Floats = NDArray[np.float64]
 
 #: Axes of a part, and the unit of each.
-AXES = {"gx": "deg/s", "gy": "deg/s", "gz": "deg/s", "ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}
+AXES = SENSOR_UNITS
 #: The truths by unit and law: what `identify` finds on an ADIS16405 (README), rounded; s.
 TRUTHS: dict[str, dict[str, dict[str, float]]] = {
     "deg/s": {

@@ -17,14 +17,11 @@ from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
 from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior, Regressor
-from selfcal.model.laws import NAMED, PARAMETERS, PLACES, SWING_LEAST, Law
+from selfcal.model.laws import KINDS, NAMED, PARAMETERS, PLACES, Law
 from selfcal.model.regressors import channels_of, sources_of
 
 #: Most samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
-#: Most bank intervals of a stated correlation time, and of an oscillation's period over 2 pi: TIME_MAX in
-#: lib/bank_states.c.
-TIME_MAX = 1e6
 
 
 class PriorLaw(IntEnum):
@@ -248,7 +245,7 @@ def make_tables(
     _check_times(model, block / rate_hz)
 
     def grids(name: str) -> tuple[Grid | None, Grid | None]:
-        counts = nodes.of.get(name, ())
+        counts = nodes.get(name, ())
         rho, alpha = (*(make_grid(count) for count in counts), None, None)[:2]
         return rho, alpha
 
@@ -312,16 +309,11 @@ def _check_times(model: Model, dt: float) -> None:
         what = f"{model.half_life_s:g} s are less than {_library32.BATCH} bank intervals ({least_s:g} s)"
         raise UserError(f"{model.path}: half_life_s: {what}")
     for name, law in model.laws.items():
-        where = f"hypotheses.{name}: "
         for term in law.terms:
-            if term.kind == "oscillation":
-                most_s = 2.0 * math.pi * TIME_MAX * dt
-                check(f"{where}period_s", 2.0 * math.pi / term.bandwidth, SWING_LEAST * dt, most_s)
-        for term in law.terms:
-            if term.stated and term.kind == "markov":
-                stated = "correlation_time_s" if name in NAMED else f"{where}correlation_time_s"
-                # 6.9 is ALPHA_DT_MAX in lib/bank_inside.h.
-                check(stated, 1.0 / term.bandwidth, dt / 6.9, TIME_MAX * dt)
+            if term.stated:
+                kind = KINDS[term.kind]
+                where = kind.time if name in NAMED else f"hypotheses.{name}: {kind.time}"
+                check(where, kind.turn / term.bandwidth, *(intervals * dt for intervals in kind.times))
 
 
 def priors_of(group: Group, law: str) -> tuple[PriorRow, ...]:

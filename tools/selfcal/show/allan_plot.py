@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import chi2
 
+from selfcal.adequacy.overbound import upper_limit
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
 from selfcal.base.output import plotter, save_picture
@@ -139,7 +139,7 @@ def _panel(panel: Any, name: str, axis: Mapping[str, Any], datasheet: bool) -> N
 def _of_means(allan: Mapping[str, Any]) -> dict[str, Any]:
     """The Allan deviation of the bank's means, with its 90 % interval by chi-squared."""
     freedom, curve = np.array(allan["degrees_of_freedom"]), np.array(allan["recording"])
-    q05, q95 = (curve * np.sqrt(freedom / chi2.ppf(p, freedom)) for p in (0.95, 0.05))
+    q05, q95 = (upper_limit(curve, freedom, level) for level in (0.05, 0.95))
     return {"tau_s": allan["tau_s"], "deviation": curve, "q05": q05, "q95": q95}
 
 

@@ -12,8 +12,9 @@ from typing import Literal
 
 import numpy as np
 from markupsafe import Markup
+from numpy.typing import NDArray
 
-from selfcal.base.grid import Array, runs
+from selfcal.base.grid import Array, Mask, runs
 from selfcal.show.template import number, render
 
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
@@ -141,18 +142,22 @@ class Figure:
         return looks
 
 
+def means_of(edges: NDArray[np.int64], values: Array | Mask) -> Array:
+    """Mean of the finite values in each piece between `edges`; NaN without any."""
+    good = np.isfinite(values)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        total = np.add.reduceat(np.where(good, values, 0.0), edges[:-1])
+        return np.asarray(total / np.add.reduceat(good.astype(float), edges[:-1]))
+
+
 def envelope(x: Array, y: Array, points: int) -> tuple[Array, Array, Array, Array]:
     """Centre, mean, least and largest of y [n] in at most points / 2 pieces of equal length."""
     pieces = max(1, min(y.size, points // 2))
     edges = np.linspace(0, y.size, pieces + 1).astype(int)
-    good = np.isfinite(y)
-    count = np.add.reduceat(good.astype(float), edges[:-1])
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = np.add.reduceat(np.where(good, y, 0.0), edges[:-1]) / count
+    good, mean = np.isfinite(y), means_of(edges, y)
     low = np.minimum.reduceat(np.where(good, y, np.inf), edges[:-1])
     high = np.maximum.reduceat(np.where(good, y, -np.inf), edges[:-1])
-    empty = count == 0
-    mean[empty] = low[empty] = high[empty] = np.nan
+    low[np.isnan(mean)] = high[np.isnan(mean)] = np.nan
     return 0.5 * (x[edges[:-1]] + x[edges[1:] - 1]), mean, low, high
 
 

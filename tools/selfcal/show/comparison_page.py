@@ -11,18 +11,13 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from selfcal.base.output import write_text
+from selfcal.base.errors import short
 from selfcal.base.units import typeset
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
 from selfcal.show.template import render
 
 #: Allan deviations by axis and recording: the key `allan` of `selfcal.identify/1`.
 Curves = Mapping[str, Mapping[str, Mapping[str, Any]]]
-
-
-def write_page(path: Path | str, document: Mapping[str, Any], curves: Curves) -> None:
-    """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
-    write_text(path, page(document, curves))
 
 
 def page(document: Mapping[str, Any], curves: Curves) -> str:
@@ -128,7 +123,7 @@ def _deviations(name: str, curves: Mapping[str, Mapping[str, Any]], names: Mappi
     panels = []
     for log, stated in curves.items():
         tau, measured, low, high = (np.array(stated[key]) for key in ("tau_s", "recording", "model_q05", "model_q95"))
-        title = names[log] if len(names[log]) <= 22 else f"{names[log][:21]}…"
+        title = short(names[log], 22)
         curve, band = Curve("recording", tau, measured), Band("law, 5 to 95 %", tau, low, high)
         unit = f"deviation, {typeset(stated['unit'])}"
         if tau.size > 1:

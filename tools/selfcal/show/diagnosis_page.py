@@ -18,7 +18,6 @@ from markupsafe import Markup
 
 from selfcal.base import units
 from selfcal.base.ending import Stopped
-from selfcal.base.output import write_text
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted, times_of
 from selfcal.diagnosis.extend import fitted_law
@@ -40,13 +39,6 @@ ALLAN, ALLAN_OUTSIDE = "Allan deviation", 0.35
 #: Options of the command line and their values, each as often as it was given.
 Options = Sequence[tuple[str, str]]
 Entry = Mapping[str, Any]
-
-
-def write_page(
-    path: Path | str, document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()
-) -> None:
-    """Write page() to `path`, whole or not at all. Raises UserError if it cannot be written."""
-    write_text(path, page(document, record, diagnosed, options))
 
 
 def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()) -> str:

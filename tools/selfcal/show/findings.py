@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from rich.console import Console
@@ -14,7 +15,7 @@ from selfcal.adequacy.document import since
 from selfcal.adequacy.summary import noisier
 from selfcal.base import units
 from selfcal.base.errors import printable
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
 
@@ -32,9 +33,7 @@ def show(
         if not console.is_terminal:  # its cells wrap and lose nothing
             console.width = WIDTH
 
-    def say(line: str, style: str | None = None) -> None:
-        console.print(line, style=style, highlight=False, markup=False, soft_wrap=True)
-
+    say = partial(print_line, console)
     say(
         f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
         f"{recording['duration_s']:g} s{since(recording)}"
@@ -58,7 +57,8 @@ def show(
         if "error" in axis:
             say(f"{name}: no result: {axis['error']}")
     for name, axis in axes.items() if details else ():
-        say(f"\n{name} [{axis['unit']}]: {verdict(axis)}", "bold red" if axis["verdict"] != "adequate" else "green")
+        say("")
+        say(f"{name} [{axis['unit']}]: {verdict(axis)}", "bold red" if axis["verdict"] != "adequate" else "green")
         for finding in axis["findings"]:
             for line in _lines(finding):
                 say(f"  {line}")

@@ -14,10 +14,10 @@ from rich.table import Table
 from selfcal.adequacy.document import as_typed, since
 from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
-from selfcal.bank.result import likeliest
+from selfcal.bank.result import FAINT, likeliest
 from selfcal.base import units
 from selfcal.base.errors import called, few, printable
-from selfcal.base.output import TABLE_WIDTH, console_of, table_of
+from selfcal.base.output import TABLE_WIDTH, console_of, print_line, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
@@ -62,7 +62,7 @@ def show(
     if any("regressors" in axis for axis in axes.values()):
         console.print(_regressor_table(axes))
     for line in _notes(document, axes):
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        print_line(console, line)
 
 
 def _fitting(console: Console, tables: Sequence[Table]) -> Table:
@@ -74,7 +74,9 @@ def _fitting(console: Console, tables: Sequence[Table]) -> Table:
     return next(fitting, tables[-1])
 
 
-#: Names of the numbers of summary.py, of an angular rate, of an acceleration, and of anything else.
+#: Units of axes that have data sheets.
+_SHEETS = ("rad/s", "m/s^2")
+#: Names of the numbers of summary.py, of the axes with data sheets, and of anything else.
 _NUMBERS = {
     "arw": ("ARW", "VRW", "white noise"),
     "rrw": ("RRW", "RRW", "random walk"),
@@ -89,13 +91,13 @@ def _summary_table(axes: Mapping[str, Any], left_out: int) -> Table:
     table = table_of(headings, pad_edge=left_out == 0, collapse_padding=left_out > 0)
     for name, axis in axes.items():
         unit = axis["bias_now"]["unit"]
-        kind = next((k for k, of in enumerate(("rad/s", "m/s^2")) if units.same_kind(unit, of)), 2)
+        kind = next((k for k, of in enumerate(_SHEETS) if units.same_kind(unit, of)), len(_SHEETS))
         for key, number in axis["summary"].items():
             table.add_row(
                 name if key == "arw" else "",
                 _NUMBERS[key][kind],
                 _number(number, number, brief=left_out > 1),
-                _number(number["datasheet"], number, brief=left_out > 0) if kind < 2 else "-",
+                _number(number["datasheet"], number, brief=left_out > 0) if kind < len(_SHEETS) else "-",
                 end_section=key == list(axis["summary"])[-1],
             )
     return table
@@ -186,7 +188,7 @@ def _times(intervals: Sequence[Sequence[float]]) -> str:
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
     """The table without the intervals of its last `left_out` columns."""
-    brief = dict(zip(("alpha", "N", "K"), (left_out > 0, left_out > 1, left_out > 2), strict=True))
+    brief = {name: place < left_out for place, name in enumerate(("alpha", "N", "K"))}
     names = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
     drift = "K or sigma_m" if "B" not in names else "K, sigma_m or B"
     second = "1/alpha, s" + (", or ratio" if names & set(RATIOS) else "")
@@ -247,7 +249,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         coarse = [
             law
             for law, parameters in axis["parameters"].items()
-            if axis["hypotheses"][law] >= 0.01 and any(e["off_grid"] for e in parameters.values())
+            if axis["hypotheses"][law] >= FAINT and any(e["off_grid"] for e in parameters.values())
         ]
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
@@ -256,10 +258,10 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
     for said, chosen in (("identified with", True), ("strongest suspicion", False)) if suspicions else ():
         from selfcal.diagnosis.words import named  # it takes a second
 
-        of = _by_reason((named(one), name) for name, one in suspicions.items() if ("added_law" in axes[name]) is chosen)
+        of = _by_reason((named(why), name) for name, why in suspicions.items() if ("added_law" in axes[name]) is chosen)
         failed += [f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in of.items())}"] if of else []
     more = _by_reason(
-        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > 0.01), name)
+        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > FAINT), name)
         for name, more in ((name, axis["more_laws"]) for name, axis in axes.items() if "more_laws" in axis)
     )
     failed += [f"with the laws of sums.yaml: {names}: {laws}" for laws, names in more.items()]
@@ -289,7 +291,7 @@ def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
             same[1].append(name)
             same[2].append(outcome)
     for check, outcomes in lasting.items():
-        for names, intervals in events_of({name: one["intervals"] for name, one in outcomes.items()}).items():
+        for names, intervals in events_of({name: outcome["intervals"] for name, outcome in outcomes.items()}).items():
             events.append((check, [*names], [{**outcomes[names[0]], "intervals": intervals}]))
     return events
 
@@ -301,7 +303,9 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
     once = [{*names} for check, names, _ in events if check in ("turn_on", "jump")]
     # An axis goes like another one by an event of both.
     events = [
-        one for one in events if one[0] != "channel" or not any({one[2][0]["column"], *one[1]} <= both for both in once)
+        event
+        for event in events
+        if event[0] != "channel" or not any({event[2][0]["column"], *event[1]} <= both for both in once)
     ]
     lines = []
     for check, names, outcomes in events:
@@ -322,21 +326,21 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
         elif failed:
             alike.setdefault(tuple(failed), []).append(name)
     for checks, names in alike.items():
-        told = [_range_of(one, [axes[name]["checks"][one] for name in names]) for one in checks if one != "allan"]
+        said = [_range_of(test, [axes[name]["checks"][test] for name in names]) for test in checks if test != "allan"]
         off = [each for name in names for each in _off(axes[name])]
         each = off if len(names) == 1 else [min(off), max(off)]  # allan_16s model -9 %, 128s +22 %
-        told += (
+        said += (
             [f"allan_{', '.join(f'{tau} {most:+.0f} %' for most, tau in each).replace(' ', ' model ', 1)}"]
             if off
             else []
         )
-        lines.append(f"not adequate: {', '.join(names)}: {'; '.join(told)}")
+        lines.append(f"not adequate: {', '.join(names)}: {'; '.join(said)}")
     return [*lines, *([f"not adequate: statistics of {', '.join(beside)} as well"] if beside else [])]
 
 
 def _failed(axis: Mapping[str, Any]) -> list[str]:
     """Statistics of an axis that speak against its law."""
-    return [check for check, one in axis["checks"].items() if check.startswith(STATISTICS) and not one["passed"]]
+    return [check for check, own in axis["checks"].items() if check.startswith(STATISTICS) and not own["passed"]]
 
 
 def _off(axis: Mapping[str, Any]) -> list[tuple[float, str]]:

@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
@@ -20,7 +19,7 @@ from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
-from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope
+from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope, means_of
 
 #: Number of simulated records of a band.
 RECORDS = 20
@@ -257,14 +256,6 @@ def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
     return edges, 0.5 * (edges[:-1] + edges[1:]) / record.rate_hz
 
 
-def _reduced(edges: Indices, values: Array | NDArray[np.bool_]) -> Array:
-    """Mean of the finite values in each piece."""
-    good = np.isfinite(values)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        total = np.add.reduceat(np.where(good, values, 0.0), edges[:-1])
-        return np.asarray(total / np.add.reduceat(good.astype(float), edges[:-1]))
-
-
 def _level(
     finding: Finding, record: Record, means: bool = False, marked: bool = False, pieces: int = PIECES
 ) -> Compared:
@@ -272,7 +263,7 @@ def _level(
     size = np.sqrt(np.diff(edges))
 
     def summary(y: Array, w: Array) -> Array:
-        return _reduced(edges, w) * size if means else np.sqrt(_reduced(edges, w * w))
+        return means_of(edges, w) * size if means else np.sqrt(means_of(edges, w * w))
 
     what = "Mean" if means else "Noise level"
     return Compared(
@@ -413,7 +404,7 @@ def _missing(finding: Finding, record: Record) -> Figure:
     return Figure(
         "Missing samples",
         f"{np.count_nonzero(gone)} samples in {len(gaps)} gaps; the longest is of {longest} samples.",
-        [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, 100.0 * _reduced(edges, gone))])],
+        [Panel("Measured", "time, s", "missing, %", [Curve("missing", middle, 100.0 * means_of(edges, gone))])],
     )
 
 

@@ -10,18 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.bank.result import FAINT
 from selfcal.base.errors import printable
 from selfcal.base.output import plotter, save_picture
 from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
+from selfcal.model.file import LARGEST
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import AxisReport, axis_unit
 
 #: Colours of the hypotheses, in the model's order.
 COLORS = ("tab:green", "tab:blue", "tab:red", "tab:purple", "tab:orange", "tab:olive", "tab:brown", "tab:cyan")
-#: Least probability of a law that is drawn in full, with its values.
-FAINT = 0.01
-#: Largest true value that is drawn: an integer may have any number of digits.
-LARGEST = 1e30
 #: Share of first reports that set no scale: their intervals are the prior's.
 SETTLING = 0.2
 

@@ -60,13 +60,9 @@ def _typed(value: Any, hint: Any) -> Any:
 def _shape(hint: Any) -> type:
     """What a value must be to be taken for `hint`."""
     hint = get_origin(hint) or hint
-    return (
-        hint
-        if isinstance(hint, type) and not issubclass(hint, Object)
-        else Mapping
-        if isinstance(hint, type)
-        else object
-    )
+    if not isinstance(hint, type):
+        return object
+    return Mapping if issubclass(hint, Object) else hint
 
 
 class Damaged(Object):

@@ -12,9 +12,9 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from selfcal.model.file import KEYS_OF_TERM, MOST_AXES, MOST_HYPOTHESES, MOST_TAPS, NODES, REGRESSORS, SCHEMA
-from selfcal.model.forms import FORMS
-from selfcal.model.laws import NAMED, PLACES
+from selfcal.model.file import MOST_AXES, MOST_HYPOTHESES, MOST_TAPS, NODES, REGRESSORS, SCHEMA
+from selfcal.model.forms import FORMS, INPUTS
+from selfcal.model.laws import KINDS, NAMED, PLACES
 from selfcal.show.results import Comparison, Diagnosis, Identification, Object
 
 Json = dict[str, Any]
@@ -69,12 +69,12 @@ def model() -> Json:
         ]
     }
     kinds = [
-        _only({"kind": {"const": kind}, "deviation": TEXT, **dict.fromkeys(keys, NUMBER)}, ["kind"])
-        for kind, keys in KEYS_OF_TERM.items()
+        _only({"kind": {"const": name}, "deviation": TEXT, **dict.fromkeys(kind.keys, NUMBER)}, ["kind"])
+        for name, kind in KINDS.items()
     ]
-    term = {"anyOf": [{"enum": ["walk", "markov"]}, *kinds]}
+    term = {"anyOf": [{"enum": [name for name, kind in KINDS.items() if not kind.needs_time]}, *kinds]}
     law = _only({"probability": NUMBER, "terms": _list(term), "coloured_noise": {"type": "boolean"}}, ["terms"])
-    special = {"column": TEXT, "unit": TEXT, "input": {"enum": ["value", "variance"]}, "form": {"enum": list(FORMS)}}
+    special = {"column": TEXT, "unit": TEXT, "input": {"enum": list(INPUTS)}, "form": {"enum": list(FORMS)}}
     special["knots"] = _list(_list(NUMBER, minItems=2, maxItems=2), minItems=2)
     regressors = [
         _only(

@@ -15,9 +15,7 @@ import selfcal
 from selfcal.base.errors import printable
 from selfcal.base.units import typeset
 from selfcal.diagnosis import words
-
-#: Most letters of a name or a reason that are shown.
-LONGEST = 200
+from selfcal.model.file import LONGEST_TEXT
 
 
 def number(value: float, digits: int = 4) -> str:
@@ -42,9 +40,9 @@ def interval(estimate: Mapping[str, Any] | None) -> str:
 
 
 def shortened(text: str) -> str:
-    """A name or a reason from a file, on one line of at most LONGEST letters."""
+    """A name or a reason from a file, on one line of at most LONGEST_TEXT letters."""
     shown = printable(text)
-    return shown if len(shown) <= LONGEST else f"{shown[:LONGEST]}..."
+    return shown if len(shown) <= LONGEST_TEXT else f"{shown[:LONGEST_TEXT]}..."
 
 
 @cache

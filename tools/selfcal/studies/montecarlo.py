@@ -15,7 +15,7 @@ import numpy as np
 
 from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
 from selfcal.bank.result import HALF_90, likeliest
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.tables import bank_block, make_tables
@@ -23,15 +23,9 @@ from selfcal.model.tables import bank_block, make_tables
 SCHEMA = "selfcal.montecarlo/1"
 #: Fewest bank samples.
 MIN_SAMPLES = 10
-#: Most samples of a record: 80 MB.
-MOST_SAMPLES = 10_000_000
-
-
 #: Samples drawn of a bank interval and averaged as the intake does, where the sensor gives as many: their drift's mean
 #: is that of infinitely many to a hundredth of the averaging's effect.
 BLOCK = 10
-
-
 #: Keys of each estimate of the true law in a row.
 ESTIMATE = ("mean", "sd", "q05", "median", "q95")
 
@@ -137,8 +131,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     console = console_of(to_stderr=to_stderr)
     console.print(table)
     f = document["false_identification"]
-    console.print(
+    print_line(
+        console,
         f"false identification: calculated {f['calculated']:.4f}, actual {f['actual']:.4f}, "
         f"difference {f['actual'] - f['calculated']:+.4f} ± {f['sd_of_difference']:.4f} (1 sd)",
-        highlight=False,
     )

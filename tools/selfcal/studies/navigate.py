@@ -1,4 +1,4 @@
-"""`selfcal navigate`: a GPS/INS filter that is told the data sheet's noise, ten times it, or what the bank finds."""
+"""`selfcal navigate`: a GPS/INS filter with the noise of the data sheet, ten times that, or the bank's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import optimize
 
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from selfcal.bank.result import AxisResult
 
 SCHEMA = "selfcal.navigate/1"
-#: What filter designers multiply a data sheet's noise by.
+#: Factor by which filter designers inflate a data sheet's noise.
 INFLATION = 10.0
 #: The filters, in the order of the table.
 TITLES = {
@@ -31,9 +31,9 @@ TITLES = {
     "identified": f"identified in {REST_S // 60} min of rest",
     "true": "the true one",
 }
-#: When they are judged.
+#: Times at which the filters are judged.
 TIMES = {"with_gps": "with GPS", "after_outage": f"{OUTAGE_S} s without"}
-#: What of: columns of the table.
+#: Errors that are judged: columns of the table.
 FIGURES = {
     "position_m": "position, m",
     "gyro_bias_deg_s": "gyro bias, deg/s",
@@ -160,8 +160,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
                 last = name == list(filters)[-1]
                 table.add_row(law if name == "sheet" else "", TITLES[name], *cells, word, end_section=last)
         console.print(table)
-    console.print(
+    print_line(
+        console,
         f"NEES: squared error over what the filter states, {document['nees_expected']} of one that is consistent; its "
         f"mean over {document['parts']} parts then lies between {low:.1f} and {high:.1f} in 95 % of cases",
-        highlight=False,
     )

@@ -28,6 +28,7 @@ from scipy.spatial.transform import Rotation
 
 from selfcal.base.grid import slices
 from selfcal.base.units import STANDARD_GRAVITY, convert
+from selfcal.calibration.gyroscope import cross
 from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
 
 #: Lengths of the rest, and of the flight with GPS and after its outage, s; the longest outage that is flown.
@@ -288,13 +289,6 @@ class Filters:
             np.concatenate([*moved, turned, bias, self.part.latency - self.latency], axis=1),
             _JUDGED @ self.covariance @ _JUDGED.T,
         )
-
-
-def cross(v: Floats) -> Floats:
-    """[n, 3, 3] of v [n, 3]: the matrix of v x."""
-    x, y, z = v.T
-    o = np.zeros_like(x)
-    return np.stack([o, -z, y, z, o, -x, -y, x, o], axis=1).reshape(-1, 3, 3)
 
 
 def nees(errors: Floats, covariance: Floats) -> Floats:

@@ -52,7 +52,7 @@ from selfcal.studies.navigation import (
 OUTAGES_S = (10, OUTAGE_S, LONGEST_S)
 #: Flights, evenly spread; coordinates of a position.
 FLIGHTS, COORDINATES = 50, 3
-#: What the numbers rest on.
+#: Assumptions behind the numbers.
 ASSUMES = (
     f"The filter flies figures of eight: {GPS_S} s with GPS of 3 m a second, then none. Motion, GPS and the errors at "
     "the start are simulated, the errors of the readings are recorded: no vibration, and the temperature of the bench."

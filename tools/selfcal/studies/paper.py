@@ -1,4 +1,4 @@
-"""`selfcal paper`: the figures of Stepanov & Motorin (2017) made anew, on one page beside the paper's words."""
+"""`selfcal paper`: the figures of Stepanov & Motorin (2017) made anew, on one page with the paper's words."""
 
 from __future__ import annotations
 
@@ -8,17 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from selfcal.base.errors import printable
-from selfcal.base.output import console_of, table_of
+from selfcal.base.errors import few
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.show.chart import Figure, draw
 from selfcal.show.template import render
 from selfcal.studies.paper_figures import section4
 from selfcal.studies.paper_figures.reproduction import Reproduction
 
-#: Folder of the real recordings: beside the repository by default.
+#: Folder of the real recordings: next to the repository by default.
 DATA = Path(os.environ.get("SELFCAL_DATA", Path(__file__).resolve().parents[4] / "shared" / "data"))
-#: Causes of a recording that the page names.
-MOST_CAUSES = 5
 #: A look at the real records that explains a difference: this recording, by 1 s means.
 EXPLAINED = "adis16405_run1.npz"
 
@@ -32,11 +30,8 @@ def with_reason(
         f"{finding['cause'].replace('_', ' ')} ({finding['evidence_gain_nats']:.0f} nats)"
         for finding in entry.get("findings", [])
     ]
-    more = f" and {len(causes) - MOST_CAUSES} more" if len(causes) > MOST_CAUSES else ""
-    why = (
-        f"The diagnosis of {log.name}, {section4.AXIS}, finds in 1 s means "
-        f"{', '.join(causes[:MOST_CAUSES]) or 'nothing'}{more}, and neither law has these."
-    )
+    said = few(causes) or "nothing"
+    why = f"The diagnosis of {log.name}, {section4.AXIS}, finds in 1 s means {said}, and neither law has these."
     return [
         replace(figure, why=why) if figure.verdict == "differs" and figure.name == "Fig. 5, real" else figure
         for figure in figures
@@ -58,4 +53,4 @@ def show(figures: Sequence[Reproduction], output: Path | str) -> None:
         table.add_row(figure.name, figure.here, figure.verdict)
     console.width = max(console.width, 100)
     console.print(table)
-    console.print(printable(f"page: {output}"), highlight=False, markup=False, soft_wrap=True)
+    print_line(console, f"page: {output}")

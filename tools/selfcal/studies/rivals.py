@@ -26,7 +26,7 @@ from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
 from selfcal.base.grid import runs
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.base.progress import bar
 from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.recording import Recording
@@ -214,15 +214,16 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     for name, axis in document["axes"].items():
         console.print(_table(name, axis, brief=brief))
         if axis["samples_left_out"]:
-            console.print(f"left out: {axis['samples_left_out']} averages outside the longest stretch without a gap")
+            print_line(
+                console, f"left out: {axis['samples_left_out']} averages outside the longest stretch without a gap"
+            )
         for entry in axis["rivals"].values():
             if "error" in entry:
-                console.print(f"no answer: {entry['title']}: {entry['error']}", highlight=False, markup=False)
-    console.print(
-        "estimates [5 %, 95 %] in the units of the recording, an interval where the method states one\n"
+                print_line(console, f"no answer: {entry['title']}: {entry['error']}")
+    print_line(console, "estimates [5 %, 95 %] in the units of the recording, an interval where the method states one")
+    print_line(
+        console,
         "weight of the law: by Bayes' rule, A by AIC, B by BIC; time: of the CPU; memory: beyond the program's own",
-        highlight=False,
-        markup=False,
     )
 
 
@@ -290,13 +291,12 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
             f"{entry['log_score']:.4f} ± {entry['log_score_sd']:.4f}",
         )
     console.print(table)
-    console.print(
-        "error: rms of the logarithm over that of ML [95 % of a bootstrap], each estimate kept within the prior\n"
-        "none: records without an answer, in the worst parameter; time: median CPU time of a record, all laws\n"
+    for line in (
+        "error: rms of the logarithm over that of ML [95 % of a bootstrap], each estimate kept within the prior",
+        "none: records without an answer, in the worst parameter; time: median CPU time of a record, all laws",
         "ekf, ukf: begin at the priors' middle and leave N, K and sigma_m there: their errors are the start's",
-        highlight=False,
-        markup=False,
-    )
+    ):
+        print_line(console, line)
 
 
 def document_laws(document: Mapping[str, Any]) -> list[str]:

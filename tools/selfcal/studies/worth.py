@@ -12,7 +12,7 @@ import numpy as np
 from scipy import signal
 
 from selfcal.base.errors import UserError, printable
-from selfcal.base.output import console_of, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
 from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, load
@@ -290,8 +290,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         table.add_row(TITLES[name], *shown)
     console.print(table)
     if document["recordings"]:
-        console.print(
+        print_line(
+            console,
             f"the mean of the {REFERENCE_S} s that follow stands for the truth; its own noise is in every error, and "
             "gravity in an accelerometer's bias",
-            highlight=False,
         )

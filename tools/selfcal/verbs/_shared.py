@@ -1,6 +1,6 @@
 """What several verbs share: options, and files of verdicts that are written in each case.
 
-The options of one verb stand beside its own function. A verb imports at its top only `base` and this file, so that the
+A verb has its own options with its function. A verb imports at its top only `base` and this file, so that the
 command starts at once; what a verb runs is imported when it runs.
 """
 
@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ParamSpec, TypeVar
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
-from selfcal.logs.loaders import READ
+from selfcal.logs.loaders import READ, Reading
 
 if TYPE_CHECKING:
-    from selfcal.logs.recording import Data
+    from selfcal.logs.recording import Data, Recording
+    from selfcal.model.file import Model
 
 Logs = Annotated[
     "Data",
@@ -38,12 +39,6 @@ Decimate = Annotated[float | None, option("Rate of the block means instead of th
 RunPlot = Annotated[Path | str | None, option("Save the plot of the run", metavar="FILE")]
 Json = Annotated[Path | str | None, option("Write the result as JSON (- for stdout)", metavar="FILE")]
 Report = Annotated[Path | str | None, option("Write a page with pictures and tables", metavar="FILE.html")]
-Start = Annotated[
-    float | None, option("Begin here, seconds of the recording; default: its start", "--start", metavar="S")
-]
-End = Annotated[
-    float | None, option("End before this, seconds of the recording; default: its end", "--end", metavar="S")
-]
 SincePowerOn = Annotated[
     float, option("From power-on to the recording's beginning, s", "--since-power-on", metavar="S")
 ]
@@ -73,10 +68,21 @@ Scheduler = Annotated[
 Workers = Annotated[
     int | None, option("Processes on this machine; default: one for each processor", metavar="N", min=1)
 ]
+#: Default number of simulated parts.
+PARTS = 200
 Results = Annotated[
     Path | str | None,
     option("Folder that keeps finished records: a later run continues from them", metavar="DIR"),
 ]
+
+
+def looked_at(log: Data, model: Model, since_power_on_s: float, gate: bool, reading: Reading) -> Recording:
+    """The recording that a verb looks at, with its distance from power-on; with `gate` its rests alone."""
+    from selfcal.logs.recording import load
+    from selfcal.readings.gate import gated
+
+    recording = load(log, sensors=model.sensors, **reading).later(since_power_on_s)
+    return gated(recording, model) if gate else recording
 
 
 P = ParamSpec("P")

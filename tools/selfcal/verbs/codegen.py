@@ -32,8 +32,7 @@ def codegen(
     `axes` is a subset of the model's. Says on stderr what of the model is left out.
     Raises UserError for a bad model file, one that the target has no RAM for, or a folder that cannot be written.
     """
-    from rich.console import Console
-
+    from selfcal.base.output import print_lines
     from selfcal.diagnosis.warm import load, warmed
     from selfcal.model.file import Model
     from selfcal.model.tables import make_tables
@@ -45,8 +44,7 @@ def codegen(
     tables = warmed(tables, known)
     check_room(loaded, tables, target, hold)
     write_tables(loaded, tables, Path(output), target, known.of if known is not None else "", hold)
-    for said in left_out(loaded, tables, target):
-        Console(stderr=True).print(said, highlight=False, soft_wrap=True, markup=False)
+    print_lines(left_out(loaded, tables, target), to_stderr=True)
     return tables
 
 

@@ -36,8 +36,6 @@ def compare(
     limits: shared.LimitsFile = None,
     junit: shared.Junit = None,
     verdicts: shared.Verdicts = None,
-    start_s: shared.Start = None,
-    end_s: shared.End = None,
     gate: shared.Gate = False,
     json: shared.Json = None,
     report: shared.Report = None,
@@ -47,13 +45,13 @@ def compare(
 
     Returns the document `selfcal.compare/1`: by axis a list of changes, each with the quantity, its values and the
     distance in standard deviations; the `findings` of each recording as `diagnose` has them, with its `recording`; the
-    `verdicts` by recording and axis; and the `quantities` that were set beside each other, by recording, axis and name.
+    `verdicts` by recording and axis; and the `quantities` that were compared, by recording, axis and name.
     An axis that two successive recordings do not both have, judged and in the same unit, is {"error": ..., "changes":
     [...]}. `fail_on` is only checked here.
     Raises UserError for fewer than two recordings, where no axis can be compared, and as `identify` and `diagnose` do.
     """
     from selfcal.base.ending import Held
-    from selfcal.base.output import check_writable, write_json
+    from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.batch.compare import LIMIT, SCHEMA, compared_of, quantities, verdict
     from selfcal.batch.fail_on import CHANGED, check
     from selfcal.batch.verdicts import Judged, Limits, Verdict, add_verdicts, check_options, write
@@ -75,8 +73,7 @@ def compare(
     judged: list[Judged] = []
     by_log: dict[str, dict[str, Any]] = {}
     curves: dict[str, dict[str, Any]] = {}
-    part: dict[str, Any] = {"axes": axes, "model": model, "start_s": start_s, "end_s": end_s, "gate": gate}
-    part |= reading
+    part: dict[str, Any] = {"axes": axes, "model": model, "gate": gate, **reading}
     names = [
         str(log if isinstance(log, Path | str) else getattr(log, "path", f"arrays {number}"))
         for number, log in enumerate(logs, 1)
@@ -117,9 +114,9 @@ def compare(
     if json is not None and not (none and fail_on is None):
         write_json(document, json)
     if report is not None and not none:
-        from selfcal.show.comparison_page import write_page
+        from selfcal.show.comparison_page import page
 
-        write_page(report, document, curves)
+        write_text(report, page(document, curves))
     if none:
         reasons = "; ".join(f"{name}: {', '.join(axis.errors)}" for name, axis in compared.items())
         raise UserError(f"no axis can be compared ({reasons})")

@@ -49,8 +49,6 @@ def diagnose(
     limits: shared.LimitsFile = None,
     junit: shared.Junit = None,
     verdicts: shared.Verdicts = None,
-    start_s: shared.Start = None,
-    end_s: shared.End = None,
     since_power_on_s: shared.SincePowerOn = 0.0,
     gate: shared.Gate = False,
     details: Annotated[bool, option("Print every finding of each axis too", "--details")] = False,
@@ -62,7 +60,8 @@ def diagnose(
     of 1 s, whose findings go to stderr at once, then every sample. The second result is the final one, unless it shows
     nothing where the first one does. A further finding of the means stays in the axis' `only_in_means`. An axis that
     the second look did not finish without a result of its own has the first look's. `full_rate`: no first look.
-    `on` is read as the first recording is. A file that `diagnose` did not write is no place for `write_model`.
+    `on` is read as the first recording is, and whole. A file that `diagnose` did not write is no place for
+    `write_model`.
     `fail_on` is only checked here. Times are those of the whole recording, numbers in its units. Raises UserError for
     what the user can put right.
 
@@ -70,10 +69,10 @@ def diagnose(
     yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.
     """
     from selfcal.adequacy.document import of_errors
-    from selfcal.adequacy.identify import chosen_axes, stretch_of
+    from selfcal.adequacy.identify import chosen_axes
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.ending import held
-    from selfcal.base.output import check_writable, write_json
+    from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.base.progress import Doing
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
@@ -89,7 +88,7 @@ def diagnose(
     from selfcal.show.results import Diagnosis
 
     if report is not None:
-        from selfcal.show.diagnosis_page import write_page
+        from selfcal.show.diagnosis_page import page
 
     check(fail_on)
     check_options(limits, junit, verdicts)
@@ -99,12 +98,12 @@ def diagnose(
     check_not_by_hand(write_model)
     loaded = Model.load(model)
     bounds = None if limits is None else Limits.load(limits, loaded)
-    recording = load(log, sensors=loaded.sensors, **reading).later(since_power_on_s)
-    recording = stretch_of(recording, loaded, start_s, end_s, gate)
+    recording = shared.looked_at(log, loaded, since_power_on_s, gate, reading)
     axes = [axes] if isinstance(axes, str) else axes
     names = chosen_axes(recording, loaded, axes)
     of_file, loaded = loaded, for_record(loaded, recording, names)
-    second = None if on is None else load(on, sensors=loaded.sensors, **reading)
+    whole: Reading = {**reading, "start_s": None, "end_s": None}
+    second = None if on is None else load(on, sensors=loaded.sensors, **whole)
     with held() as ending, Doing("diagnose") as doing:
         record, first, diagnosed, errors = _looked(recording, loaded, names, decimate, full_rate, ending, doing)
         with work.within(work.Work(lambda: ending.overdue)):
@@ -112,7 +111,7 @@ def diagnose(
                 if fail_on is not None:  # a production line gets its files in each case
                     document = of_errors(SCHEMA, recording, errors) | {"model": {}}
                     if report is not None:
-                        write_page(report, document, record, {})
+                        write_text(report, page(document, record, {}))
                     write_json(document, json)
                 raise _unjudged(recording, errors, ending)
             doing.now("held-out gain")
@@ -120,14 +119,14 @@ def diagnose(
             tree, read_out = extended(loaded, record, diagnosed, sensor)
             out = left_out(loaded, diagnosed)
             doing.now("what the axes share")
-            shared = shared_by(diagnosed, loaded) if not ending.asked else None
+            common = shared_by(diagnosed, loaded) if not ending.asked else None
             quantity = None
-            if shared is not None:
-                hidden.extend(tree, shared)
-                quantity = entry_of(shared, diagnosed, recording)
+            if common is not None:
+                hidden.extend(tree, common)
+                quantity = entry_of(common, diagnosed, recording)
                 if second is not None:
-                    on_second = of_recording(second, loaded, 1.0 / shared.dt)
-                    quantity["gain_on"] = hidden.carried(shared, on_second.axes, events_of(on_second))
+                    on_second = of_recording(second, loaded, 1.0 / common.dt)
+                    quantity["gain_on"] = hidden.carried(common, on_second.axes, events_of(on_second))
             document = to_document(recording, diagnosed, errors, tree, first, [finding for _, finding in out])
             add_sources(document, of_file, loaded)
             if second is not None:
@@ -145,7 +144,7 @@ def diagnose(
                 write_extended(write_model, tree, recording.path, read_out, out)
             if report is not None:
                 doing.now("pictures")
-                write_page(report, document, record, diagnosed, options_given(axes, model, decimate, recording))
+                write_text(report, page(document, record, diagnosed, options_given(axes, model, decimate, recording)))
     add_verdicts(document, bounds, junit, verdicts)
     write_json(document, json)
     return Diagnosis(document)

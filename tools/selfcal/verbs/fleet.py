@@ -52,8 +52,6 @@ def fleet(
     ] = None,
     axes: shared.Axes = (),
     model: shared.ModelFile = None,
-    start_s: shared.Start = None,
-    end_s: shared.End = None,
     since_power_on_s: shared.SincePowerOn = 0.0,
     gate: shared.Gate = False,
     **reading: Unpack[Reading],
@@ -70,7 +68,7 @@ def fleet(
     from operator import itemgetter
 
     import selfcal
-    from selfcal.base.output import check_writable, write_json
+    from selfcal.base.output import check_writable, write_json, write_text
     from selfcal.batch.batch_summary import document_of, lines_of, summed_up
     from selfcal.batch.fail_on import check
     from selfcal.batch.fleet import document_with, judged_units
@@ -105,8 +103,8 @@ def fleet(
         None if model is None else str(Path(model).absolute()),
         tuple(axes),
         diagnose,
-        {**reading, **({} if dbc is None else {"dbc": str(Path(dbc).absolute())})},
-        {"start_s": start_s, "end_s": end_s, "since_power_on_s": since_power_on_s, "gate": gate},
+        {**reading, "since_power_on_s": since_power_on_s, "gate": gate}
+        | ({} if dbc is None else {"dbc": str(Path(dbc).absolute())}),
     )
     version = str(selfcal.__version__)
     kept = Kept(folder, settings_of(options, model_settings_of(loaded), version), key=itemgetter(1))  # its content
@@ -138,13 +136,13 @@ def fleet(
         document["words"] += lines_of_priors(write_priors(write_model, loaded, summary), loaded)
     write_json(document, json)
     if report is not None:
-        from selfcal.batch.fleet_page import write_page
+        from selfcal.batch.fleet_page import page
 
         flagged = [*document["failed"], *document["unlike"], *document["drifting"]]
         pages: dict[str, str] = {}
         if diagnose:
             pages = own_pages(f"{report}.units", flagged, summary.devices, verbs, options, kept, workers)
-        write_page(report, document, summary, pages)
+        write_text(report, page(document, summary, pages))
     return document
 
 

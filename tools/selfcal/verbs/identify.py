@@ -69,8 +69,6 @@ def identify(
     limits: shared.LimitsFile = None,
     junit: shared.Junit = None,
     verdicts: shared.Verdicts = None,
-    start_s: shared.Start = None,
-    end_s: shared.End = None,
     since_power_on_s: shared.SincePowerOn = 0.0,
     gate: shared.Gate = False,
     **reading: Unpack[Reading],
@@ -84,13 +82,13 @@ def identify(
     """
     from selfcal.adequacy.checks import against
     from selfcal.adequacy.document import Identified, to_document
-    from selfcal.adequacy.identify import chosen_axes, identify_axis, stretch_of, with_reasons
+    from selfcal.adequacy.identify import chosen_axes, identify_axis, with_reasons
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, print_line, write_json
     from selfcal.base.progress import bar
     from selfcal.batch.fail_on import check
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
-    from selfcal.logs.recording import list_of, load
+    from selfcal.logs.recording import list_of
     from selfcal.model.file import Model
     from selfcal.model.regressors import choices_of, offered
     from selfcal.show.export import FORMS, write_export
@@ -114,8 +112,7 @@ def identify(
     loaded_model = Model.load(model)
     say_once(loaded_model.left_out)
     bounds = None if limits is None else Limits.load(limits, loaded_model)
-    recording = load(log, sensors=loaded_model.sensors, **reading)
-    recording = stretch_of(recording.later(since_power_on_s), loaded_model, start_s, end_s, gate)
+    recording = shared.looked_at(log, loaded_model, since_power_on_s, gate, reading)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)
     of_file, loaded_model = loaded_model, for_record(loaded_model, recording, names)
     identified: dict[str, Identified | UserError] = {}

@@ -31,18 +31,19 @@ def montecarlo(
     """
     from functools import partial
 
+    from selfcal.bank.blocks import MOST_DENSE
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.spread import record_seeds, spread
     from selfcal.model.file import Model, settings_of
-    from selfcal.studies.montecarlo import MIN_SAMPLES, MOST_SAMPLES, SCHEMA, rows_of, summary
+    from selfcal.studies.montecarlo import MIN_SAMPLES, SCHEMA, rows_of, summary
 
     check_writable(json)
     loaded = Model.load(model)
     seeds = record_seeds(records, seed)
     if not duration_s * loaded.bank_rate_hz >= MIN_SAMPLES:
         raise UserError(f"--duration must be at least {MIN_SAMPLES / loaded.bank_rate_hz:g} s")
-    if not duration_s * loaded.bank_rate_hz <= MOST_SAMPLES:
-        raise UserError(f"--duration must be at most {MOST_SAMPLES / loaded.bank_rate_hz:g} s")
+    if not duration_s * loaded.bank_rate_hz <= MOST_DENSE:
+        raise UserError(f"--duration must be at most {MOST_DENSE / loaded.bank_rate_hz:g} s")
     if loaded.regressors:
         raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
     loaded.group_of(axis)

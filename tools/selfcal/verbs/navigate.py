@@ -1,23 +1,23 @@
-"""Errors and consistency of a GPS/INS filter, by the noise that it is told."""
+"""Errors and consistency of a GPS/INS filter, by the noise that it assumes."""
 
 from __future__ import annotations
 
 from typing import Annotated, Any
 
 from selfcal.base.options import option
-from selfcal.verbs._shared import Json, Results, Scheduler, shown_by
+from selfcal.verbs._shared import PARTS, Json, Results, Scheduler, shown_by
 
 
 def navigate(
     *,
-    records: Annotated[int, option("Simulated parts of each law", metavar="N")] = 200,
+    records: Annotated[int, option("Simulated parts of each law", metavar="N")] = PARTS,
     seed: Annotated[int, option("Same seed, same parts", metavar="N", min=0)] = 1,
     json: Json = None,
     scheduler: Scheduler = None,
     results: Results = None,
 ) -> dict[str, Any]:
     """Fly `records` simulated parts of each law after a rest, each with the four filters of `TITLES`, which differ in
-    the noise that they are told (navigation.py).
+    the noise that they assume (navigation.py).
 
     Returns the document `selfcal.navigate/1`: rms errors and the mean NEES by law, filter and time, and the 95 % band
     of the NEES of filters that are consistent. A bias has the rms of its three axes.

@@ -1,4 +1,4 @@
-"""Make the figures of Stepanov & Motorin (2017) anew, on one page beside what the paper says."""
+"""Make the figures of Stepanov & Motorin (2017) anew, on one page with the words of the paper."""
 
 from __future__ import annotations
 

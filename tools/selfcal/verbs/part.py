@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError
 from selfcal.base.options import REQUIRED, argument, option
 from selfcal.logs.loaders import READ, Reading
-from selfcal.verbs._shared import End, Start
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
@@ -33,8 +32,6 @@ def part(
         Sequence[str],
         option("Column that is an axis, beside gx to az (repeat for more)", "--axis", metavar="NAME"),
     ] = (),
-    start_s: Start = None,
-    end_s: End = None,
     **reading: Unpack[Reading],
 ) -> Model:
     """Write the model file of a part into `output`, and return the model.
@@ -54,7 +51,7 @@ def part(
         raise UserError("give a recording at rest, or numbers of a data sheet: --datasheet 'N=0.012deg/sqrt(h)'")
     check_writable(output, inputs=tuple(list_of(log)))
     stated = [parse(text) for text in datasheet]
-    recording = load(log, sensors=(*SENSORS, *axes), **reading).between(start_s, end_s) if given else None
+    recording = load(log, sensors=(*SENSORS, *axes), **reading) if given else None
     tree, said = tree_of(recording, axes, stated, name, reading.get("rate"))
     model = Model.of_tree(tree, Path(output))
     write_text(output, as_text(tree, recording, said))

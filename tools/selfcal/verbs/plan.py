@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import End, Json, Scheduler, Start, to_stderr
+from selfcal.verbs._shared import PARTS, Json, Scheduler, to_stderr
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
@@ -36,7 +36,7 @@ def plan(
     axis: Annotated[
         str | None, option("Axis of the part; default: the first that `simulate` states", metavar="NAME")
     ] = None,
-    records: Annotated[int, option("Simulated parts", metavar="N")] = 200,
+    records: Annotated[int, option("Simulated parts", metavar="N")] = PARTS,
     seed: Annotated[int, option("Same seed, same parts", metavar="N", min=0)] = 1,
     plot: Annotated[Path | str | None, option("Save what is reached over the length", metavar="FILE")] = None,
     response: Annotated[
@@ -60,14 +60,12 @@ def plan(
     ] = None,
     json: Json = None,
     scheduler: Scheduler = None,
-    start_s: Start = None,
-    end_s: End = None,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """How long to record the part of a model file, so that SHARE of the records have each of the wishes `want`.
 
-    Of a recording the part is made as `part` makes it; `start_s`, `end_s` and the options of a log are of that. A wish
-    of a parameter is of the records whose law has it.
+    Of a recording the part is made as `part` makes it; the options of a log are of that. A wish of a parameter is of
+    the records whose law has it.
     `tumble`: how many rests of which length `selfcal tumble` takes: document `selfcal.plan_tumble/1`; wishes are those
     of `calibration/tumble_plan.py`.
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
@@ -87,7 +85,7 @@ def plan(
 
     check_writable(json, plot, inputs=list_of(model))
     check_picture(plot)
-    loaded = _model_of(model, axis, start_s, end_s, reading)
+    loaded = _model_of(model, axis, reading)
     if isinstance(want, str) or not want:
         raise UserError("--want: say what is wanted, as --want 'K within 20 %'")
     if tumble:
@@ -154,7 +152,7 @@ def plan(
     return document
 
 
-def _model_of(given: Data, axis: str | None, start_s: float | None, end_s: float | None, reading: Reading) -> Model:
+def _model_of(given: Data, axis: str | None, reading: Reading) -> Model:
     """The model file, or the part of a recording. Raises UserError."""
     from selfcal.logs.loaders import is_recording
     from selfcal.logs.recording import load
@@ -165,9 +163,9 @@ def _model_of(given: Data, axis: str | None, start_s: float | None, end_s: float
         from selfcal.base.units import SENSORS
 
         sensors = SENSORS if axis is None else (*SENSORS, axis)
-        recording = load(given, sensors=sensors, **reading).between(start_s, end_s)
+        recording = load(given, sensors=sensors, **reading)
         model = Model.of_tree(tree_of(recording, () if axis is None else (axis,))[0], recording.path)
-    elif reading or start_s is not None or end_s is not None:
+    elif reading:
         raise UserError(f"{given}: the options of a recording (--rate, --column, --start ...) are for plan LOG")
     else:
         model = Model.load(given)

@@ -33,8 +33,6 @@ def replay(
         float | None, option("Seconds between reports; default: 100 in all, fewer in QEMU", metavar="S")
     ] = None,
     gate: shared.Gate = False,
-    start_s: shared.Start = None,
-    end_s: shared.End = None,
     since_power_on_s: shared.SincePowerOn = 0.0,
     json: shared.Json = None,
     plot: shared.RunPlot = None,
@@ -78,7 +76,7 @@ def replay(
     say_once(loaded_model.left_out)
     known = None if start is None else load_start(start, loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
-    recording = recording.later(since_power_on_s).between(start_s, end_s)
+    recording = recording.later(since_power_on_s)
     known_s = recording.start_s
     loaded_model = replace(loaded_model, regressors=from_time(loaded_model.regressors, known_s))
     recording = replace(recording, start_s=0.0).later(since_power_on_s + known_s)  # as the firmware has it

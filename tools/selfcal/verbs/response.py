@@ -9,7 +9,7 @@ from typing import Annotated, Any, Unpack
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import End, Gate, Json, Logs, ModelFile, Start, to_stderr
+from selfcal.verbs._shared import Gate, Json, Logs, ModelFile, to_stderr
 
 
 def response(
@@ -28,19 +28,16 @@ def response(
     plot: Annotated[
         Path | str | None, option("Save gain, phase and coherence (.png .pdf .svg)", metavar="FILE")
     ] = None,
-    start_s: Start = None,
-    end_s: End = None,
     gate: Gate = False,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """The answer of the axis `output` to the column `input`: temperature, supply or another axis. Of several, each
-    answer is beside those to the others.
+    answer is fitted together with those to the others.
 
     Returns the document `selfcal.response/1` and writes it to `json`; `plot` is of one input. Raises UserError for what
     the user can put right.
     """
     from selfcal.adequacy.document import recording_entry
-    from selfcal.adequacy.identify import stretch_of
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.diagnosis.diagnose import BELOW_LATTICE
     from selfcal.diagnosis.record import of_recording
@@ -54,20 +51,20 @@ def response(
         plot_response,
         without_wild,
     )
-    from selfcal.logs.recording import list_of, load
+    from selfcal.logs.recording import check_column, list_of, load
     from selfcal.model.file import Model
+    from selfcal.readings.gate import gated
 
     check_writable(json, plot, inputs=(*list_of(log), model))
     check_picture(plot)
     loaded = Model.load(model)
-    recording = stretch_of(load(log, **reading), loaded, start_s, end_s, gate)
+    recording = load(log, **reading)
+    recording = gated(recording, loaded) if gate else recording
     names = [input] if isinstance(input, str) else list(dict.fromkeys(input))
     if plot is not None and len(names) > 1:
         raise UserError("--plot is of one input: leave it out, or give one --input")
     for asked, name in (*(("--input", name) for name in names), ("--output", output)):
-        if name not in recording.columns:
-            there = ", ".join(recording.columns)
-            raise UserError(f"{recording.path}: {asked}: there is no column '{name}' (there are {there})")
+        check_column(recording, name, f"{asked}: ")
     if output in names:
         raise UserError(f"--input and --output are both {output}: give two columns")
     loaded.group_of(output)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ, Reading
-from selfcal.verbs._shared import End, Json, ModelFile, Start, to_stderr
+from selfcal.verbs._shared import Json, ModelFile, to_stderr
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
@@ -40,8 +40,6 @@ def tumble(
         option("Exit code 1 when a sensor is not adequate, 2 when one cannot be judged", metavar="inadequate"),
     ] = None,
     json: Json = None,
-    start_s: Start = None,
-    end_s: End = None,
     **reading: Unpack[Reading],
 ) -> dict[str, Any]:
     """Calibrate the accelerometers and gyros of a part by its rests in several positions and the turns between them.
@@ -49,7 +47,7 @@ def tumble(
     Several `logs` are in order of time. `model`: the part's own law, noise and range; without one the law is of a rest
     of 20 min in the log, else the default model's prior. `fail_on` is only checked here.
     Returns the document `selfcal.tumble/1` and writes it to `json`; gyros without an answer have an `error` there.
-    Raises UserError for what the user can put right: fewer than three rests, a place that is none, logs that are not of
+    Raises UserError for what the user can put right: fewer than three rests, an invalid place, logs that are not of
     accelerometers.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
@@ -75,7 +73,7 @@ def tumble(
         raise UserError(f"--fail-on: takes {INADEQUATE}")
     where = place(latitude, height, gravity)
     loaded = Model.load(model)
-    recordings = [load(log, sensors=loaded.sensors, **reading).between(start_s, end_s) for log in each]
+    recordings = [load(log, sensors=loaded.sensors, **reading) for log in each]
     tumbled = tumble_of(recordings, loaded, part_stated=model is not None)
     accel = accelerometer.calibrate(tumbled, where)
     gyro, failed = None, None

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import READ
-from selfcal.verbs._shared import Axes, Json, ModelFile, Results, Scheduler, shown_by
+from selfcal.verbs._shared import PARTS, Axes, Json, ModelFile, Results, Scheduler, shown_by
 
 
 def worth(
@@ -21,7 +21,7 @@ def worth(
     *,
     axes: Axes = (),
     model: ModelFile = None,
-    records: Annotated[int, option("Simulated rests of each law and length", metavar="N")] = 200,
+    records: Annotated[int, option("Simulated rests of each law and length", metavar="N")] = PARTS,
     seed: Annotated[int, option("Same seed, same rests", metavar="N", min=0)] = 1,
     json: Json = None,
     scheduler: Scheduler = None,

@@ -64,5 +64,5 @@ def of_report(report: AxisReport, model: Model) -> Known:
     sent = [
         stated.get(column, (0.0, 0.0, 0.0)) for regressor in offered(model, report.axis) for column in regressor.columns
     ]
-    coefficients = np.array([mean if probability > 0.5 else 0.0 for mean, _, probability in sent], np.float64)
+    coefficients = np.array([mean if report.in_use(probability) else 0.0 for mean, _, probability in sent], np.float64)
     return Known(report.time_s, report.value("bias_mean"), coefficients)

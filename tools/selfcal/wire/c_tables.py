@@ -15,7 +15,7 @@ from selfcal.base.units import factor
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.file import LEAST_NODES, NOT_HANDLED, Model
 from selfcal.model.forms import COLUMN_KINDS
-from selfcal.model.laws import KINDS
+from selfcal.model.laws import KIND_CODES, MOST_TERMS
 from selfcal.model.tables import AxisTable, PriorRow, Tables, gate_table
 from selfcal.wire.frames import AXES, carries
 
@@ -124,8 +124,8 @@ def sizes(tables: Tables, target: str) -> dict[str, int]:
         "HYPOTHESIS_NODES_MAX": nodes,
         "NODES_MAX": max(nodes, tables.nodes),
         "REGRESSORS_MAX": max(1, len(tables.regressors)),
-        "TERMS_MAX": 3 if tables.term_nodes else 1,
-        "BATCH": 16,
+        "TERMS_MAX": MOST_TERMS if tables.term_nodes else 1,
+        "BATCH": _library32.BATCH,
         "PUSH_NODES": 1,
         "RETIRE_BLOCKS": 60,
         **CORES[core_of(target)],
@@ -159,7 +159,7 @@ def _values(model: Model, tables: Tables, target: str, start: str, hold: bool) -
         "handled": tables.handling != NOT_HANDLED,
         "means": any(column.coefficient_mean for column in tables.regressors),
         "limits": _limits,
-        "KINDS": KINDS,
+        "KINDS": KIND_CODES,
         "COLUMN_KINDS": COLUMN_KINDS,
     }
 

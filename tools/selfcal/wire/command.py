@@ -23,6 +23,10 @@ CHALLENGE = "challenge"
 CHALLENGE_S, ANSWER_S = 5.0, 400.0
 #: Pause of a module after a challenge or a wrong tag, s.
 PAUSE_S = 1.0
+#: Limits of the telemetry's period, ms.
+PERIODS_MS = (100, 2**24 - 1)
+#: A key: two numbers of 64 bits.
+KEY = struct.Struct("<2Q")
 #: Note on every answer: whoever is on the wire can give it.
 UNVERIFIED = "unverified: an answer has a checksum, but no tag"
 #: Orders that go to no module.
@@ -31,7 +35,7 @@ OWN_ORDERS = ("new-key", "build-flag")
 
 def siphash(key: bytes, message: int) -> int:
     """SipHash-2-4 of 8 bytes under a key of 16 (Aumasson & Bernstein, INDOCRYPT 2012), as the module has it."""
-    return int(_firmware.siphash(*struct.unpack("<2Q", key), message))
+    return int(_firmware.siphash(*KEY.unpack(key), message))
 
 
 def codes(signal: str) -> dict[str, int]:
@@ -63,10 +67,9 @@ def read_key(path: Path | str) -> bytes:
         raise UserError(f"{path}: there is no such key; --key names the module's, `{make}` makes one") from error
     except OSError as error:
         raise UserError(f"{path}: cannot read the key: {error.strerror}") from error
-    except ValueError as error:
-        raise UserError(f"{path}: a key is 32 hexadecimal digits") from error
-    if len(key) != 16:
-        raise UserError(f"{path}: a key is 32 hexadecimal digits")
+        KEY.unpack(key)
+    except (ValueError, struct.error) as error:
+        raise UserError(f"{path}: a key is {2 * KEY.size} hexadecimal digits") from error
     return key
 
 
@@ -74,22 +77,23 @@ def new_key(path: Path | str) -> None:
     """Write a random key, for the owner alone to read. Raises UserError if the file is there or cannot be written."""
     try:
         Path(path).touch(mode=0o600, exist_ok=False)
-        Path(path).write_text(secrets.token_hex(16) + "\n", encoding="ascii")
+        Path(path).write_text(secrets.token_hex(KEY.size) + "\n", encoding="ascii")
     except OSError as error:
         raise UserError(f"{path}: cannot write the key: {error.strerror}") from error
 
 
 def build_flag(key: bytes) -> str:
     """The entry of CFLAGS that gives an image this key."""
-    low, high = struct.unpack("<2Q", key)
+    low, high = KEY.unpack(key)
     return f"-DAPP_COMMAND_KEY=0x{low:016X}ULL,0x{high:016X}ULL"
 
 
 def argument_of(order: str, value: str | None) -> int:
     """The number that goes with an order: ms, axes (`gx,gz`; `none` takes offsets back), a start, or nothing."""
     if order == "telemetry_period":
-        if value is None or not value.isdecimal() or not 100 <= int(value) < 2**24:
-            raise UserError(f"telemetry_period wants a number of ms from 100 to {2**24 - 1}")
+        least, most = PERIODS_MS
+        if value is None or not value.isdecimal() or not least <= int(value) <= most:
+            raise UserError(f"telemetry_period wants a number of ms from {least} to {most}")
         return int(value)
     if order == "write_offsets":
         names = [] if value == "none" else (value or "").split(",")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 
 from selfcal.base.errors import UserError, remark
 from selfcal.base.templates import of_code
-from selfcal.base.units import parameter_unit
+from selfcal.base.units import SENSOR_UNITS, parameter_unit
 from selfcal.model.file import MOST_COLUMNS, MOST_HYPOTHESES
 
 if TYPE_CHECKING:
@@ -24,10 +24,12 @@ if TYPE_CHECKING:
 
 PATTERN = Path(__file__).parent / "frames.dbc"
 
-#: Axes, in the order of their messages, with the units that telemetry carries their readings in.
-AXIS_UNITS = {"gx": "deg/s", "gy": "deg/s", "gz": "deg/s", "ax": "m/s^2", "ay": "m/s^2", "az": "m/s^2"}
 #: Identifier of node 0's first message, identifiers of a node, and nodes of a bus.
 BASE, NODE_IDS, NODES = 0x200, 128, 12
+#: Signals every frame carries, first bit and number of bits, and the bits before them: those of the value, whose
+#: meaning is the item's.
+COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
+VALUE_BITS = COMMON["item"][0]
 #: Hypotheses and regressor columns that telemetry has room for: as many as a model.
 HYPOTHESES, COLUMNS = MOST_HYPOTHESES, MOST_COLUMNS
 #: Names of the places of a hypothesis' parameters where no model gives better ones.
@@ -157,7 +159,7 @@ def _different(names: Iterable[str]) -> list[str]:
     return symbols
 
 
-def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS_UNITS)) -> str:
+def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENSOR_UNITS)) -> str:
     """The DBC file of a node, whose model has these names and axes. Messages of node 0 have no prefix; those of node 3
     begin with `M3_`, so that files of several nodes go together."""
     from cantools.database import load_file
@@ -184,12 +186,12 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(AXIS
 
     add("STATUS")
     for axis in axes:
-        add("GX", axis.upper(), _in_unit(AXIS_UNITS[axis]), list(AXIS_UNITS).index(axis), gx=axis)
+        add("GX", axis.upper(), _in_unit(SENSOR_UNITS[axis]), list(SENSOR_UNITS).index(axis), gx=axis)
     for name in ("CORRECTED", "COMMAND", "ANSWER", "TUMBLE"):
         add(name)
     small = [name.lower() for name in _different(names.hypotheses)]
     for axis in axes:
-        index, unit, big = list(AXIS_UNITS).index(axis), AXIS_UNITS[axis], axis.upper()
+        index, unit, big = list(SENSOR_UNITS).index(axis), SENSOR_UNITS[axis], axis.upper()
         if names.columns:
             add("GX_COEFFICIENTS", f"{big}_COEFFICIENTS", _coefficients(names, unit), index, gx=axis)
         add("GX_ADEQUACY", f"{big}_ADEQUACY", same, index, gx=axis)

@@ -23,21 +23,22 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 
 from selfcal import _firmware, _library32
 from selfcal.bank.result import AxisResult, Estimate
-from selfcal.base.errors import UserError, called, install
+from selfcal.base.errors import UserError, called, few, install
+from selfcal.base.units import SENSOR_UNITS, SENSORS
+from selfcal.logs.framelog import LONGEST_FRAME
 from selfcal.model.file import Model
-from selfcal.wire.dbc_file import AXIS_UNITS, BASE, BY_PLACE, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
+from selfcal.wire.dbc_file import BASE, BY_PLACE, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
 
 if TYPE_CHECKING:
     import can
     from cantools.database.can import Database, Message
 
-#: Version of the wire that this module reads.
-VERSION = 4
 #: Axis messages are named after the axis, in capitals.
-AXES = tuple(AXIS_UNITS)
+AXES = SENSORS
 STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "ANSWER", "TUMBLE"
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
-COUNTER = 64  # the counter is modulo this; beyond half of it forward and backward are alike
+#: Moduli of the counter and of the time, s. Beyond half of them forward and backward are alike.
+COUNTER, SECONDS = (1 << COMMON[name][1] for name in ("counter", "time"))
 FOREIGN_STATUSES = 2  # whole statuses in a row with another version, of a module that stated this version before
 RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is no stranger's from then
 
@@ -60,11 +61,16 @@ def load_dbc() -> Database:
     return database
 
 
+def version() -> int:
+    """Version of the wire that this module reads."""
+    return int(load_dbc().version or 0)
+
+
 def axis_unit(axis: str) -> str:
     """Unit of an axis's readings on the wire. Raises UserError for an axis that has no message."""
     if axis not in AXES:
         raise UserError(f"axis '{axis}' has no telemetry message (there are {', '.join(AXES)})")
-    return AXIS_UNITS[axis]
+    return SENSOR_UNITS[axis]
 
 
 def names_of(model: Model) -> Names:
@@ -233,6 +239,11 @@ class AxisReport:
         moved = span if math.isfinite(span) else None
         return Adequacy(word("adequacy"), word("reason"), word("suspicion"), score, samples, moved, change)
 
+    @staticmethod
+    def in_use(probability: float) -> bool:
+        """Whether a regressor is the likelier with this probability of use; NaN: it is not."""
+        return probability > 0.5
+
     def coefficients(self, names: Names = BY_PLACE) -> dict[str, tuple[float, float, float]]:
         """Mean, sd and probability of use of each regressor column that came."""
         return {
@@ -307,8 +318,6 @@ class _Kind:
 
 #: Parts of a report in their order, by what follows the axis in a message's name. The end follows them.
 _PARTS = ("", *(f"h{k}" for k in range(HYPOTHESES)), "coefficients", "adequacy")
-#: Item of an axis message that closes a report.
-_END_ITEM = 43
 
 
 @lru_cache(maxsize=1)
@@ -377,8 +386,9 @@ class Decoder:
         """
         if self._other is None or self._ours:
             return ""
-        step = "load the firmware of this release into it" if self._other < VERSION else "take the tools of its release"
-        return f"the module speaks wire version {self._other:.0f}, this tool reads version {VERSION}: {step}"
+        own = version()
+        step = "load the firmware of this release into it" if self._other < own else "take the tools of its release"
+        return f"the module speaks wire version {self._other:.0f}, this tool reads version {own}: {step}"
 
     @property
     def twins(self) -> str:
@@ -395,18 +405,18 @@ class Decoder:
         """Take a frame; return the reports that it closes (none, one or two)."""
         kind = _kinds().get(message.arbitration_id - BASE - NODE_IDS * self.node)
         special = message.is_extended_id or message.is_remote_frame or message.is_error_frame or message.is_fd
-        if kind is None or special or not message.dlc == 8 == len(message.data):
+        if kind is None or special or not message.dlc == LONGEST_FRAME == len(message.data):
             return self._refused()
         data = bytes(message.data)
         bits = int.from_bytes(data, "little")
-        if bits >> 52 != frame_crc(message.arbitration_id, data):
+        item, counter, second, crc = (bits >> start & (1 << size) - 1 for start, size in COMMON.values())
+        if crc != frame_crc(message.arbitration_id, data):
             self.statistics.damaged += 1
             return []
-        item, counter, second = bits >> 32 & 0x3F, bits >> 38 & 0x3F, bits >> 44 & 0xFF
         values = _values(kind, data)
         if (
             values is None
-            or int(values.get("time_ms", 1000.0 * second)) // 1000 % 256 != second
+            or int(values.get("time_ms", 1000.0 * second)) // 1000 % SECONDS != second
             or int(values.get("frames_sent", counter)) % COUNTER != counter
         ):
             return self._refused()
@@ -441,7 +451,7 @@ class Decoder:
             elif name == ANSWER:
                 self.answer.update(values)
             return self.flush()
-        order = _order(kind, item)
+        order = _starts()[-1] if "end_items" in values else _starts()[kind.part] + item
         named = {f"{kind.prefix}{signal}": value for signal, value in values.items()}
         return self._assemble(kind.axis, order, jump, second, begun_ms / 1000.0, named)
 
@@ -451,13 +461,13 @@ class Decoder:
 
     def _take_status(self, values: Mapping[str, float]) -> None:
         """Take an item of the status. Of another version nothing is believed but the version."""
-        version = values.get("wire_version")
-        if version == VERSION:
+        stated = values.get("wire_version")
+        if stated == version():
             self._other, self._others, self._ours = None, 0, True
-        elif version is not None:
+        elif stated is not None:
             self.statistics.foreign += 1
-            self._others = self._others if version == self._other else 0
-            self._other = version
+            self._others = self._others if stated == self._other else 0
+            self._other = stated
         if "frames_sent" in values:
             self._exact(int(values["frames_sent"]))
             self._others += self._other is not None
@@ -465,10 +475,11 @@ class Decoder:
         if self.foreign:
             self.status = {"wire_version": cast(float, self._other)}
             self._open = None
-        elif version in (None, VERSION):
+        elif stated in (None, version()):
             self.status.update(values)
         if "frames_sent" in values:
-            self.finished = self.status.get("state") == 2.0  # "finished"; frames_sent ends each status
+            # frames_sent ends each status
+            self.finished = status_text("state", self.status.get("state", 0.0)) == "finished"
             self.status_ms = (self.time_ms if self.status_ms is None else self.status_ms[0], self.time_ms)
 
     def _look_for_twin(self, sent: int) -> None:
@@ -517,8 +528,8 @@ class Decoder:
     def _exact(self, frames_sent: int) -> None:
         """Make the loss exact: `frames_sent` went before the frame just accepted."""
         if self._origin is not None:
-            unseen = (frames_sent - self._origin + 1 - self._sent) % 2**32
-            if unseen < 2**31 and unseen % COUNTER == 0:
+            unseen = _ahead(frames_sent + 1, self._origin + self._sent, 2**32)
+            if unseen >= 0 and unseen % COUNTER == 0:
                 self._sent += unseen
                 self.statistics.lost = self._sent - self.statistics.received
                 return
@@ -559,9 +570,9 @@ class Decoder:
         return closed
 
     def _begun(self, second: int) -> int:
-        """Module time of a frame that has its second alone, modulo 256: the nearest to what is known."""
+        """Module time of a frame that has its second alone, modulo SECONDS: the nearest to what is known."""
         wrapped = self.time_ms % 2**32
-        ahead = _ahead(second, wrapped // 1000, 256)
+        ahead = _ahead(second, wrapped // 1000, SECONDS)
         return max(0, self.time_ms - wrapped % 1000 + 1000 * ahead)
 
 
@@ -572,18 +583,13 @@ def _ahead(second: int, known: int, modulus: int) -> int:
 
 @lru_cache(maxsize=1)
 def _starts() -> tuple[int, ...]:
-    """Place of the first frame of each part of a report."""
+    """Place of the first frame of each part of a report among all frames that it may have, and of the last frame."""
     items = dict.fromkeys(range(len(_PARTS) + 1), 1)
     for kind in _kinds().values():
         if kind.axis == AXES[0]:
-            ids = [signal.multiplexer_ids[0] for signal in kind.message.signals if signal.multiplexer_ids]
-            items[kind.part] = 1 + max(id_ for id_ in ids if id_ != _END_ITEM)
+            inner = [signal for signal in kind.message.signals if not signal.name.startswith("end_")]
+            items[kind.part] = 1 + max(signal.multiplexer_ids[0] for signal in inner if signal.multiplexer_ids)
     return tuple(sum(items[before] for before in range(part)) for part in items)
-
-
-def _order(kind: _Kind, item: int) -> int:
-    """Place of a frame among all that a report may have. Two places differ by the most frames between them."""
-    return _starts()[-1] if item == _END_ITEM and kind.part == 0 else _starts()[kind.part] + item
 
 
 def _values(kind: _Kind, data: bytes) -> dict[str, float] | None:
@@ -592,7 +598,7 @@ def _values(kind: _Kind, data: bytes) -> dict[str, float] | None:
         decoded: dict[str, Any] = dict(kind.message.decode(data, decode_choices=False))  # type: ignore[arg-type]
     except Exception:  # cantools has a class of its own for an item that the DBC does not have
         return None
-    values = {name: float(value) for name, value in decoded.items() if name not in ("item", "counter", "time", "crc")}
+    values = {name: float(value) for name, value in decoded.items() if name not in COMMON}
     return values if all(_possible(kind, signal, value) for signal, value in values.items()) else None
 
 
@@ -853,7 +859,7 @@ def serial_ports() -> str:
     ports = sorted(port.device for port in comports())
     if not ports:
         return "this machine has none: is the module plugged in?"
-    return f"there are {', '.join(ports[:8])}{' and more' if len(ports) > 8 else ''}"
+    return f"there are {few(ports)}"
 
 
 def _can_devices() -> str:

@@ -16,11 +16,10 @@ from jinja2 import Template
 
 from selfcal.base.errors import UserError
 from selfcal.base.templates import of_code
-from selfcal.wire.dbc_file import COLUMNS, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, dbc
+from selfcal.logs.framelog import LONGEST_FRAME
+from selfcal.wire.dbc_file import COLUMNS, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, VALUE_BITS, dbc
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc
 
-#: Signals every frame carries, with their bits: the value, whose meaning is the item's, fills bits 0 to 31.
-COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 #: Messages of an axis, by what follows its name, and the name of their items in C; alike for all axes.
 OF_AXIS = {"": "AXIS", "_H0": "HYPOTHESIS", "_COEFFICIENTS": "COEFFICIENTS", "_ADEQUACY": "ADEQUACY"}
 #: Headings of lib/WIRE.md, by what follows an axis's name or by message.
@@ -42,7 +41,7 @@ LATER = re.compile(r"c[1-9]_")
 
 def _bits(signal: Signal) -> str:
     """Where a signal lies, if it does not fill the value."""
-    if signal.length == 32:
+    if signal.length == VALUE_BITS:
         return ""
     last = signal.start + signal.length - 1
     return f", bit {last}" if signal.length == 1 else f", bits {signal.start} to {last}"
@@ -70,16 +69,16 @@ def _meaning(signal: Signal) -> str:
 
 def fields(message: Message) -> list[Signal]:
     """The items' signals of a message, by item and bit. Raises UserError where the DBC leaves the common layout."""
-    if message.length != 8 or message.is_extended_frame or message.frame_id > 0x7FF:
-        raise UserError(f"selfcal.dbc: {message.name}: must have 8 bytes and a standard id")
+    if message.length != LONGEST_FRAME or message.is_extended_frame:
+        raise UserError(f"selfcal.dbc: {message.name}: must have {LONGEST_FRAME} bytes and a standard id")
     for name, bits in COMMON.items():
         signal = message.get_signal_by_name(name)
         if (signal.start, signal.length) != bits or signal.is_signed or signal.byte_order != "little_endian":
             raise UserError(f"selfcal.dbc: {message.name}.{name}: must be bits {bits[0]} to {sum(bits) - 1}, unsigned")
     members = [signal for signal in message.signals if signal.name not in COMMON]
     for signal in members:
-        within = signal.byte_order == "little_endian" and signal.start + signal.length <= 32
-        whole = not signal.is_float or (signal.start, signal.length) == (0, 32)
+        within = signal.byte_order == "little_endian" and signal.start + signal.length <= VALUE_BITS
+        whole = not signal.is_float or (signal.start, signal.length) == (0, VALUE_BITS)
         if signal.multiplexer_signal != "item" or len(signal.multiplexer_ids or ()) != 1 or not (within and whole):
             wanted = "C packs what is of one item, little-endian within bits 0 to 31, which a float fills"
             raise UserError(f"selfcal.dbc: {message.name}.{signal.name}: {wanted}")

@@ -19,7 +19,7 @@ from rich.live import Live
 from rich.text import Text
 
 from selfcal import _library32
-from selfcal.base.units import parameter_unit, typeset
+from selfcal.base.units import STANDARD_GRAVITY, parameter_unit, typeset
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import (
     AXES,
@@ -392,7 +392,7 @@ class View:
         contact = self._contact_of(module)
         status = module.decoder.status if module is not None else {}
         finished = module is not None and module.decoder.finished
-        said = {1.0: "running", 2.0: "finished"}.get(status.get("state", 0.0), "waiting for the module")
+        said = status_text("state", status["state"]) if status.get("state") else "waiting for the module"
         if contact is not None and self.source.closed:
             return Text(f"port gone for {contact.silent_s:.0f} s, waiting for it", "bold red")
         if contact is not None and contact.lost and not finished:
@@ -451,7 +451,7 @@ class View:
 
 def _calibration(values: Mapping[str, float]) -> list[str]:
     """The result of a calibration by rests in several positions, in data sheet units."""
-    units = {"bias": (1e6 / 9.80665, "ug"), "scale": (1e6, "ppm"), "angle": (1e3, "mrad")}
+    units = {"bias": (1e6 / STANDARD_GRAVITY, "ug"), "scale": (1e6, "ppm"), "angle": (1e3, "mrad")}
     said = []
     for name, value in values.items():
         size, unit = units.get(name.partition("_")[0], (0.0, ""))

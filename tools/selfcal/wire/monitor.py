@@ -102,7 +102,7 @@ class Run:
         if frame is not None:
             return frame, reports
         # A module that saves is deaf for 1 to 2 s; a restarted one waits for the channel to be opened.
-        if self.contact is not None and min(self.contact.silent_s, time.monotonic() - self.opened_s) > 3.0:
+        if self.contact is not None and min(self.contact.silent_s, time.monotonic() - self.opened_s) > SILENT_S:
             cast(Link, self.source).order("open")  # a module that has restarted waits for that
             self.opened_s = time.monotonic()
         return None

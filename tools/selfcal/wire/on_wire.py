@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from selfcal.base.errors import UserError
+from selfcal.base.units import SENSOR_UNITS
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Group, Model
-from selfcal.wire.dbc_file import AXIS_UNITS
 
 
 def places(model: Model, axes: Sequence[str]) -> dict[str, str]:
@@ -20,16 +20,16 @@ def places(model: Model, axes: Sequence[str]) -> dict[str, str]:
     axis in another unit, and without room."""
     for name in axes:
         unit = model.group_of(name).unit
-        if name in AXIS_UNITS and AXIS_UNITS[name] != unit:
+        if name in SENSOR_UNITS and SENSOR_UNITS[name] != unit:
             raise UserError(
-                f"{model.path}: axis {name} is in {unit}; telemetry carries it in {AXIS_UNITS[name]}, so the model "
+                f"{model.path}: axis {name} is in {unit}; telemetry carries it in {SENSOR_UNITS[name]}, so the model "
                 "must be in that unit"
             )
-    names = {name: name for name in axes if name in AXIS_UNITS}
+    names = {name: name for name in axes if name in SENSOR_UNITS}
     for group in model.groups:
-        foreign = [name for name in group.axes if name in axes and name not in AXIS_UNITS]
-        free = [name for name in AXIS_UNITS if name not in names.values()]
-        rooms = [[name for name in free if AXIS_UNITS[name] == unit] for unit in ("m/s^2", "deg/s")]
+        foreign = [name for name in group.axes if name in axes and name not in SENSOR_UNITS]
+        free = [name for name in SENSOR_UNITS if name not in names.values()]
+        rooms = [[name for name in free if SENSOR_UNITS[name] == unit] for unit in ("m/s^2", "deg/s")]
         room = next((room for room in rooms if len(room) >= len(foreign)), None)
         if room is None:
             raise UserError(
@@ -50,7 +50,7 @@ def sent(model: Model, recording: Recording, taken: Mapping[str, str]) -> tuple[
     columns = dict(recording.columns)
     for name, sent_as in taken.items():
         values = recording.in_unit(name, model.group_of(name).unit)
-        columns[sent_as] = replace(recording.columns[name], name=sent_as, unit=AXIS_UNITS[sent_as], values=values)
+        columns[sent_as] = replace(recording.columns[name], name=sent_as, unit=SENSOR_UNITS[sent_as], values=values)
     regressors = tuple(
         replace(regressor, column=taken.get(regressor.column, regressor.column)) for regressor in model.regressors
     )
@@ -59,4 +59,4 @@ def sent(model: Model, recording: Recording, taken: Mapping[str, str]) -> tuple[
 
 def _renamed(group: Group, taken: Mapping[str, str]) -> Group:
     own = {taken[name]: priors for name, priors in group.own_priors.items() if name in taken}
-    return replace(group, axes=tuple(taken.values()), unit=AXIS_UNITS[next(iter(taken.values()))], own_priors=own)
+    return replace(group, axes=tuple(taken.values()), unit=SENSOR_UNITS[next(iter(taken.values()))], own_priors=own)

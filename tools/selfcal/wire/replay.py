@@ -23,10 +23,10 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from selfcal.adequacy.checks import Judged, judge, with_readings
+from selfcal.adequacy.checks import Judged
 from selfcal.adequacy.document import Identified, as_typed, to_document
-from selfcal.adequacy.identify import may_act, with_reasons
-from selfcal.adequacy.one_over_f import weigh, with_white
+from selfcal.adequacy.identify import Fed, concluded, may_act, with_reasons
+from selfcal.adequacy.one_over_f import with_white
 from selfcal.adequacy.summary import summarize
 from selfcal.bank.blocks import usable_blocks
 from selfcal.bank.firmware import Played
@@ -39,13 +39,13 @@ from selfcal.base.units import same_kind
 from selfcal.diagnosis.warm import Start, warmed
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float
 from selfcal.model.file import Model
-from selfcal.model.regressors import Choice, check_channels, coefficient_unit, columns_of, ln_prior, offered
+from selfcal.model.regressors import Choice, check_channels, coefficient_unit, columns_of, ln_prior, mask_of, offered
 from selfcal.model.tables import Tables, bank_block, make_tables
 from selfcal.readings.readings import look
 from selfcal.wire.ahead import error_ahead, of_report
 from selfcal.wire.c_tables import check_forms, write_tables
 from selfcal.wire.frames import AXES, ROOT, TREE, AxisReport, Decoder, Link, names_of, open_bus, reasons
-from selfcal.wire.live import View, frame_counts
+from selfcal.wire.live import SILENT_S, View, frame_counts
 
 MAGIC = b"SELFCAL2"
 #: Channels of every sample apart from the model's (port/port.h); not a number if the recording lacks them.
@@ -402,8 +402,7 @@ def _watch(
             if frame is None:
                 silent_s = time.monotonic() - heard
                 ended = module is not None and module.poll() is not None
-                # None will come from firmware that has ended 2 s ago.
-                if link.closed or silent_s > patience_s or (ended and silent_s > 2.0):
+                if link.closed or silent_s > (SILENT_S if ended else patience_s):
                     break
                 continue
             heard = time.monotonic()
@@ -470,9 +469,8 @@ def document_of(
 def _identified(recording: Recording, model: Model, name: str, history: Sequence[AxisReport], gate: bool) -> Identified:
     """One axis by the firmware's last report. The checks of its law are made here, over the same samples."""
     recording = recording.along(name)
-    regressors = offered(model, name)
+    regressors, group, unit = offered(model, name), model.group_of(name), recording.columns[name].unit
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,))
-    group, unit = model.group_of(name), recording.columns[name].unit
     columns = as_float(columns_of(regressors, recording))
     samples = as_float(recording.in_unit(name, group.unit))
     blocks = usable_blocks(samples, recording.missing_before, tables, group, columns)
@@ -481,22 +479,16 @@ def _identified(recording: Recording, model: Model, name: str, history: Sequence
     result, scored = _with_coefficients(history[-1], model, regressors, unit)
     if not any(math.isfinite(p) for p in result.probability.values()):
         raise OutsidePriors
-    judged = Judged({}, None)
-    if not gate:
-        used = list(range(len(tables.regressors))) if scored is not None and scored.best == 1 else []
-        readings = look(recording, name, group)
-        judged = judge(blocks, tables, group, result, recording, may_act(model, recording, name), used)
-        judged = with_readings(judged, readings, group, unit, tables.dt_s, as_fed=True)
     extent = tables.dt_s, blocks.mean.size, tables.block
-    in_reading_unit = in_unit(with_white(result, group, *extent), group.unit, unit)
-    mask = (1 << len(tables.regressors)) - 1 if scored is not None and scored.best == 1 else 0
-    scored = replace(scored, result=in_reading_unit) if scored else None
-    beside = None if gate else weigh(tables, group, samples, recording.missing_before, columns, mask)
-    numbers = summarize(result, group, *extent, beside)
-    more = beside.laws(in_reading_unit.probability) if beside else {}
-    return Identified(
-        unit, group.unit, in_reading_unit, judged, blocks.kept_out, scored, summary=numbers, more_laws=more
-    )
+    answer = in_unit(with_white(result, group, *extent), group.unit, unit)
+    scored = replace(scored, result=answer) if scored else None
+    if gate:  # which samples were at rest is not in the telemetry
+        numbers = summarize(result, group, *extent)
+        return Identified(unit, group.unit, answer, Judged({}, None), blocks.kept_out, scored, summary=numbers)
+    mask = mask_of(regressors, regressors) if scored is not None and scored.best == 1 else 0
+    fed = Fed(recording, look(recording, name, group), group, tables, regressors, samples, 0.0, columns, blocks)
+    others = may_act(model, recording, name)
+    return concluded(fed, unit, others, result, mask, result, answer, scored, as_fed=True)
 
 
 def _with_coefficients(
@@ -516,7 +508,7 @@ def _with_coefficients(
     if not math.isfinite(probability):
         probability = 0.0
     sent = [coefficients.get(column, (math.nan, math.nan, 0.0))[:2] for column in columns]
-    used = probability > 0.5
+    used = report.in_use(probability)
     if used:
         result = replace(result, coefficients={law: tuple(sent) for law in result.probability})
     factor = factor_of(model.group_of(report.axis).unit, unit)

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 #: Default ports of the programs: PlotJuggler's UDP server, Foxglove's websocket.
 PORTS = {"udp-json": 9870, "foxglove": 8765}
-#: Kinds that go to stdout; `ros` takes the rate of the readings, Hz.
+#: Kinds of streams on stdout; `ros` takes the rate of the readings, Hz.
 LINES = ("jsonl", "ros")
 KINDS = (*PORTS, *LINES)
 HOST = "127.0.0.1"

@@ -28,7 +28,7 @@ ZIP = ".zip"
 class Format:
     """A format: how a message calls its files, suffixes, and bytes at places by which a file is known.
 
-    `module` reads it. `library` is the import name of what it takes beside numpy and scipy, and `extra` the group of
+    `module` reads it. `library` is the import name of what it takes but numpy and scipy, and `extra` the group of
     `pip install` that brings the library, "" where every installation has it. `here`: sizes are checked before anything
     is read, and columns are read when they are wanted, so it needs no process of its own.
     """
@@ -79,6 +79,12 @@ def _pairs(help: str, name: str, metavar: str) -> Option:
 class Reading(TypedDict, total=False):
     """How a log is read: the options that every verb shares; `recording.load()` has their meaning."""
 
+    start_s: Annotated[
+        float | None, option("Begin here, seconds of the recording; default: its start", "--start", metavar="S")
+    ]
+    end_s: Annotated[
+        float | None, option("End before this, seconds of the recording; default: its end", "--end", metavar="S")
+    ]
     rate: Annotated[float | None, option("Sampling rate, for recordings without a t column", metavar="HZ")]
     rate_hz: float | None
     columns: Annotated[
@@ -106,9 +112,9 @@ class Reading(TypedDict, total=False):
     dbc: Annotated[Path | str | None, option("Signals of a log of CAN frames", metavar="FILE.dbc")]
 
 
-#: Bytes from a file's begin that tell its format.
-_HEAD = 520
-#: What a ROS 2 folder holds.
+#: Bytes at the beginning of a file that identify its format.
+_HEAD = max(at + len(sign) for form in FORMATS for at, sign in form.magic)
+#: Content of a ROS 2 folder.
 _ROS_FOLDER = ("metadata.yaml", "*.db3", "*.mcap")
 
 

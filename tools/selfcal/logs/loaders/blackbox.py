@@ -26,7 +26,7 @@ BEGIN = b"H Product:Blackbox"
 _AXES = {"gyroADC": "g", "accSmooth": "a"}
 #: Fields of a frame at most.
 _MOST_FIELDS = 256
-#: Bytes of an event's data, by its number; a log's end is told apart by its text.
+#: Bytes of an event's data, by its number; a log's end is known by its text.
 _EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30: "vv", 40: "v"}
 
 
@@ -55,13 +55,12 @@ class _Bytes:
 
     def unsigned(self) -> int:
         """Seven bits a byte, the lowest first."""
-        value = shift = 0
-        while shift < 35:
+        value = 0
+        for shift in range(0, 35, 7):
             byte = self.byte()
             value |= (byte & 0x7F) << shift
             if byte < 0x80:
                 return value & 0xFFFFFFFF
-            shift += 7
         raise _Damaged
 
     def signed(self) -> int:
@@ -291,7 +290,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         tables += [table] if table is not None else []
     if not tables:
         raise UserError(f"{path}: no log in it has frames with gyroADC")
-    tables = [replace(one, damaged=damaged) for one in tables]
+    tables = [replace(table, damaged=damaged) for table in tables]
     return [replace(tables[0], source="")] if len(tables) == 1 else tables
 
 

@@ -26,19 +26,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, printable
-from selfcal.base.limits import MOST_COLUMNS, MOST_GROWTH, MOST_NUMBERS, MOST_UNPACKED_SMALL, reading
+from selfcal.base.limits import MOST_COLUMNS, MOST_GROWTH, MOST_UNPACKED_SMALL, reading
 from selfcal.base.output import temporary_folder
 from selfcal.logs.loaders import Format
 from selfcal.logs.loaders.damage import Damaged, parts_of
-from selfcal.logs.loaders.table import Hints, Table, of_arrays
+from selfcal.logs.loaders.table import Hints, Table, bound_numbers, of_arrays
 
 #: Seconds of a reading: for any file, and a byte. The slowest library reads a megabyte in a second.
 _LEAST_S, _S_PER_BYTE = 60.0, 4e-6
-#: What comes before the JSON: its size.
+#: Head of the answer: the size of the JSON.
 _SIZE = struct.Struct("=Q")
 
-#: What starts a reader: (format, path, hints, descriptor for the answer, folder for what it unpacks) -> number of its
-#: process. The folder goes after it, however it ended; "" is none.
+#: Starts a reader: (format, path, hints, descriptor for the answer, folder for what it unpacks) -> number of its
+#: process. The folder goes after it, however it ended; "" is no folder.
 Start = Callable[[Format, Path, Hints, int, str], int]
 
 
@@ -172,8 +172,7 @@ def _entry(path: Path, table: Table, arrays: list[NDArray[np.uint8]]) -> dict[st
     columns = []
     for name, member in table.members.items():
         array = member.read()
-        if array.size > MOST_NUMBERS:
-            raise UserError(f"{path}: {table.source}: more than {MOST_NUMBERS:,} numbers: cut it in parts")
+        bound_numbers(path, array.size)
         if array.dtype.kind not in "biufcMm":
             raise ValueError(f"column '{name}' holds no numbers")
         arrays.append(np.ascontiguousarray(array).reshape(-1).view(np.uint8))

@@ -40,10 +40,8 @@ _TLOG = {
     "SCALED_IMU3": _SCALED,
     "HIGHRES_IMU": ("time_usec", "us", "rad/s", "m/s^2"),
 }
-#: How a message of a DataFlash log begins, and the kind that describes the others; the first byte of MAVLink's frames.
+#: How a message of a DataFlash log begins, and the kind that describes the others.
 _HEAD, _FMT = b"\xa3\x95", 0x80
-_MAVLINK_2 = 0xFD
-_MARKS = (0xFE, _MAVLINK_2)
 
 
 class _Rows:
@@ -178,9 +176,9 @@ def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str
 
     def end_of(at: int) -> int:
         head = data[at + 8 : at + 18]
-        if len(head) < 8 or head[0] not in _MARKS:
+        if len(head) < 8 or head[0] not in (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2):
             return 0
-        second = head[0] == _MAVLINK_2
+        second = head[0] == dialect.PROTOCOL_MARKER_V2
         number = int.from_bytes(head[7:10], "little") if second else head[5]
         checked = at + 8 + head[1] + (12 if second else 8)
         end = checked + (13 if second and head[2] & 1 else 0)  # a signature
@@ -203,8 +201,8 @@ def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str
             continue
         vehicle = message.get_srcSystem()
         if kind == "HEARTBEAT":
-            # Its RAW_IMU is in counts but for ArduPilot, number 3.
-            if message.autopilot == 3:
+            # Its RAW_IMU is in counts but for ArduPilot.
+            if message.autopilot == dialect.MAV_AUTOPILOT_ARDUPILOTMEGA:
                 ardupilot.add(vehicle)
             continue
         stamp, unit, gyro, accel = _TLOG[kind]

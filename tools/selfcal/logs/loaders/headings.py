@@ -103,7 +103,7 @@ FORMS = (
     # EuRoC and Kalibr
     _Form(rf"w_RS_S_{_AXIS}", rf"a_RS_S_{_AXIS}", (("#?timestamp", "ns"), ("time", "ns"))),
     _Form(rf"omega_{_AXIS}", rf"alpha_{_AXIS}", (("timestamp", "ns"),), needs="alpha_x"),
-    # PX4, as ulog2csv writes it: topic sensor_combined; then sensor_gyro and sensor_accel, which the file's name tells
+    # PX4, as ulog2csv writes it: topic sensor_combined; then sensor_gyro and sensor_accel, by the file's name
     _Form(rf"gyro_rad{_PLACE}", rf"accelerometer_m_s2{_PLACE}", (("timestamp_sample", "us"), ("timestamp", "us"))),
     _Form(
         _AXIS, "", (("timestamp_sample", "us"), ("timestamp", "us")), "temperature", file="gyro", needs="device_id"
@@ -250,7 +250,7 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
         )
     found = []
     for source, meant in axes.items():
-        named = [one.name for one in meant.values()]
+        named = [meaning.name for meaning in meant.values()]
         if len(set(named)) < len(named):
             return []  # not this form's
         found.append(Sensor(source, {**meant, **_time(form, free, taken, source), **_temperature(form, free, source)}))
@@ -258,10 +258,10 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
 
 
 def _axes(form: _Form, keys: Sequence[str]) -> Iterator[tuple[str, str, re.Match[str], str | None]]:
-    """Letter, heading, match and stated unit of a form's axes. In the last form a stated unit tells the sensor, and
+    """Letter, heading, match and stated unit of a form's axes. In the last form a stated unit decides the sensor, and
     where no name is a gyro's or an accelerometer's, the unit alone does."""
     found = [
-        (letter, *one) for pattern, letter in ((form.gyro, "g"), (form.accel, "a")) for one in _matching(pattern, keys)
+        (letter, *own) for pattern, letter in ((form.gyro, "g"), (form.accel, "a")) for own in _matching(pattern, keys)
     ]
     if form is not FORMS[-1]:
         yield from found
@@ -304,7 +304,7 @@ def _time(form: _Form, keys: Sequence[str], taken: Mapping[str, str], source: st
 
 
 def _in_two(keys: Sequence[str], source: str) -> dict[str, Meaning]:
-    """The whole seconds of a source's time, and the nanoseconds in a column beside them; nothing without both."""
+    """The whole seconds of a source's time, and the column of their nanoseconds; nothing without both."""
     whole = {match[1]: key for key in keys if (match := re.fullmatch(r"(.*?)(?:secs?|seconds?)", key, re.IGNORECASE))}
     for key in keys:
         match = re.fullmatch(r"(.*?)(?:n|nano)(?:secs?|seconds?)", key, re.IGNORECASE)
@@ -319,13 +319,13 @@ def _temperature(form: _Form, keys: Sequence[str], source: str) -> dict[str, Mea
         ((match.groupdict().get("source") or "").strip("/. "), key, stated)
         for key, match, stated in _matching(form.temperature, keys)
     ]
-    of = [one for one in found if one[0] == source] or (found if len(found) == 1 else [])
+    of = [entry for entry in found if entry[0] == source] or (found if len(found) == 1 else [])
     return {key: Meaning("temp", stated or (None if form is FORMS[-1] else "degC")) for _, key, stated in of[:1]}
 
 
 def _matching(pattern: str | tuple[str, ...], keys: Sequence[str]) -> Iterator[tuple[str, re.Match[str], str | None]]:
     """Heading, match and the unit that it states, of the headings that one of the patterns fits."""
-    patterns = [one for one in ([pattern] if isinstance(pattern, str) else pattern) if one]
+    patterns = [choice for choice in ([pattern] if isinstance(pattern, str) else pattern) if choice]
     for key in keys if patterns else ():
         match, unit = _first(patterns, key), None
         if match is None:

@@ -51,11 +51,11 @@ def _mat4(data: bytes) -> _Variables:
     """Variables of a file of version 4. Raises ValueError, and EOFError where it is cut off."""
     at = 0
     while at < len(data):
-        order = "<" if 0 <= struct.unpack_from("<i", data, at)[0] < 5000 else ">"
+        order = next((sign for sign in "<>" if 0 <= struct.unpack_from(f"{sign}i", data, at)[0] < 5000), "")
         kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, at)
         place = kind // 10 % 10
-        if not 0 <= kind < 5000 or min(rows, columns, length) < 0 or place >= len(_MAT4_TYPES):
-            raise ValueError("a variable's header is none")
+        if not order or min(rows, columns, length) < 0 or place >= len(_MAT4_TYPES):
+            raise ValueError("a variable's header is invalid")
         name = bytes(_piece(data, at + 20, length)).rstrip(b"\0").decode("latin-1")
         dtype = np.dtype(order + _MAT4_TYPES[place])
         size = rows * columns * dtype.itemsize

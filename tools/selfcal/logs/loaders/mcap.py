@@ -180,13 +180,21 @@ def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
     Raises what mcap raises."""
     from mcap import records as of
     from mcap.data_stream import ReadDataStream
+    from mcap.opcode import Opcode
     from mcap.stream_reader import breakup_chunk
 
-    kinds: dict[int, Any] = {3: of.Schema, 4: of.Channel, 6: of.Chunk, 11: of.Statistics, 15: of.DataEnd, 2: of.Footer}
+    kinds: dict[int, Any] = {
+        Opcode.SCHEMA: of.Schema,
+        Opcode.CHANNEL: of.Channel,
+        Opcode.CHUNK: of.Chunk,
+        Opcode.STATISTICS: of.Statistics,
+        Opcode.DATA_END: of.DataEnd,
+        Opcode.FOOTER: of.Footer,
+    }
     if not (end := _end(data, at)):
         raise ValueError("no record")
     stream, kind = ReadDataStream(BytesIO(data[at + _HEAD.size : end])), data[at]
-    if kind == 5:  # a message
+    if kind == Opcode.MESSAGE:
         return end, [of.Message.read(stream, end - at - _HEAD.size)], False
     record = kinds[kind].read(stream) if kind in kinds else None
     if isinstance(record, of.Chunk):

@@ -27,7 +27,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         groups: list[Any] = file.groups
         for number, group in enumerate(groups):
             columns: dict[str, Any] = {}
-            formulas = {index: text for index, one in enumerate(group.channels) if (text := _formula(one.conversion))}
+            formulas = {k: text for k, channel in enumerate(group.channels) if (text := _formula(channel.conversion))}
             why = f"a formula, '{short(next(iter(formulas.values()), ''))}', which is not run"
             notes = left_out([group.channels[index].name for index in formulas], why)
             without += notes
@@ -56,7 +56,7 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: {without[0]}")
     names = [table.source for table in tables]
     if len(set(names)) < len(names):
-        tables = [replace(one, source=f"{one.source} {k}") for k, one in enumerate(tables)]
+        tables = [replace(table, source=f"{table.source} {k}") for k, table in enumerate(tables)]
     return tables
 
 

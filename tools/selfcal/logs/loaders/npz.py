@@ -52,7 +52,7 @@ def _npz_header(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> tuple[tuple[
         shape, _, dtype = read(stream)
         start = stream.tell()
     if not all(type(extent) is int and extent >= 0 for extent in shape):
-        raise ValueError("its shape is none")
+        raise ValueError("its shape is invalid")
     if dtype.kind != "O" and start + math.prod(shape) * dtype.itemsize != info.file_size:
         raise ValueError("its length and its shape differ")
     return shape, dtype, start

@@ -106,7 +106,7 @@ def _r_text(node: Any) -> str:
 
 
 def _r_texts(node: Any) -> list[str]:
-    return [_r_text(one) for one in node.value] if node is not None and node.info.type.name == "STR" else []
+    return [_r_text(element) for element in node.value] if node is not None and node.info.type.name == "STR" else []
 
 
 def _r_add(path: Path, members: dict[str, Member], meta: dict[str, Any], name: str, node: Any) -> None:

@@ -19,9 +19,10 @@ from selfcal.base.errors import UserError
 from selfcal.logs.loaders.damage import parts_of
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
+IMU = "sensor_msgs/msg/Imu"
 #: Doubles after the header, by type. Of an Imu's: an orientation, angular velocity and acceleration, each with nine
 #: covariances after it.
-LAYOUTS = {"sensor_msgs/msg/Imu": 37, "sensor_msgs/msg/Temperature": 2}
+LAYOUTS = {IMU: 37, "sensor_msgs/msg/Temperature": 2}
 #: Place of the first axis, and its unit, by the first letter of the axes here.
 _AXES = {"g": (13, "rad/s"), "a": (25, "m/s^2")}
 _ROS_1 = b"#ROSBAG V2.0"
@@ -58,10 +59,10 @@ class Topic:
             columns["t[ns]"] = stamps
         else:
             notes = (f"{name}: no message has a stamp in its header",)
-        if values.shape[1] == 2:
-            columns["temp[degC]"] = values[:, 0]
-        else:
+        if self.kind == IMU:
             columns |= _axes(values)
+        else:
+            columns["temp[degC]"] = values[:, 0]
         return of_arrays(name, columns, notes=notes)
 
 
@@ -73,7 +74,7 @@ def _axes(values: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
         triad = values[:, at : at + 3]
         if len(values) and triad.any() and values[0, at + 3] != -1.0:
             found[letter] = triad
-    if len(found) == 2:
+    if found.keys() == _AXES.keys():
         none = (found["a"] == 0.0).all(axis=1, keepdims=True)  # at rest gravity is among the axes: no reading is 0
         found["a"] = np.where(none, np.nan, found["a"])
         # A topic has the gyro and the accelerometer in turn.
@@ -105,8 +106,8 @@ def read(path: Path, _: Hints) -> list[Table]:
         raise UserError(f"{path}: rename it: a ROS 2 bag with '%', '?' or '#' in a name cannot be opened")
     topics: dict[tuple[str, str], Topic] = {}
     with (Reader1 if first else Reader2)(path) as bag:
-        kinds = {one.id: one.msgtype for one in bag.connections}
-        wanted = [one for one in bag.connections if one.msgtype in LAYOUTS]
+        kinds = {connection.id: connection.msgtype for connection in bag.connections}
+        wanted = [connection for connection in bag.connections if connection.msgtype in LAYOUTS]
         for connection, _received, data in bag.messages(wanted) if wanted else ():
             topic = topics.setdefault((connection.topic, connection.msgtype), Topic(connection.msgtype))
             topic.take(data, cdr=not first)
@@ -116,7 +117,7 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 
 def _has_wal(path: Path) -> bool:
-    """Whether what is newest in a database is in a -wal beside it. Source: sqlite.org/fileformat2.html, 1.3.3 and 4."""
+    """Whether the newest content of a database is in its -wal. Source: sqlite.org/fileformat2.html, 1.3.3 and 4."""
     log = path.with_name(f"{path.name}-wal")
     # The content follows a head of 32 bytes.
     if not log.is_file() or log.stat().st_size <= 32:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from selfcal.base.errors import UserError, printable, short
+from selfcal.base.errors import UserError, few, printable, short
 
 #: Sources that a message lists.
 _MOST_LISTED = 30
@@ -44,7 +44,7 @@ def chosen(path: object, parts: Sequence[Part], wanted: Sequence[str]) -> tuple[
     sources: dict[str, list[Part]] = {}
     for part in parts:
         sources.setdefault(part.source, []).append(part)
-    axes = {source: frozenset().union(*(one.axes for one in of)) for source, of in sources.items()}
+    axes = {source: frozenset().union(*(part.axes for part in of)) for source, of in sources.items()}
     sensors = [source for source in sources if axes[source]]
     for name in wanted:
         if name not in sources:
@@ -85,7 +85,7 @@ def _by_rate(
     rate = {source: max(part.rate_hz for part in sources[source] if part.axes) for source in sensors}
     kept: list[str] = []
     dropped: list[str] = []
-    for source in sorted(sensors, key=lambda one: -rate[one]):
+    for source in sorted(sensors, key=lambda sensor: -rate[sensor]):
         others = [other for other in kept if axes[other] & axes[source]]
         if not others:
             kept.append(source)
@@ -97,12 +97,12 @@ def _by_rate(
 
 
 def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
-    """The temperatures beside the sensors: the only one, else the one whose name has the longest begin in common."""
+    """The temperatures of the sensors: the only one, else the one whose name has the longest begin in common."""
     if len(sides) == 1:
         return list(sides)
 
-    def common(one: str) -> int:
-        return max(next((k for k, (a, b) in enumerate(zip(one, of, strict=False)) if a != b), 0) for of in kept)
+    def common(side: str) -> int:
+        return max(next((k for k, (a, b) in enumerate(zip(side, of, strict=False)) if a != b), 0) for of in kept)
 
     best = sorted(sides, key=common, reverse=True)
     return best[:1] if common(best[0]) > max(1, common(best[1])) else []
@@ -111,9 +111,8 @@ def _nearest(kept: Sequence[str], sides: Sequence[str]) -> list[str]:
 def _listed(sources: dict[str, list[Part]], axes: dict[str, frozenset[str]], names: Sequence[str]) -> str:
     """The option to type for each source, with its axes, rate and length."""
     lines = []
-    for name in names[:_MOST_LISTED]:
-        part = max(sources[name], key=lambda one: (bool(one.axes), one.rate_hz))
+    for name in names:
+        part = max(sources[name], key=lambda own: (bool(own.axes), own.rate_hz))
         of = " ".join(sorted(axes[name], key=lambda axis: (axis[0] != "g", axis))) or "no axis"
         lines.append(f"--source '{printable(name)}' ({of}; {part.rate_hz:.4g} Hz, {part.span()[1]:.4g} s)")
-    more = f"; {len(names) - _MOST_LISTED} more" if len(names) > _MOST_LISTED else ""
-    return f"give {', '.join(lines)}{more}"
+    return f"give {few(lines, _MOST_LISTED)}"

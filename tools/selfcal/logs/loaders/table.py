@@ -24,7 +24,7 @@ from selfcal.base.limits import (
 )
 from selfcal.logs.loaders.damage import SOUND, Damaged
 
-#: What the user states beside the file: `dbc`, the path of a CAN database.
+#: Hints of the user about a file: `dbc`, the path of a CAN database.
 Hints = Mapping[str, str]
 
 
@@ -117,11 +117,8 @@ class Table:
                 raise UserError(f"{column} holds no numbers (its type is {short(str(member.dtype))})")
             if member.shape[0] != count:
                 raise UserError(f"{column} has {member.shape[0]} rows, '{fields[0].name}' has {count}")
-        if count < 2:
-            what = "one row only" if count else "no rows"
-            raise UserError(f"{path}: {self.where}{what}, a recording needs two or more")
-        if count * len(fields) > MOST_NUMBERS:
-            raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns")
+        check_rows(f"{path}: {self.where}", count)
+        bound_numbers(path, count * len(fields))
 
         def fail(row: int, number: int | None, what: str) -> NoReturn:
             column = "" if number is None else f"column '{fields[number].name}': "
@@ -168,7 +165,7 @@ def of_groups(
 
 def left_out(names: Sequence[str], by: str) -> tuple[str, ...]:
     """The note on channels that are left out, if there are any. `by`: what their values take that is not done."""
-    named = few(list(map(short, names)), 6)
+    named = few(list(map(short, names)))
     return (f"left out: {named}: their values come by {by}: export them as physical values",) if names else ()
 
 
@@ -192,7 +189,7 @@ def parse_meta(path: Path, text: str) -> Mapping[str, Any]:
 
 
 def meta_place(path: Path) -> Path:
-    """Where the metadata of a text recording stand: beside it. An npz holds its own."""
+    """Place of the metadata of a text recording, next to it. An npz holds its own."""
     return path.with_name(path.name + ".meta.json")
 
 
@@ -211,10 +208,22 @@ def room(data: bytes) -> int:
     return min(MOST_UNPACKED_BYTES, max(MOST_UNPACKED_SMALL, MOST_GROWTH * len(data)))
 
 
+def check_rows(where: str, count: int) -> None:
+    """Raise UserError for fewer rows than a recording needs. `where`: the file, and the place in it."""
+    if count < 2:
+        raise UserError(f"{where}{'one row only' if count else 'no rows'}, a recording needs two or more")
+
+
+def bound_numbers(path: Path, numbers: int) -> None:
+    """Raise UserError for more numbers than are read."""
+    if numbers > MOST_NUMBERS:
+        more = "cut it in parts, or read fewer columns, those that --column names"
+        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: {more}")
+
+
 def check_numbers(path: Path, numbers: int) -> None:
     """Raise UserError for more numbers than are read, or than a packed file of this size may hold."""
-    if numbers > MOST_NUMBERS:
-        raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers: cut it in parts")
+    bound_numbers(path, numbers)
     if 8 * numbers > max(MOST_UNPACKED_SMALL, MOST_GROWTH * path.stat().st_size):
         raise UserError(f"{path}: unpacks to more than {MOST_GROWTH} times its size, as no sensor's readings do")
 

@@ -5,6 +5,7 @@ Units are those of the channels (`unit_string`). Without a channel of times a wa
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,13 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, short
-from selfcal.base.limits import MOST_NUMBERS
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import TIMES
-from selfcal.logs.loaders.table import Hints, Table, heading, left_out, of_groups
+from selfcal.logs.loaders.table import Hints, Table, bound_numbers, heading, left_out, of_groups
 
-#: Bytes before a segment's content.
-_LEAD = 28
+#: What comes before a segment's content: its sign, kind and version, the length of what follows, and of the metadata.
+_LEAD = "4sIIQQ"
 
 
 def read(path: Path, _: Hints) -> list[Table]:
@@ -31,12 +31,11 @@ def read(path: Path, _: Hints) -> list[Table]:
     clocks: dict[tuple[str, int], NDArray[Any]] = {}
     unscaled: dict[str, str] = {}
     numbers = 0
-    with path.open("rb") as stream, TdmsFile.open(stream) as file:  # of a path it would read the _index beside it too
+    with path.open("rb") as stream, TdmsFile.open(stream) as file:  # of a path it would read its _index too
         for group in file.groups():
             for channel in group.channels():
                 numbers += len(channel)
-                if numbers > MOST_NUMBERS:
-                    raise UserError(f"{path}: more than {MOST_NUMBERS:,} numbers")
+                bound_numbers(path, numbers)
                 if unknown := _unknown_scale(channel.properties, group.properties, file.properties):
                     unscaled[channel.name] = unknown
                     continue
@@ -75,17 +74,16 @@ def _unknown_scale(*stated: Mapping[str, Any]) -> str:
 
 
 def _cut(path: Path) -> Damaged:
-    """What the last segment states that is not there: nptdms reads what there is. A segment is 28 bytes, with the
-    length of what follows as the third number. Source: NI's description of TDMS."""
-    at, size = 0, path.stat().st_size
+    """What the last segment states that is not there: nptdms reads what there is. Source: NI's description of TDMS."""
+    at, size, lead = 0, path.stat().st_size, struct.calcsize(f"={_LEAD}")
     with path.open("rb") as stream:
         while at < size:
             stream.seek(at)
-            head = stream.read(_LEAD)
-            if len(head) < _LEAD or head[:4] != b"TDSm":
+            head = stream.read(lead)
+            if len(head) < lead or head[:4] != b"TDSm":
                 return Damaged(size - at, 1)
-            length = int.from_bytes(head[12:20], "big" if head[4] & 0x40 else "little")
+            length = struct.unpack(f"{'>' if head[4] & 0x40 else '<'}{_LEAD}", head)[3]
             if length == 2**64 - 1:  # the writer did not come to its end
                 return Damaged()
-            at += _LEAD + length
+            at += lead + length
     return Damaged(at - size, 1, at) if at > size else Damaged()

@@ -31,15 +31,15 @@ from selfcal.base.limits import (
     LONGEST_HEADING,
     MOST_COLUMNS,
     MOST_LEADING_LINES,
-    MOST_NUMBERS,
     MOST_TEXT_GROWTH,
     reading,
 )
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import RECEIVED, number_of
+from selfcal.logs.loaders.table import bound_numbers, check_rows
 
 _SEPARATORS = {",": "','", ";": "';'", "\t": "tabs"}
-#: What begins a comment.
+#: Beginning of a comment.
 _COMMENT = re.compile(r"\s*(#|//|%)[#/% \t]*")
 #: The last heading of LabVIEW's texts, in small letters.
 _COMMENT_OF_ROWS = "comment"
@@ -68,7 +68,7 @@ _OF_DAY = re.compile(
     re.ASCII,
 )
 _DAY_S = 86400.0
-#: What a serial monitor puts before a line.
+#: Stamp that a serial monitor puts before a line.
 _MONITOR = re.compile(r"(\d\d:\d\d:\d\d\.\d{1,6}) -> ", re.ASCII)
 #: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
 _NO_TEXT = re.compile("[\0\udc80-\udcff]")
@@ -86,7 +86,7 @@ LOOKED_AT, _WORD = 1000, re.compile(r"\w[\w ./:-]{0,59}")
 #: Turns of a sensor at least.
 _TURNS = 5
 
-#: What opens a text in an archive: its bytes, and its packed size.
+#: Function that opens a text in an archive: its bytes, and its packed size.
 Opened = Callable[[ExitStack], tuple[BinaryIO, int]]
 
 
@@ -211,11 +211,7 @@ class TextReader:
                 self._fail(lines, None, "an empty line")
             blank = blank or filled < len(batch)
             wanted = [place for place, part in enumerate(parts) if part is not None]
-            if (rows + filled) * len(wanted) > MOST_NUMBERS:
-                raise UserError(
-                    f"{self.path}: more than {MOST_NUMBERS:,} numbers: cut it in parts, or read fewer columns, those "
-                    "that --column names"
-                )
+            bound_numbers(self.path, (rows + filled) * len(wanted))
             skipped = len(self._skipped)
             dated = None if time is None else wanted.index(time)
             table = self._parse(batch[:filled], [index[place] for place in wanted], dated)
@@ -230,9 +226,9 @@ class TextReader:
             lines += len(batch) if self._skip_bad else filled
             rows += len(table)
             batch = self._lines.more()
-        if rows < 2:
-            what = "one row only, a recording needs two or more" if rows else "there is a header but no rows"
-            raise UserError(f"{self.path}: line {self._row + rows - 1}: {what}")
+        if not rows:
+            raise UserError(f"{self.path}: line {self._row - 1}: there is a header but no rows")
+        check_rows(f"{self.path}: line {self._row + rows - 1}: ", rows)
         self.places = np.concatenate(places) if self._skip_bad else None
         whole: list[NDArray[np.float64] | None] = []
         while parts:  # no column stays in both forms
@@ -570,7 +566,7 @@ def _with_units(line: str, after: Sequence[str]) -> str:
     """A line of headings with the units of the line after it, where that is nothing but units; else empty."""
     for sign in (*_SEPARATORS, " "):
         names, stated = (
-            [cell.strip(signs) for one in lines for cell in one.split(None if sign == " " else sign)]
+            [cell.strip(signs) for text in lines for cell in text.split(None if sign == " " else sign)]
             for lines, signs in (([line], ' "'), (after, ' "[]'))
         )
         if len(names) != len(stated) or not 1 < len(names) <= MOST_COLUMNS or max(map(len, stated)) > LONGEST_HEADING:

@@ -46,8 +46,9 @@ def read(path: Path, _: Hints) -> list[Table]:
         log = ULog(stream, [*_SOURCES, "sensor_selection"])
     found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
     order = list(_SOURCES)
-    for one in sorted((one for one in log.data_list if one.name in _SOURCES), key=lambda one: order.index(one.name)):
-        found.setdefault((_SOURCES[one.name], one.multi_id), {})[one.name] = one.data
+    known = [topic for topic in log.data_list if topic.name in _SOURCES]
+    for topic in sorted(known, key=lambda topic: order.index(topic.name)):
+        found.setdefault((_SOURCES[topic.name], topic.multi_id), {})[topic.name] = topic.data
     if not found:
         raise UserError(f"{path}: no topic {', '.join(_SOURCES)}")
     lost = [dropout.duration for dropout in log.dropouts]
@@ -125,7 +126,7 @@ def _columns(topic: str, data: Mapping[str, NDArray[Any]]) -> Columns:
 
 def _triad(letter: str, values: Sequence[NDArray[Any]]) -> Columns:
     unit = {"g": "rad/s", "a": "m/s^2"}[letter]
-    return {f"{letter}{axis}[{unit}]": one for axis, one in zip("xyz", values, strict=True)}
+    return {f"{letter}{axis}[{unit}]": column for axis, column in zip("xyz", values, strict=True)}
 
 
 def _rate(data: Mapping[str, NDArray[Any]], name: str, place: int) -> NDArray[np.float64]:
@@ -145,4 +146,4 @@ def _fifo(topic: str, data: Mapping[str, NDArray[Any]], stamps: NDArray[Any]) ->
     columns: Columns = {"t[us]": time[used]}
     scale = np.asarray(data["scale"], np.float64)[:, None]
     counts = [np.stack([data[f"{axis}[{k}]"] for k in range(depth)], axis=1) for axis in "xyz"]
-    return columns | _triad("g" if "gyro" in topic else "a", [(one * scale)[used] for one in counts])
+    return columns | _triad("g" if "gyro" in topic else "a", [(column * scale)[used] for column in counts])

@@ -69,5 +69,5 @@ RIVALS = {
         Rival("mmae", "multiple models (MMAE), filterpy", "multiple_model", "mmae", "filterpy"),
     )
 }
-for _one in entry_points(group=GROUP):
-    RIVALS.setdefault(_one.name, Rival(_one.name, f"{_one.name}, {_one.module}", _one.module, _one.attr, foreign=True))
+for _own in entry_points(group=GROUP):
+    RIVALS.setdefault(_own.name, Rival(_own.name, f"{_own.name}, {_own.module}", _own.module, _own.attr, foreign=True))

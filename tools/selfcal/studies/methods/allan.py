@@ -6,24 +6,17 @@ import math
 
 import numpy as np
 
-from selfcal.adequacy.allan import overlapping
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import Answer, Floats, Peak, Problem, Value, maximum, weights
-
-#: Shortest record part that a point averages over: fewer windows say nothing.
-WINDOWS = 5
+from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, weights
 
 
 def curve(problem: Problem) -> tuple[Floats, Floats, Floats]:
     """Averaging times in readings, overlapping Allan deviations, and equivalent degrees of freedom (white noise,
     Riley's approximation N (1/m) 4m^2/(4m^2+5) of NIST SP 1065)."""
     n = problem.y.size
-    m = 2.0 ** np.arange(max(1, math.floor(math.log2(max(2, n // WINDOWS))) + 1))
-    y = problem.y - problem.y.mean()
-    deviation = np.sqrt([overlapping(y, int(length))[0] for length in m])
+    m, variance = problem.octaves()
     freedom = (1.5 * (n - 1) / m - 2.0 * (n - 2) / n) * 4.0 * m**2 / (4.0 * m**2 + 5.0)
-    floats = [np.asarray(values, dtype=np.float64) for values in (m, deviation, np.maximum(freedom, 1.0))]
-    return floats[0], floats[1], floats[2]
+    return m, np.sqrt(variance), np.maximum(freedom, 1.0)
 
 
 def slopes(problem: Problem) -> Answer:
@@ -33,7 +26,7 @@ def slopes(problem: Problem) -> Answer:
     ln_tau, ln_deviation = np.log(m * problem.dt_s), np.log(deviation)
     slope = np.gradient(ln_deviation, ln_tau) if m.size > 1 else np.array([-0.5])
     # A slope within 1/4 of +-1/2 is half-way to the flat part.
-    falling, rising = np.abs(slope + 0.5) <= 0.25, np.abs(slope - 0.5) <= 0.25
+    falling, rising = (np.abs(slope - own) <= 0.25 for own in (-0.5, 0.5))
     falling &= np.cumsum(~falling) == 0  # the first stretch alone: later points may fall by chance
     if not falling.any():
         falling[0] = True
@@ -49,15 +42,11 @@ def fit(problem: Problem) -> Answer:
     points count as independent, as is the practice. Laws are weighed by AIC of this fit."""
     m, deviation, freedom = curve(problem)
     ln_variance = 2.0 * np.log(deviation)
-    peaks: dict[str, Peak] = {}
-    for law in problem.laws:
-        if m.size < len(NAMED[law].parameters):
-            continue
 
-        def objective(ln_theta: Floats, law: str = law) -> float:
-            model = np.log(problem.terms(law, ln_theta).allan_variance(m))
-            return -0.25 * float((freedom * (ln_variance - model) ** 2).sum())
+    def objective(law: str, ln_theta: Floats) -> float:
+        model = np.log(problem.terms(law, ln_theta).allan_variance(m))
+        return -0.25 * float((freedom * (ln_variance - model) ** 2).sum())
 
-        peaks[law] = maximum(objective, problem.starts(law))
+    peaks = problem.peaks(objective, m.size)
     criterion = {law: 2.0 * len(NAMED[law].parameters) - 2.0 * peak.value for law, peak in peaks.items()}
-    return Answer({law: peak.values(law) for law, peak in peaks.items()}, {"AIC": weights(criterion)})
+    return Answer.of(peaks, {"AIC": weights(criterion)})

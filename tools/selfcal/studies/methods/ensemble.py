@@ -33,17 +33,12 @@ class Cell:
     seed: int
 
 
-def middle(prior: Prior) -> float:
-    """The truth of `--truth middle`: the middle of the prior's logarithm."""
-    return math.sqrt(prior.min * prior.max)
-
-
 def rows_of(model: Model, axis: str, truth_from: str, chosen: Sequence[Rival], cell: Cell) -> list[Row]:
     """A row for each method. The estimates are those of the true law, the weights those of all laws."""
     group = model.group_of(axis)
     truth = draw(group, cell.law, np.random.default_rng([cell.seed, list(NAMED).index(cell.law)]))
     if truth_from == "middle":
-        truth |= {name: middle(group.priors[name]) for name in NAMED[cell.law].parameters}
+        truth |= {name: group.priors[name].median for name in NAMED[cell.law].parameters}
     y, _ = simulate_bank_samples(cell.law, truth, model.bank_rate_hz, cell.samples, cell.seed)
     problem = Problem(y, 1.0 / model.bank_rate_hz, replace(group, axes=(axis,)), tuple(model.hypotheses))
     rows: list[Row] = []
@@ -97,13 +92,8 @@ def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
 
 def _criteria(rows: Sequence[Row]) -> list[str]:
     """Criteria by which a method weighs the laws."""
-    keys = {
-        key.split(".")[1]
-        for row in rows
-        for key, value in row.items()
-        if key.startswith("weight.") and value is not None
-    }
-    return sorted(keys)
+    stated = (key for row in rows for key, value in row.items() if value is not None)
+    return sorted({key.split(".")[1] for key in stated if key.startswith("weight.")})
 
 
 def _column(rows: Sequence[Row], key: str) -> Floats:

@@ -7,7 +7,7 @@ import warnings
 import numpy as np
 from statsmodels.tsa.arima.model import ARIMA
 
-from selfcal.studies.methods.problem import Answer, Problem, Value, of_coefficients
+from selfcal.studies.methods.problem import Answer, Problem, of_coefficients
 
 _ORDER = {"random_walk": (0, 1, 1), "gauss_markov": (1, 0, 1)}
 
@@ -16,10 +16,8 @@ def arma(problem: Problem) -> Answer:
     """Estimates without an interval: the coefficients' own is not one of N, K, sigma_m or alpha."""
     y, dt = problem.y - problem.y.mean(), problem.dt_s
     scale = float(y.std()) or 1.0
-    by_law: dict[str, dict[str, Value]] = {}
+    by_law = {}
     for law in problem.drifts:
-        if law not in _ORDER:
-            continue
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of a search that has not converged: the figures show it
             model = ARIMA(y / scale, order=_ORDER[law], trend="c" if law == "gauss_markov" else "n")

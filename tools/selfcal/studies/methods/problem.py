@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from selfcal.adequacy.allan import Terms, overlapping, terms_of
+from selfcal.adequacy.allan import LONGEST, STEP, Terms, overlapping, terms_of
 from selfcal.bank.result import HALF_90
 from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Group, Prior
@@ -20,8 +21,6 @@ Floats = NDArray[np.float64]
 
 #: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
 REACH = 1e5
-#: Step of a derivative, in the logarithm of a parameter: a tenth of the least posterior sd at 3000 samples.
-STEP = 1e-3
 #: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
 LEVEL_SD = 10.0
 
@@ -69,6 +68,20 @@ class Problem:
             return [np.log([N, long * math.sqrt(3.0 / (m * dt))])]
         return [np.log([N, long, 1.0 / (part * n * dt)]) for part in (0.2, 0.03, 0.005)]
 
+    def peaks(self, objective: Callable[[str, Floats], float], points: float = math.inf) -> dict[str, Peak]:
+        """The maximum of an objective of a law and ln parameters, by law; of laws that so many points determine."""
+        return {law: maximum(partial(objective, law), self.starts(law)) for law in self.determined(points)}
+
+    def determined(self, points: float) -> list[str]:
+        """The laws that have no more parameters than points of a curve."""
+        return [law for law in self.laws if points >= len(NAMED[law].parameters)]
+
+    def octaves(self) -> tuple[Floats, Floats]:
+        """Averaging times in readings, an octave apart, and overlapping Allan variances."""
+        y = self.y - self.y.mean()
+        m = np.exp2(np.arange(max(1, math.floor(math.log2(max(2, y.size // LONGEST))) + 1)))
+        return m, np.array([overlapping(y, int(length))[0] for length in m])
+
 
 @dataclass(frozen=True)
 class Value:
@@ -85,6 +98,11 @@ class Answer:
 
     estimates: Mapping[str, Mapping[str, Value]]
     weights: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @staticmethod
+    def of(peaks: Mapping[str, Peak], weights: Mapping[str, Mapping[str, float]] | None = None) -> Answer:
+        """Estimates with the interval of each maximum's curvature."""
+        return Answer({law: peak.values(law) for law, peak in peaks.items()}, weights or {})
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """A Rao-Blackwellised particle filter: the parameters are the particles, each with a Kalman filter of its own for level
 and drift. All else is as in `particles.py`.
 
-The library `particles` cannot be installed beside this package: its version 0.4 refuses numpy 2, 0.3 has no wheel.
+The library `particles` cannot be installed with this package: its version 0.4 refuses numpy 2, 0.3 has no wheel.
 """
 
 from __future__ import annotations

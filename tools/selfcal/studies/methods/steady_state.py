@@ -9,15 +9,12 @@ from functools import partial
 import numpy as np
 from scipy import signal
 
-from selfcal.studies.methods.problem import Answer, Floats, Peak, Problem, maximum
+from selfcal.studies.methods.problem import Answer, Floats, Problem
 
 
 def steady_state(problem: Problem) -> Answer:
     """Estimates with intervals from the curvature. The method gives no weights of laws."""
-    peaks: dict[str, Peak] = {}
-    for law in problem.laws:
-        peaks[law] = maximum(partial(ln_likelihood, problem, law), problem.starts(law))
-    return Answer({law: peak.values(law) for law, peak in peaks.items()})
+    return Answer.of(problem.peaks(partial(ln_likelihood, problem)))
 
 
 def ln_likelihood(problem: Problem, law: str, ln_theta: Floats) -> float:

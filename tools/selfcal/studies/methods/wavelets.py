@@ -7,16 +7,14 @@ covariance that the first fit implies. The interval is that of the second step.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 
 import numpy as np
 
-from selfcal.adequacy.allan import Terms, overlapping
+from selfcal.adequacy.allan import STEP, Terms
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.allan import WINDOWS
-from selfcal.studies.methods.problem import STEP, Answer, Floats, Problem, Value, inverse, logarithmic, maximum
+from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, inverse, logarithmic, maximum
 
 #: Weights of a second difference of sums over m readings.
 _SECOND = ((0, 1.0), (1, -2.0), (2, 1.0))
@@ -38,14 +36,10 @@ def covariance(terms: Terms, m: Floats, n: int) -> Floats:
 
 def gmwm(problem: Problem) -> Answer:
     """Estimates by law. The method gives no weights of laws without a bootstrap, so none are stated."""
-    y = problem.y - problem.y.mean()
-    m = 2.0 ** np.arange(max(1, math.floor(math.log2(max(2, y.size // WINDOWS))) + 1), dtype=np.float64)
-    variance = np.array([overlapping(y, int(length))[0] for length in m.tolist()])
-    own = np.diag(y.size / (2.0 * m * variance**2))
+    (m, variance), n = problem.octaves(), problem.y.size
+    own = np.diag(n / (2.0 * m * variance**2))
     by_law: dict[str, dict[str, Value]] = {}
-    for law in problem.laws:
-        if m.size < len(NAMED[law].parameters):
-            continue
+    for law in problem.determined(m.size):
 
         def model(ln_theta: Floats, law: str = law) -> Floats:
             return problem.terms(law, ln_theta).allan_variance(m)
@@ -55,7 +49,7 @@ def gmwm(problem: Problem) -> Answer:
             return -0.5 * float(off @ weight @ off)
 
         first = maximum(partial(objective, own), problem.starts(law))
-        weight = inverse(covariance(problem.terms(law, first.at), m, y.size))
+        weight = inverse(covariance(problem.terms(law, first.at), m, n))
         if not np.isfinite(weight).all():
             by_law[law] = {name: Value(value.value) for name, value in first.values(law).items()}
             continue

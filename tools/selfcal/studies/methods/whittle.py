@@ -12,7 +12,7 @@ import math
 import numpy as np
 from scipy import fft
 
-from selfcal.studies.methods.problem import Answer, Floats, Problem, information_criteria, maximum
+from selfcal.studies.methods.problem import Answer, Floats, Problem, information_criteria
 
 
 def whittle(problem: Problem) -> Answer:
@@ -20,13 +20,11 @@ def whittle(problem: Problem) -> Answer:
     n = problem.y.size
     power = fft.dct(problem.y - problem.y.mean(), norm="ortho")[1:] ** 2
     omega = math.pi * np.arange(1, n) / n
-    peaks = {}
-    for law in problem.laws:
 
-        def objective(ln_theta: Floats, law: str = law) -> float:
-            spectrum = problem.terms(law, ln_theta).spectrum(omega)
-            return -0.5 * float((np.log(spectrum) + power / spectrum).sum())
+    def objective(law: str, ln_theta: Floats) -> float:
+        spectrum = problem.terms(law, ln_theta).spectrum(omega)
+        return -0.5 * float((np.log(spectrum) + power / spectrum).sum())
 
-        peaks[law] = maximum(objective, problem.starts(law))
+    peaks = problem.peaks(objective)
     criteria = information_criteria({law: peak.value for law, peak in peaks.items()}, n - 1)
-    return Answer({law: peak.values(law) for law, peak in peaks.items()}, criteria)
+    return Answer.of(peaks, criteria)

@@ -425,9 +425,16 @@ def of_map_error(tables: Tables, y: Array) -> tuple[float, tuple[float, float, f
     return report.probability["gauss_markov"], (rms / MGAL, 1.0 / alpha / 60.0, noise / MGAL / math.sqrt(AREA_STEP_S))
 
 
+def identified(fits: Mapping[str, Sequence[tuple[float, tuple[float, ...]]]]) -> tuple[dict[str, float], float]:
+    """Share of an area's records for which Gauss-Markov is the more probable, %, and the mean calculated probability
+    of all records, %. `fits`: of_map_error() of each record."""
+    shares = {area: 100.0 * float(np.mean([p > 0.5 for p, _ in each])) for area, each in fits.items()}
+    return shares, 100.0 * float(np.mean([max(p, 1.0 - p) for each in fits.values() for p, _ in each]))
+
+
 def figure_8(model: Model, seed: int) -> Reproduction:
     """Shares of the records for which Gauss-Markov is the more probable, and the parameters found."""
-    shares, correct, fits = {}, [], {}
+    drawn: dict[str, list[tuple[float, tuple[float, float, float]]]] = {}
     rate = 1.0 / AREA_STEP_S
     tables = map_tables(model)
     for number, (area, (rms, minutes, noise)) in enumerate(AREAS.items()):
@@ -437,14 +444,10 @@ def figure_8(model: Model, seed: int) -> Reproduction:
             "alpha": 1.0 / (60.0 * minutes),
             "bias": 0.0,
         }
-        chosen, estimates = 0, []
-        for k in range(AREA_RECORDS):
-            y, _ = simulate_bank_samples("gauss_markov", truth, rate, AREA_SAMPLES, seed + 1_000_003 * k + 101 * number)
-            p, estimate = of_map_error(tables, y)
-            chosen += p > 0.5
-            correct.append(max(p, 1.0 - p))
-            estimates.append(estimate)
-        shares[area], fits[area] = 100.0 * chosen / AREA_RECORDS, np.array(estimates)
+        seeds = (seed + 1_000_003 * k + 101 * number for k in range(AREA_RECORDS))
+        records = (simulate_bank_samples("gauss_markov", truth, rate, AREA_SAMPLES, own)[0] for own in seeds)
+        drawn[area] = [of_map_error(tables, y) for y in records]
+    (shares, sure), fits = identified(drawn), {area: np.array([e for _, e in each]) for area, each in drawn.items()}
     figures = []
     for column, (what, limit) in enumerate((("process rms", "σm"), ("white noise", "N"))):
         panels = []
@@ -472,7 +475,6 @@ def figure_8(model: Model, seed: int) -> Reproduction:
     medians = {area: np.median(values, axis=0) for area, values in fits.items()}
     negligible = all(noise < 0.1 * rms for rms, _, noise in medians.values())
     paper_shares = ", ".join(f"{share}" for share in PAPER_SHARES.values())
-    sure = 100.0 * float(np.mean(correct))
     agrees = sure >= 95.0 and negligible
     return Reproduction(
         "Fig. 8 and the shares",

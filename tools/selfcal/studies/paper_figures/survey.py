@@ -24,7 +24,7 @@ from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.show.chart import Curve, Figure, Panel
 from selfcal.studies.paper_figures.reproduction import Reproduction
-from selfcal.studies.paper_figures.section4 import AREA_SAMPLES, AREA_STEP_S, MGAL, map_tables, of_map_error
+from selfcal.studies.paper_figures.section4 import AREA_SAMPLES, AREA_STEP_S, MGAL, identified, map_tables, of_map_error
 
 #: The field: rms, mGal, and length, km.
 FIELD_MGAL, FIELD_KM = 10.0, 12.0
@@ -84,7 +84,7 @@ def figure(model: Model, areas: Mapping[str, Array]) -> Reproduction:
     """The law of the errors by area, and whether more tracks make them smaller and longer."""
     tables = map_tables(model)
     fits = {area: [of_map_error(tables, MGAL * error) for error in errors] for area, errors in areas.items()}
-    shares = {area: 100.0 * float(np.mean([p > 0.5 for p, _ in each])) for area, each in fits.items()}
+    shares, sure = identified(fits)
     estimates = {area: np.array([estimate for _, estimate in each]) for area, each in fits.items()}
     medians = np.array([np.median(values, axis=0) for values in estimates.values()])
     ends = (next(iter(areas)), list(areas)[-1])
@@ -118,7 +118,6 @@ def figure(model: Model, areas: Mapping[str, Array]) -> Reproduction:
     ]
     falls = medians[-1] < medians[0]
     agrees = bool(min(shares.values()) > 50.0 and falls[0] and falls[2] and not falls[1])
-    sure = 100.0 * float(np.mean([max(p, 1.0 - p) for each in fits.values() for p, _ in each]))
     return Reproduction(
         "Section 4.2, one track left out",
         [errors, *by_area],
