@@ -500,7 +500,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     cells = Cells(y, step)
     plain, limits, total = cells.fit(cells.own), dict[float, Mask](), 0.0
     for side, edge, at_edge in zip((1, -1), edges, at_edges, strict=True):
-        nats = cells.fit(cells.limit(side)).one - plain.one
+        nats = cells.fit(cells.limit(side)).over(plain)
         count = int(at_edge.sum())
         if count < 3 or nats < nats_of("saturation"):
             continue
