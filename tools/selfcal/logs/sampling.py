@@ -459,9 +459,9 @@ def rhythm(gaps: Places) -> tuple[float, float]:
     for start, part in ((middle, 1), (short, 1), (short, 2), (short, 3)):
         few, near = gap <= 3.5 * start, gap <= 1.5 * start
         period = float(np.average(gap[near], weights=count[near])) / part
-        for _ in range(20):
-            times = np.maximum(1.0, np.rint(gap[few] / period))
-            period = float(gap[few] @ count[few]) / float(times @ count[few])
+        for some in [few] * 20 + [slice(None)]:
+            times = np.maximum(1.0, np.rint(gap[some] / period))
+            period = float(gap[some] @ count[some]) / float(times @ count[some])
         off = np.abs(gap - np.rint(gap / period) * period)
         order = np.argsort(off)
         share = np.minimum(1.0, np.cumsum(count[order]) / gaps.size)
