@@ -84,28 +84,20 @@ class _Map:
     share: float = 1.0
 
     def read(self, expected: Array) -> Array:
-        """Readings [codes] of `expected` true ones [codes]."""
+        """Readings [codes, ...] of `expected` true ones [codes, ...]."""
         assert self.lost is not None
-        moved = self.lost * expected
+        moved = (self.lost * expected.T).T
         found = np.asarray(expected - moved)
         if self.kind == "uneven":
             found[:-1] += 0.5 * moved[1:]
             found[1:] += 0.5 * moved[:-1]
         else:
-            found[self.place] += moved.sum()
+            found[self.place] += moved.sum(axis=0)
         return found
 
     def within(self, cells: Cells) -> csr_matrix:
         """`to`, of codes as they are without the map."""
-        if self.to is not None:
-            return self.to
-        assert self.lost is not None
-        lost, code = csr_matrix(np.diag(self.lost)), np.arange(self.lost.size)
-        if self.kind == "uneven":
-            to = 0.5 * (np.eye(code.size, k=1) + np.eye(code.size, k=-1))
-        else:
-            to = np.where(code[:, None] == self.place, 1.0, np.zeros(code.size))
-        return (csr_matrix(np.diag(1.0 - self.lost)) @ cells.own + csr_matrix(to) @ lost @ cells.own).tocsr()
+        return csr_matrix(self.read(cells.own.toarray())) if self.to is None else self.to
 
 
 @dataclass(frozen=True)
