@@ -228,8 +228,9 @@ class Cells:
         return np.asarray((1.0 - ODD) * chance + ODD / self.many)
 
     def of_pieces(self, fit: _Fit) -> Array:
-        """Chance [parts, pieces] of parts of codes at the levels and the noise of a fit."""
-        return np.asarray(np.diff(ndtr((self.edges[:, None] - fit.level[1]) / fit.sigma[1]), axis=0))
+        """Chance [parts, pieces] of parts of codes at the levels and noises of a fit, as they are likelier."""
+        row = int(np.argmax(fit.ln.sum(axis=1)))
+        return np.asarray(np.diff(ndtr((self.edges[:, None] - fit.level[row]) / fit.sigma[row]), axis=0))
 
     def expected(self, fit: _Fit) -> Array:
         """Readings [parts] that a fit has in each part."""
