@@ -63,13 +63,13 @@ def held(columns: Sequence[Array], at: Rows, off: Array | None) -> Held | None:
         return found
 
     same, again = equal(1), equal(2)
-    regular = _in_runs(same, at) or _at_a_beat(same, again, at, off)
-    if regular is not None:
-        return regular
-    found = _now_and_then(same, again, at)
-    # Repeats that a stretch of a lower rate explains are its own.
-    of_stretches = sum(one.rows.size for one in slower(columns[0])) if found is not None else 0
-    return None if found is None or 2 * of_stretches > at.size - found.rows.size else found
+    regular = _in_runs(same, at)
+    found = regular or _at_a_beat(same, again, at, off) or _now_and_then(same, again, at)
+    if found is None or found is regular:
+        return found
+    # Repeats that stretches of a lower rate explain are theirs.
+    of_stretches = sum(one.rows.size for one in slower(columns[0]))
+    return None if 2 * of_stretches > at.size - found.rows.size else found
 
 
 @dataclass(frozen=True)
