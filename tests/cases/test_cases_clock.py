@@ -14,11 +14,12 @@ from typing import NoReturn
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.stats import binom
 
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import load
 from selfcal.logs.sampling import Ambiguous, rate_changes, sampling
-from selfcal.logs.timebase import clock_of
+from selfcal.logs.timebase import clock_of, clock_of_rows, has_own_clock
 from selfcal.verbs.identify import identify
 
 from conftest import case_records
@@ -535,6 +536,30 @@ def test_empty_cells_at_regular_rows_are_missing_samples(tmp_path: Path) -> None
         pytest.approx(10.0, rel=1e-9),
         45,
     )
+
+
+@pytest.mark.parametrize("period", [2.5, 3.0, 4.4, 10.0, 25.0])
+@pytest.mark.parametrize("lost", [0.0, 0.2])
+def test_a_slower_channel_has_its_own_rate(period: float, lost: float) -> None:
+    """Samples in every so many rows of a table without stamps, `lost` of them missing; the rate to a row in all."""
+    for seed in range(case_records(3, 40)):
+        random = np.random.default_rng([seed, round(10 * period)])
+        rows = np.ceil(np.arange(random.integers(200, 3000)) * period).astype(np.int64)
+        kept = random.random(rows.size) >= lost
+        kept[[0, -1]] = True
+        clock = clock_of_rows(rows[kept], 200.0)
+        assert clock.rate_hz == pytest.approx(200.0 / period, rel=1.5 / rows[-1])
+        assert np.array_equal(clock.place, np.flatnonzero(kept))
+
+
+@pytest.mark.parametrize("lost", [0.01, 0.3, 0.7, 0.95])
+def test_samples_lost_at_random_are_no_slower_channel(lost: float) -> None:
+    """Chance gives gaps no period: in 1 of 200 tables at most."""
+    count, own = case_records(60, 600), 0
+    for seed in range(count):
+        random = np.random.default_rng([seed, round(100 * lost)])
+        own += has_own_clock(np.flatnonzero(random.random(random.integers(300, 5000)) >= lost))
+    assert own <= binom.isf(1e-3, count, 1.0 / 200.0)
 
 
 # ------------------------------------------------------------------------------------------------ one law of the stamps

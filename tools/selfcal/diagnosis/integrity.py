@@ -8,12 +8,14 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtr, pdtrc
+from scipy.special import pdtrc
 
 from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import NET_LEAST, Look, State, interval
+from selfcal.likelihood.state import Look, State, interval
 from selfcal.likelihood.statemodel import Mask
+from selfcal.readings.budget import SHARES
+from selfcal.readings.held import equal_by_chance
 
 #: An unstated lattice is told of from this many white noise sd on.
 LATTICE_LEAST = 0.5
@@ -58,22 +60,12 @@ def _held(record: Record) -> Mask:
         return none  # means of blocks repeat by chance: a held reading shows at the recording's own rate
     held = np.all(repeats, axis=0)
     shares = [
-        max((float(same.sum()) - float(held.sum())) / same.size, _repeats_by_chance(state), _repeats_of_earlier(state))
+        max((float(same.sum()) - float(held.sum())) / same.size, equal_by_chance(state.y))
         for same, state in zip(repeats, record.axes.values(), strict=True)
     ]
     expected = held.size * float(np.prod(np.maximum(shares, 1.0 / held.size)))
     # Chance repeats of coarse axes are not quite independent: three times the expectation.
-    return held if pdtrc(int(held.sum()) - 1, 3.0 * expected + 0.05) < math.exp(-NET_LEAST) else none
-
-
-def _repeats_by_chance(state: State) -> float:
-    """Share of white noise's readings on the axis' lattice that repeat the one before."""
-    return 2.0 * float(ndtr(state.lsb / (2.0 * math.sqrt(2.0) * state.best.sigma))) - 1.0 if state.fits else 0.0
-
-
-def _repeats_of_earlier(state: State) -> float:
-    """Share of readings that repeat one two to four before: chance alone, on a lattice of several steps as well."""
-    return sum(float((state.y[k:] == state.y[:-k]).mean()) for k in (2, 3, 4)) / 3.0
+    return held if pdtrc(int(held.sum()) - 1, 3.0 * expected + 0.05) < SHARES["held_samples"] else none
 
 
 def rate_changes(record: Record) -> list[Look]:
@@ -104,10 +96,9 @@ def of_readings(record: Record, axis: str) -> Iterator[Look]:
     if (changed := readings.misread) is not None:  # by a map of the firmware or the logger
         fraction = interval(changed.share, math.sqrt(changed.share / n), "1")
         yield Look("misread", changed.nats, changed.nats, {"kind": changed.kind, "fraction": fraction}, {})
-    if readings.held_hz is not None:  # the logger asks oftener than the part measures, always or in stretches
-        # Each reading that is asked for again repeats; by chance one in 100 would at most.
-        nats = min(1e6, n * math.log(100.0))
-        yield Look("held_samples", nats, nats, {"rate_hz": interval(readings.held_hz, 0.0, "Hz")}, {})
+    if readings.held is not None:  # the logger asks oftener than the part measures, always or in stretches
+        nats, rate_hz = min(1e6, readings.held.nats), interval(readings.recording.rate_hz, 0.0, "Hz")
+        yield Look("held_samples", nats, nats, {"rate_hz": rate_hz}, {})
     elif readings.slower:
         surest = max(readings.slower, key=lambda one: one.nats)
         rate_hz = interval(readings.recording.rate_hz / surest.ratio, 0.0, "Hz")

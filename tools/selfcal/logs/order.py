@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from selfcal.base.grid import Array, Rows
-from selfcal.logs.sampling import common_step, overlapping
+from selfcal.logs.sampling import common_step, in_rhythm, overlapping
 
 #: Rows from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM = 100
@@ -149,8 +149,5 @@ def _far(time: Array) -> Rows:
 def _coarse(steps: Array) -> bool:
     """Whether stamps repeat for being coarse: often, or in a rhythm all the time."""
     rows = np.flatnonzero(steps == 0.0)
-    if steps.size < _REPEATS_FROM or rows.size < 2:
-        return False
-    runs = np.diff(rows)
-    steady = np.mean(np.abs(runs - np.median(runs)) <= 1) > 0.5 and 2 * np.ptp(rows) > steps.size
-    return bool(steady) or not few(rows.size, steps.size)
+    often = steps.size >= _REPEATS_FROM and not few(rows.size, steps.size)
+    return often or (in_rhythm(rows) and 2 * int(np.ptp(rows)) > steps.size)

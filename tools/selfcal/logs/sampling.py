@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import rfft
 from scipy.ndimage import grey_closing, uniform_filter1d
-from scipy.special import betaln
+from scipy.special import betaln, rel_entr
 
 #: Intervals of a record at most.
 _LONGEST = 2.0**53
@@ -39,7 +39,8 @@ _COARSE, _FINEST = 0.25, 1e-3
 #: Nats of another interval than a lattice that is no tick of a clock, and of one that is not the stated one at most;
 #: the relative sd of that one. Ticks of clocks are 10^-k s, 2^-k s, and this, s.
 _COINCIDENCE, _STATED, _STATED_SD, _JIFFY = 400.0, 20.0, 0.005, 0.004
-#: Nats of a line that random times show by chance, and of one in a row at most: rows of batches make lines as well.
+#: Nats of a line or a rhythm that random times show by chance, and of a line in a row at most: rows of batches make
+#: lines as well.
 _NO_CHANCE, _LINE_MOST = 25.0, 0.1
 #: Another dt that costs so few nats more is as good; and may cost less by the whole record.
 _AS_GOOD, _CLOSE = 10.0, 25.0
@@ -63,7 +64,7 @@ _ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
 #: A gap between steps of any length, in the step beyond which half of the time is; errors about their line that are
 #: far off, in the median one; how far batches that overlap may stray from a steady count, in their length.
 _GAP, _FAR, _STRAY = 12.0, 6.0, 5.0
-#: The share of the gaps that keep to a rhythm, and gaps in a period of losses at most.
+#: The share of the gaps that keep to a rhythm or a pattern, and gaps in a period of losses at most.
 _RHYTHM, _OF_PATTERN = 0.9, 4
 
 Floats = NDArray[np.float64]
@@ -447,12 +448,34 @@ def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     return intervals
 
 
-def in_rhythm(rows: NDArray[np.int64]) -> bool:
-    """Whether rows, four or more apart, are as far apart from each other, but for one row."""
-    runs = np.diff(rows)
-    if runs.size < _AWAKE or np.median(runs) < 4:
-        return False
-    return bool(np.mean(np.abs(runs - np.median(runs)) <= 1) >= _RHYTHM)
+def rhythm(gaps: Places) -> tuple[float, float]:
+    """Evidence, nats net, that most gaps [k] are whole multiples of one period, and the period: near the median, or a
+    part of the short ones. Chance spreads the gaps evenly over it."""
+    if gaps.size < 2:
+        return 0.0, 1.0
+    gap, count = np.unique(gaps, return_counts=True)
+    found = (0.0, 1.0)
+    short, middle = np.quantile(gaps, [0.05, 0.5], method="lower")
+    for start, part in ((middle, 1), (short, 1), (short, 2), (short, 3)):
+        few, near = gap <= 3.5 * start, gap <= 1.5 * start
+        period = float(np.average(gap[near], weights=count[near])) / part
+        for some in [few] * 20 + [slice(None)]:
+            times = np.maximum(1.0, np.rint(gap[some] / period))
+            period = float(gap[some] @ count[some]) / float(times @ count[some])
+        off = np.abs(gap - np.rint(gap / period) * period)
+        order = np.argsort(off)
+        share = np.minimum(1.0, np.cumsum(count[order]) / gaps.size)
+        chance = np.minimum(1.0, (1.0 + 2.0 * off[order]) / period)
+        each = np.where(
+            share > np.maximum(chance, 0.5), rel_entr(share, chance) + rel_entr(1.0 - share, 1.0 - chance), 0.0
+        )
+        found = max(found, (float(each.max()) * gaps.size - math.log(4.0 * gaps.size), period))
+    return found
+
+
+def in_rhythm(rows: Places) -> bool:
+    """Whether rows are whole multiples of one period apart."""
+    return rhythm(np.diff(rows))[0] > _NO_CHANCE
 
 
 def in_pattern(steps: NDArray[np.floating[Any]] | Places) -> bool:
@@ -469,11 +492,13 @@ def _periods(steps: NDArray[np.floating[Any]] | Places) -> list[tuple[int, NDArr
 
 
 def overlapping(time: Floats) -> bool:
-    """Whether stamps fall in a rhythm, and go on from there: batches overlap. Where rows are swapped they catch up."""
+    """Whether stamps fall in a rhythm of some rows, and go on from there: batches overlap. Where rows are swapped they
+    catch up."""
     steps = np.diff(time)
     rows = np.flatnonzero(steps < 0.0)
     around = time[np.minimum(rows + 4, time.size - 1)] - time[np.maximum(rows - 3, 0)]
-    return in_rhythm(rows) and float(np.median(around)) < 6.0 * float(np.median(steps))
+    batches = 4 * rows.size < time.size and in_rhythm(rows)
+    return batches and float(np.median(around)) < 6.0 * float(np.median(steps))
 
 
 def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), off: Floats | None = None) -> float:

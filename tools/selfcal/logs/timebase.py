@@ -17,11 +17,8 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, sampling
+from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, rhythm, sampling
 
-#: A column has a clock of its own where so large a share of the steps between its samples, in rows, lies so near their
-#: median of two rows or more.
-_OWN_SHARE, _OWN_NEAR = 0.6, 0.3
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
 #: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost. Regular losses
@@ -99,19 +96,15 @@ class Clock:
 
 def has_own_clock(rows: NDArray[np.int64]) -> bool:
     """Whether the samples in these rows of a table are a slower channel's, or another sensor's between them."""
-    if rows.size < 3:
-        return False
-    steps = np.diff(rows)
-    middle = float(np.median(steps))
-    near = np.abs(steps - middle) <= _OWN_NEAR * middle
-    return middle >= 2.0 and float(near.mean()) >= _OWN_SHARE
+    return rhythm(np.diff(rows))[0] > 0.0
 
 
 def clock_of_rows(rows: NDArray[np.int64], rate: float) -> Clock:
     """The clock of samples in these rows of a table without stamps, whose rows come at `rate`, Hz."""
-    every = max(1, round(float(np.median(np.diff(rows))))) if has_own_clock(rows) else 1
-    place = np.rint((rows - rows[0]) / every).astype(np.int64)
-    return Clock(rate / every, np.maximum(np.diff(place, prepend=-1) - 1, 0), None, float(rows[0]) / rate)
+    nats, period = rhythm(np.diff(rows))
+    period = period if nats > 0.0 else 1.0
+    missing = np.maximum(np.rint(np.diff(rows, prepend=rows[0] - period) / period).astype(np.int64) - 1, 0)
+    return Clock(rate / period, missing, None, float(rows[0]) / rate)
 
 
 def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: float | None, fail: Fail) -> Clock:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,13 +29,13 @@ PIECES, PIECE = 100, 64
 COMMON = 0.2
 #: Cells in the noise of readings on no lattice; parts of true values in one, and points of them.
 CELLS, PARTS, POINTS = 4.0, 8, 32
-#: Noises that are tried, in that of differences; steps of a level, in noises: between them a parabola has the best.
-NOISES, LEVEL_STEP = np.geomspace(0.1, 3.0, 18), 0.25
+#: Noises that are tried first, in that of differences; steps of a level, in noises.
+NOISES, LEVEL_STEP = np.geomspace(0.1, 3.0, 12), 0.5
 #: Shares that are read as another code, and further codes of a dead band on either side.
 SHARES, WIDTHS = np.concatenate([np.geomspace(0.01, 0.3, 24), np.linspace(0.33, 1.0, 23)]), 12
 #: Times that the commonest value of readings on no lattice is commoner than the next one.
 STANDS_OUT = 3.0
-#: Times that a map is sought at the levels and the noise of the last one.
+#: Times that a map is sought at the levels and noises of the last one, and these are refined for one map.
 TURNS = 3
 #: Chance of a reading that the noise and the codes, or a map, do not make.
 ODD = 1e-6
@@ -84,42 +84,40 @@ class _Map:
     share: float = 1.0
 
     def read(self, expected: Array) -> Array:
-        """Readings [codes] of `expected` true ones [codes]."""
+        """Readings [codes, ...] of `expected` true ones [codes, ...]."""
         assert self.lost is not None
-        moved = self.lost * expected
+        moved = (self.lost * expected.T).T
         found = np.asarray(expected - moved)
         if self.kind == "uneven":
             found[:-1] += 0.5 * moved[1:]
             found[1:] += 0.5 * moved[:-1]
         else:
-            found[self.place] += moved.sum()
+            found[self.place] += moved.sum(axis=0)
         return found
 
     def within(self, cells: Cells) -> csr_matrix:
         """`to`, of codes as they are without the map."""
-        if self.to is not None:
-            return self.to
-        assert self.lost is not None
-        lost, code = csr_matrix(np.diag(self.lost)), np.arange(self.lost.size)
-        if self.kind == "uneven":
-            to = 0.5 * (np.eye(code.size, k=1) + np.eye(code.size, k=-1))
-        else:
-            to = np.where(code[:, None] == self.place, 1.0, np.zeros(code.size))
-        return (csr_matrix(np.diag(1.0 - self.lost)) @ cells.own + csr_matrix(to) @ lost @ cells.own).tocsr()
+        return csr_matrix(self.read(cells.own.toarray())) if self.to is None else self.to
 
 
 @dataclass(frozen=True)
 class _Fit:
-    """ln likelihood with one noise, and with one for each piece; the levels [pieces] and the noise at the first."""
+    """Level, noise and ln likelihood of each piece, [2, pieces]: with one noise for all, and with one for each, which
+    has its price."""
 
-    one: float
-    each: float
     level: Array
-    sigma: float
+    sigma: Array
+    ln: Array
 
     def over(self, other: _Fit) -> float:
-        """Evidence over another: noise that comes and goes must not make it."""
-        return min(self.one - other.one, self.each - other.each)
+        """Evidence over another, nats: noise that comes and goes does not make it."""
+        return float(self.ln.sum(axis=1).max() - other.ln.sum(axis=1).max())
+
+    def better(self, other: _Fit) -> _Fit:
+        """The likelier of two: in all pieces together, and in each."""
+        more = other.ln > self.ln
+        more[0] = other.ln[0].sum() > self.ln[0].sum()
+        return _Fit(*np.where(more, (other.level, other.sigma, other.ln), (self.level, self.sigma, self.ln)))
 
 
 class Cells:
@@ -196,27 +194,43 @@ class Cells:
             found.append((level, np.diff(ndtr((self.edges[:, None] - level) / sigma), axis=0)))
         return found
 
-    def fit(self, to: csr_matrix) -> _Fit:
-        """The likeliest levels and noise under a map."""
-        count, to = self.count[:, self.there], to[self.there]
-        worth, at = np.empty((len(self.true), len(count))), []
-        for k, (level, chance) in enumerate(self.true):
-            ln = count @ np.log((1.0 - ODD) * (to @ chance) + ODD / self.many)
-            best = np.clip(np.argmax(ln, axis=1), 1, level.size - 2)
-            more, place = _summit(*(ln[np.arange(len(count)), best + side] for side in (-1, 0, 1)))
-            worth[k] = more
-            at.append(level[best] + place * (level[1] - level[0]))
-        total = worth.sum(axis=1)
-        k = min(max(int(np.argmax(total)), 1), len(total) - 2)
-        one, place = _summit(*(total[k + side, None] for side in (-1, 0, 1)))
-        best = np.clip(np.argmax(worth, axis=0), 1, len(total) - 2)
-        each = _summit(*(worth[best + side, np.arange(len(count))] for side in (-1, 0, 1)))[0]
-        ratio = float(NOISES[1] / NOISES[0])
-        return _Fit(float(one[0]), float(each.sum()), at[k], self.noise * NOISES[k] * ratio ** float(place[0]))
+    def fit(self, to: csr_matrix, near: _Fit | None = None) -> _Fit:
+        """The likeliest levels and noises under a map: Fisher's scoring from those of a `near` map, or from the best of
+        a grid."""
+        count, to = self.count[:, self.there].T[:, None], to[self.there]
+        price = np.outer([0.0, 0.5], np.log(self.count.sum(axis=1)))
+        none = _Fit(np.zeros_like(price), np.zeros_like(price), np.full(price.shape, -np.inf))
+        found = none if near is None else replace(near, ln=none.ln)
+        for (levels, chance), tried in zip(self.true, self.noise * NOISES, strict=True) if near is None else ():
+            ln = count[:, 0].T @ np.log(self._likely(to @ chance))
+            at = np.broadcast_to(levels[np.argmax(ln, axis=1)], price.shape)
+            found = found.better(_Fit(at, np.full(at.shape, tried), ln.max(axis=1) - price))
+        level, sigma = found.level, found.sigma
+        for _ in range(TURNS):
+            z = (self.edges[:, None, None] - level) / sigma
+            density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
+            cells = (np.diff(each, axis=0).reshape(len(z) - 1, -1) for each in (ndtr(z), -density, -z * density))
+            chance, by_level, by_noise = ((to @ each).reshape(-1, *level.shape) for each in cells)
+            likely = self._likely(chance)
+            found = found.better(_Fit(level, sigma, (count * np.log(likely)).sum(axis=0) - price))
+            score, of_noise = ((count * by / likely).sum(axis=0) for by in (by_level, by_noise))
+            total = count.sum(axis=0) / likely
+            known, both, noise = ((total * by).sum(axis=0) for by in (by_level**2, by_level * by_noise, by_noise**2))
+            known += 1.0  # a reading: a piece of one code shows neither level nor noise
+            of_noise, noise = of_noise - both / known * score, noise - both**2 / known + 1.0
+            of_noise[0], noise[0] = of_noise[0].sum(), noise[0].sum()
+            step = np.clip(of_noise / noise, -LEVEL_STEP, LEVEL_STEP)
+            level = level + sigma * np.clip((score - both * step) / known, -LEVEL_STEP, LEVEL_STEP)
+            sigma = np.clip(sigma * np.exp(step), *self.noise * NOISES[[0, -1]])
+        return found
+
+    def _likely(self, chance: Array) -> Array:
+        return np.asarray((1.0 - ODD) * chance + ODD / self.many)
 
     def of_pieces(self, fit: _Fit) -> Array:
-        """Chance [parts, pieces] of parts of codes at the levels and the noise of a fit."""
-        return np.asarray(np.diff(ndtr((self.edges[:, None] - fit.level) / fit.sigma), axis=0))
+        """Chance [parts, pieces] of parts of codes at the levels and noises of a fit, as they are likelier."""
+        row = int(np.argmax(fit.ln.sum(axis=1)))
+        return np.asarray(np.diff(ndtr((self.edges[:, None] - fit.level[row]) / fit.sigma[row]), axis=0))
 
     def expected(self, fit: _Fit) -> Array:
         """Readings [parts] that a fit has in each part."""
@@ -252,13 +266,6 @@ def noise_beside(y: Array) -> tuple[float, int, float]:
     unique, counts = np.unique(y, return_counts=True)
     commonest, most = float(unique[np.argmax(counts)]), int(counts.max())
     return commonest, most, noise_of(y[y != commonest] if most > COMMON * y.size else y)
-
-
-def _summit(left: Array, middle: Array, right: Array) -> tuple[Array, Array]:
-    """The largest value of parabolas through three values, and its place from the middle."""
-    bend = np.maximum(2.0 * middle - left - right, 1e-9)
-    place = np.clip(0.5 * (right - left) / bend, -1.0, 1.0)
-    return middle + 0.5 * place * (right - left) - 0.5 * place**2 * bend, place
 
 
 def _no_zeros(x: Array) -> Array:
@@ -340,7 +347,7 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
         for _ in range(TURNS if each.to is None else 0):
             over = cells.own @ cells.expected(fit)
             best = max(_of_places(cells, over, best), key=lambda rival: cells.gain(rival, over), default=best)
-            fit = cells.fit(best.within(cells))
+            fit = cells.fit(best.within(cells), fit)
         fits.append((fit.over(plain) - math.log(len(tried) if each.kind in UNEVEN else len(maps)), best, fit))
     nats, best, fit = max(fits, key=lambda tried_map: tried_map[0])
     also = tuple(dict.fromkeys(rival.kind for more, rival, _ in fits if more > nats - ALSO and rival.kind != best.kind))

@@ -15,11 +15,11 @@ import numpy as np
 from scipy.fft import next_fast_len, rfft
 
 from selfcal.base.grid import Array, Mask, Rows
-from selfcal.logs.sampling import followed_phase
+from selfcal.logs.sampling import followed_phase, rhythm
 from selfcal.readings.budget import nats_of
 
-#: Runs of equal readings that show held ones, at least; of a beat repeats beyond those by chance, and their share.
-REPEATS_LEAST, SHARE_LEAST = 50, 0.008
+#: Share of the rows that repeat beyond chance, at least: fewer change no noise by half a percent.
+SHARE_LEAST = 0.008
 #: Rows that show its line, and the power of the line over the mean in the blocks that follow its phase.
 HEAD, IN_BLOCK = 1 << 17, 60.0
 #: Share of the rows that repeat, over the beat's frequency, at least: one a beat, and one more for each late row.
@@ -40,12 +40,13 @@ IN_BIN, BINS = 50, 100
 @dataclass(frozen=True)
 class Held:
     """`rows` [m] at which a new reading of the part begins, `missing` [m]: how many it made unasked before each, and
-    the `ratio` of rows to readings. `even`: the rows show when the readings were made; else their mean rate is known,
-    but for those never asked for."""
+    the `ratio` of rows to readings; `nats` that the repeats are no chance. `even`: the rows show when the readings were
+    made; else their mean rate is known, but for those never asked for."""
 
     ratio: float
     rows: Rows
     missing: Rows
+    nats: float
     even: bool = True
 
 
@@ -61,16 +62,14 @@ def held(columns: Sequence[Array], at: Rows, off: Array | None) -> Held | None:
         found[lag:] = np.logical_and.reduce([column[lag:] == column[:-lag] for column in columns])
         return found
 
-    if at.size < 4 * REPEATS_LEAST:
-        return None
     same, again = equal(1), equal(2)
-    regular = _in_runs(same, at) or _at_a_beat(same, again, at, off)
-    if regular is not None:
-        return regular
-    found = _now_and_then(same, again, at)
-    # Repeats that a stretch of a lower rate explains are its own.
-    of_stretches = sum(one.rows.size for one in slower(columns[0])) if found is not None else 0
-    return None if found is None or 2 * of_stretches > at.size - found.rows.size else found
+    regular = _in_runs(same, at)
+    found = regular or _at_a_beat(same, again, at, off) or _now_and_then(same, again, at)
+    if found is None or found is regular:
+        return found
+    # Repeats that stretches of a lower rate explain are theirs.
+    of_stretches = sum(one.rows.size for one in slower(columns[0]))
+    return None if 2 * of_stretches > at.size - found.rows.size else found
 
 
 @dataclass(frozen=True)
@@ -93,8 +92,7 @@ def slower(values: Array) -> list[Slower]:
         return []
     same = np.zeros(n, bool)
     same[1:] = values[1:] == values[:-1]
-    later = sum(float(np.count_nonzero(values[k:] == values[:-k])) for k in (2, 3, 4))
-    chance = max(later / 3.0, 1.0) / n
+    chance = max(equal_by_chance(values), 1.0 / n)
     found: list[Slower] = []
     while len(found) < STRETCHES:
         best = max((_slower(same, ratio, chance) for ratio in range(2, RATIO_MOST + 1)), key=lambda one: one.nats)
@@ -103,6 +101,11 @@ def slower(values: Array) -> list[Slower]:
         found.append(best)
         same[best.rows] = False
     return found
+
+
+def equal_by_chance(values: Array) -> float:
+    """Share of readings [n] that equal one two to four before: by chance alone, on a lattice of several steps too."""
+    return sum(float(np.count_nonzero(values[k:] == values[:-k])) for k in (2, 3, 4)) / (3.0 * values.size)
 
 
 def _slower(same: Mask, ratio: int, chance: float) -> Slower:
@@ -153,8 +156,8 @@ def updates(values: Array, at: Rows) -> Rows | None:
     if rows.size <= CHANGES_LEAST:
         return None
     gaps = np.diff(at[rows])
-    nats, period = max(_of_period(gaps, part) for part in (1, 2, 3))
-    if nats < nats_of("held_samples") + math.log(3 * gaps.size):  # parts and periods were tried
+    nats, period = rhythm(gaps)
+    if nats < nats_of("held_samples"):
         return None
     times = np.maximum(1, np.rint(gaps / period))
     count = np.concatenate([[0.0], np.cumsum(times)])
@@ -165,42 +168,20 @@ def updates(values: Array, at: Rows) -> Rows | None:
     return np.unique(np.minimum(np.searchsorted(at, np.rint(every)), at.size - 1))
 
 
-def _of_period(gaps: Rows, part: int) -> tuple[float, float]:
-    """Evidence, nats, that gaps [k] are whole multiples of one period: of the short ones, or a part of them."""
-    period = float(np.quantile(gaps, 0.05, method="lower")) / part
-    period = _period(gaps, period, 3 * part)
-    off = np.abs(gaps - np.rint(gaps / period) * period)
-    return gaps.size * math.log(period / (1.0 + 2.0 * float(np.quantile(off, 0.95)))), period
-
-
-def _period(gaps: Rows, period: float, most: int) -> float:
-    """The period of which gaps [k] are whole multiples, by those of `most` periods or fewer, from one near it."""
-    for _ in range(20):
-        times = np.maximum(1, np.rint(gaps / period))
-        few = times <= most
-        period = float(gaps[few].sum() / times[few].sum())
-    return period
-
-
 def _in_runs(same: Mask, at: Rows) -> Held | None:
-    """Readings that repeat by chance make runs of any length, most of them of one. Held ones make few shorter than half
-    of the usual run. A run of several lengths is of as many readings that are equal by chance."""
-    n = same.size
+    """Readings that repeat by chance make runs of any length, most of them of one. The runs of held ones are whole
+    multiples of one length, those of several lengths of as many readings that are equal by chance."""
     starts = np.flatnonzero(~same)
-    if not REPEATS_LEAST < starts.size < 0.55 * n:
+    lengths = np.diff(starts, append=same.size)
+    nats, ratio = rhythm(lengths[1:-1])
+    if nats < nats_of("held_samples"):
         return None
-    lengths = np.diff(starts, append=n)
-    inner = lengths[1:-1]
-    low, usual = np.quantile(inner, [0.05, 0.5], method="lower")
-    if usual < 2 or low <= 0.5 * usual:
-        return None
-    ratio = _period(inner, float(inner[inner <= 1.5 * usual].mean()), 3)
     times = np.maximum(1, np.rint(lengths / ratio)).astype(np.int64)
     run = np.repeat(np.arange(starts.size), times)
     place = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)
     rows = starts[run] + place * lengths[run] // times[run]
     apart = np.rint(np.diff(at[rows], prepend=at[rows[0]] - ratio) / ratio).astype(np.int64)
-    return Held(ratio, rows, np.maximum(0, apart - 1))
+    return Held(ratio, rows, np.maximum(0, apart - 1), nats)
 
 
 def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | None:
@@ -208,9 +189,10 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
     held reading does by chance alone."""
     n = same.size
     next_one = np.diff(at, prepend=at[0] - 2) == 1
-    share, chance = float(same[next_one].mean()), float(again[next_one].mean())
+    pairs = max(1, int(np.count_nonzero(next_one)))
+    share, chance = (int(np.count_nonzero(each & next_one)) / pairs for each in (same, again))
     excess, sd = share - chance, math.sqrt((share + chance) / n)
-    if excess < max(SHARE_LEAST, REPEATS_LEAST / n, math.sqrt(2.0 * nats_of("held_samples")) * sd):
+    if excess < max(SHARE_LEAST, math.sqrt(2.0 * nats_of("held_samples")) * sd):
         return None
     x = np.where(next_one, same - share, 0.0)
     size = min(n, HEAD)
@@ -224,7 +206,8 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
     least = round(SHARE_LEAST * grid.size)
     most = round(min(0.5, (excess + 3.0 * sd) / (1.0 - chance) / ONE_EACH) * grid.size)
     top = least + int(np.argmax(power[least : most + 1]))
-    if power[top] < (math.log(size) + nats_of("held_samples")) * mean:
+    nats = float(power[top]) / mean - math.log(size)
+    if nats < nats_of("held_samples"):
         return None
     frequency = top / grid.size
     block = max(256, math.ceil(size * IN_BLOCK * mean / float(power[top])))
@@ -257,7 +240,7 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
         equal = np.flatnonzero((missing > 0) & (np.diff(rows, prepend=0) > 1))
         missing[equal] -= 1
         rows, missing = np.insert(rows, equal, rows[equal] - 1), np.insert(missing, equal, 0)
-    return Held(ratio, rows, missing)
+    return Held(ratio, rows, missing, nats)
 
 
 def _now_and_then(same: Mask, again: Mask, at: Rows) -> Held | None:
@@ -268,9 +251,13 @@ def _now_and_then(same: Mask, again: Mask, at: Rows) -> Held | None:
     lengths = np.diff(starts, append=n)
     repeats = same & np.repeat(lengths <= RUN_MOST, lengths)
     share, chance = float(repeats.mean()), float((again & ~same).mean())
-    if share < max(SHARE_LEAST, REPEATS_LEAST / n, 10.0 * chance) or chance > CHANCE:
+    if share < max(SHARE_LEAST, 10.0 * chance) or chance > CHANCE:
+        return None
+    expected = max(chance, 1.0 / n)
+    nats = n * (share * math.log(share / expected) - share + expected)
+    if nats < nats_of("held_samples"):
         return None
     rows = np.flatnonzero(~repeats)
     ratio = n / rows.size
     unasked = np.diff(at[rows] - rows, prepend=at[rows[0]] - rows[0])
-    return Held(ratio, rows, np.rint(unasked / ratio).astype(np.int64), even=False)
+    return Held(ratio, rows, np.rint(unasked / ratio).astype(np.int64), nats, even=False)

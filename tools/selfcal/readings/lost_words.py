@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from selfcal.base.grid import Array, Mask, equal_runs
+from selfcal.base.grid import Array, Mask
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import CHANGED_LEAST, Misread, noise_beside
 from selfcal.readings.lattice import step_of
@@ -72,7 +72,7 @@ def recurring_of(values: Array, explained: Misread | None) -> Recurring | None:
 def _alone(y: Array, sigma: float, spacing: float) -> tuple[float, float]:
     """The value that comes most often beside the others within the noise `sigma` of it, which readings [n] have about
     once each, and its evidence in nats. `spacing` of the values."""
-    value, counts = np.unique(y[_no_stuck(y)], return_counts=True)
+    value, counts = np.unique(y, return_counts=True)
     total, reach = np.concatenate([[0], np.cumsum(counts)]), max(sigma, 2.5 * spacing)
     first, last = np.searchsorted(value, value - reach), np.searchsorted(value, value + reach, "right")
     expected = 0.5 + (total[last] - total[first] - counts) / np.maximum(1, last - first - 1)
@@ -111,13 +111,3 @@ def is_limit(others: Array, value: float, count: int, step: float) -> bool:
     distance = np.abs(others - value)
     close = int(np.count_nonzero(distance < max(CLOSE * float(others.std()), 1.5 * step)))
     return close > min(CLOSE_OWN * count, CLOSE_OTHERS * others.size)
-
-
-def _no_stuck(y: Array) -> Mask:
-    """Readings [n] less the repeats of runs that are no chance, if the commonest reading is a chance one."""
-    starts, lengths = equal_runs(y)
-    commonest = float(np.unique(y, return_counts=True)[1].max()) / y.size
-    stuck = lengths > 2 + math.log(1e-3 / y.size) / math.log(min(commonest, 0.99))
-    kept = np.repeat(~stuck, lengths)
-    kept[starts] = True
-    return kept

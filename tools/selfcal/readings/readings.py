@@ -199,24 +199,23 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if beyond > BEYOND_MOST and near:
         values = sound = np.clip(values, -group.range, group.range)
     lattice = lattice_of(_known(sound), recording.rate_hz)
+    stuck, nats = _stuck(sound, lattice, group.stuck_limit)
+    new = np.where(stuck, np.nan, sound) if stuck.any() else sound  # held ones have more of the codes that were held
     uneven = explained = None
     if misread is None and (lattice is None or not lattice.carried):
-        explained = misread_of(sound, lattice)
-        held_rows = _stuck(sound, lattice, group.stuck_limit)[0] if explained is not None else none
-        if held_rows.any():  # held readings have more of the codes that were held
-            explained = misread_of(np.where(held_rows, np.nan, sound), lattice)
+        explained = misread_of(new, lattice)
         if explained is not None and explained.kind in UNEVEN:
             uneven = explained
         elif explained is not None and explained.kind not in ELSEWHERE:
             misread = explained
     # The codes of a counter recur; a dead band takes its counts from its neighbours.
     counter = lattice is not None and lattice.carried > 0.0
-    recurring = None if misread or uneven or counter else recurring_of(sound, explained)
+    recurring = None if misread or uneven or counter else recurring_of(new, explained)
     lost = none if recurring is None else recurring.mask
     if lost.any():
         sound = np.where(lost, np.nan, sound)
         lattice = lattice_of(_known(sound), recording.rate_hz)
-    stuck, nats = _stuck(sound, lattice, group.stuck_limit)
+        stuck, nats = _stuck(sound, lattice, group.stuck_limit)
     if stuck.any():
         sound = np.where(stuck, np.nan, sound)
     stretches = tuple(slower(sound))
@@ -500,7 +499,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     cells = Cells(y, step)
     plain, limits, total = cells.fit(cells.own), dict[float, Mask](), 0.0
     for side, edge, at_edge in zip((1, -1), edges, at_edges, strict=True):
-        nats = cells.fit(cells.limit(side)).one - plain.one
+        nats = cells.fit(cells.limit(side)).over(plain)
         count = int(at_edge.sum())
         if count < 3 or nats < nats_of("saturation"):
             continue

@@ -3,7 +3,6 @@ these name."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -46,8 +45,8 @@ def _share(found: Misread | Recurring | None) -> float:
 
 
 def _held(readings: Readings) -> float:
-    certain = readings.held is not None and not readings.held.even
-    return sum(one.nats for one in readings.slower) + math.log(100.0) * readings.values.size * certain
+    always = 0.0 if readings.held is None or readings.held.even else readings.held.nats
+    return always + sum(one.nats for one in readings.slower)
 
 
 _OF_READINGS: Mapping[str, tuple[Callable[[Readings], float], Callable[[Readings], Mask | float]]] = {
