@@ -347,8 +347,8 @@ def ln_looks(bend: Array, gain: float) -> float:
 class Look:
     """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
     interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be. `measure`: sizes
-    beside a model that lacks the look's columns alone. `before`: the state less earlier columns of its channel, which
-    it takes the place of. `shape`: of its columns, `rivals`: other forms of it that are as likely."""
+    beside a model that lacks the look's columns alone. `shape`: of its columns, `rivals`: other forms of it that are as
+    likely."""
 
     cause: str
     gain: float
@@ -359,7 +359,6 @@ class Look:
     shown_by: str = ""
     others: tuple[str, ...] = ()
     measure: Callable[[State], Mapping[str, Any]] | None = None
-    before: State | None = None
     shape: Shape | None = None
     rivals: tuple[Shape, ...] = ()
 
