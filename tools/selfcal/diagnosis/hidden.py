@@ -39,8 +39,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: Name of the quantity in the document.
 ID = "hidden_input"
-#: Samples of which an error ahead is taken, at least.
-LEAST = 60
 #: Correlation times that the search begins at.
 LN_LOOKS = math.log(2.0)
 #: Jumps that are named at most.
@@ -200,7 +198,7 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
         steps = max(1, round(horizon / hidden.dt))
         read = hidden.y[axis, half + steps - 1 :]
         errors = [ahead(model, one, steps)[half : half + read.size, axis] - read for model, one in (before, after)]
-        row = error_entry(factor * errors[0], factor * errors[1], LEAST)
+        row = error_entry(factor * errors[0], factor * errors[1])
         if row is not None:
             rmse[f"{horizon:g}"] = row
     level = float(scores[0].mean()) - math.log(factor)

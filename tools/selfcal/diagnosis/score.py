@@ -200,7 +200,7 @@ def _errors(
     for horizon, places in horizons.items():
         first = places + _ahead(horizon, state.dt) - 1
         read = np.array([_mean(state.y[at : at + window]) for at in first])
-        row = error_entry(old[1][horizon] - read, new[1][horizon] - read, 10)
+        row = error_entry(old[1][horizon] - read, new[1][horizon] - read)
         if row is not None:
             found[f"{horizon:g}"] = row
     return found

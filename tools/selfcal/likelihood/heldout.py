@@ -15,8 +15,6 @@ from selfcal.likelihood.statemodel import Array
 HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
 #: Pieces of the held-out time whose scatter gives the uncertainty.
 PIECES = 24
-#: The same of errors of the bias ahead.
-ERROR_PIECES = 8
 #: A finding whose gain lies so many standard deviations below 0 is none.
 HARM_SD = 2.0
 
@@ -44,15 +42,15 @@ def spread(steps: Array) -> float:
     return float(np.std(steps, ddof=1)) / math.sqrt(len(steps))
 
 
-def error_entry(before: Array, after: Array, least: int) -> dict[str, float] | None:
-    """Root mean squares of two errors [n] at the same places, and the deviation of their difference; None: fewer than
-    `least` are known."""
+def error_entry(before: Array, after: Array) -> dict[str, float] | None:
+    """Root mean squares of two errors [n] at the same places, and the deviation of their difference, by pieces three
+    times as long: they last longer. None: fewer are known than a score has pieces."""
     good = np.isfinite(before) & np.isfinite(after)
-    if good.sum() < least:
+    if good.sum() < PIECES:
         return None
     squares = [error[good] ** 2 for error in (before, after)]
     rms = [math.sqrt(float(each.mean())) for each in squares]
-    first, second = (np.array([part.mean() for part in np.array_split(each, ERROR_PIECES)]) for each in squares)
+    first, second = (np.array([part.mean() for part in np.array_split(each, PIECES // 3)]) for each in squares)
     return {"before": rms[0], "after": rms[1], "sd": spread(second - first) / max(sum(rms), 1e-300)}
 
 

@@ -28,8 +28,6 @@ AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)
 DWELLS = (15.0, 50.0, 150.0, 450.0)
 #: The drift without levels, so that both are judged by one filter: ln of walk and white noise over the fitted ones.
 WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
-#: How far from those tried first the likeliest logarithms may lie.
-REACH = 3.0
 #: Share of samples of another noise level at most: gaps have some, a change of the noise has more.
 UNEVEN_MOST = 0.05
 #: Places of a dwell time's posterior.
@@ -175,8 +173,8 @@ def _law(state: State) -> float:
 
 def _best(y: Array, middle: Array) -> tuple[Array, float]:
     """The likeliest parameters from `middle` on, and their ln likelihood."""
-    limits = np.exp(middle[:, None] + np.array([-REACH, REACH]))
-    theta = np.log(top(lambda some: switching(y, np.log(some))[0], np.exp(middle).tolist(), limits))
+    unbounded = np.tile([LEAST, 1.0 / LEAST], (middle.size, 1))
+    theta = np.log(top(lambda some: switching(y, np.log(some))[0], np.exp(middle).tolist(), unbounded))
     return theta, float(switching(y, theta[None])[0][0])
 
 
