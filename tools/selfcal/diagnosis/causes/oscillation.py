@@ -14,13 +14,15 @@ import numpy as np
 
 from selfcal.diagnosis import swing
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
+from selfcal.diagnosis.causes import periodic
 from selfcal.diagnosis.finding import Finding
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import states_of
+from selfcal.diagnosis.swing import Swing
 from selfcal.likelihood.fit import Fit
-from selfcal.likelihood.state import ALIKE, Look, State, of_parameter
-from selfcal.likelihood.statemodel import Array, Matrices
+from selfcal.likelihood.state import ALIKE, Look, State, net, of_parameter
+from selfcal.likelihood.statemodel import PERIOD_LIMITS, Array, Matrices
 from selfcal.model.file import Model
 from selfcal.model.laws import DAMPING_LIMITS, RATIO_LIMITS
 from selfcal.model.laws import swing as turned
@@ -34,12 +36,28 @@ def looks(state: State, record: Record) -> list[Look]:
     found = None if state.extras.oscillation else swing.found(state, slow=True)
     if found is None:
         return []
+    line = _line(state, record, found) if found.keeps_phase else []
+    if line:
+        return line
     changes, unit = {"extras": replace(state.extras, oscillation=True), "fits": found.fits}, state.unit
     sizes = _sizes(found.fit, unit)
-    # A line has no damping: where the record does not show one, the line comes first of what is as likely.
-    worth = found.net - 0.5 * ALIKE * found.keeps_phase
-    look = Look("oscillation", found.gain, worth, sizes, changes)
+    look = Look("oscillation", found.gain, found.net, sizes, changes)
     return [replace(look, measure=lambda final: _sizes(final.best, unit))]
+
+
+def _line(state: State, record: Record, found: Swing) -> list[Look]:
+    """The line of this period where it explains as much: swings that keep their phase over the whole record have no
+    damping. Of the band in which oscillations are looked for."""
+    period, _, _ = found.numbers
+    width = 1.0 / (state.y.size * state.dt)
+    tried = (1.0 / period + width * np.linspace(-1.0, 1.0, 17)).tolist()
+    gains = state.scores([np.array([*periodic.pair(f, record).values()]) for f in tried])
+    line = periodic.at(state, record, (tried[int(np.argmax(gains))],))
+    if line.gain < found.gain - ALIKE:
+        return []
+    n = round(2.0 * state.y.size * state.dt / PERIOD_LIMITS[0])
+    price = float(periodic.ln_lines(np.array(1.0 / (period * width)), n, np.array(line.gain)))
+    return [replace(line, net=net(line.gain, 2, price), others=("oscillation",))]
 
 
 def _sizes(chosen: Fit, unit: str) -> dict[str, Any]:
