@@ -7,7 +7,6 @@ is weighed anew under its prior. Each finding is left out of the model with all 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -25,7 +24,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import regressor_key
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.heldout import HeldOut
+from selfcal.likelihood.heldout import HeldOut, score_entry, spread
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import Model, Regressor
@@ -71,31 +70,29 @@ def _of_axis(
         none = HeldOut(None, f"{second.path} has no axis {name}")
         return [none] * len(findings), none
     extended: dict[str, Regressor] = {one.name: one for one in Model.of_tree(tree, model.path).regressors}
-    terms: dict[int, Term] = {}
-    results: dict[int, HeldOut] = {}
-    for k, finding in enumerate(findings):
-        term = why_stays(finding) or term_of(found[name], finding, extended)
-        if isinstance(term, str):
-            results[k] = HeldOut(None, term)
-        else:
-            terms[k] = term
+    terms = [why_stays(one) or term_of(found[name], one, extended) for one in findings]
+    carried = [term for term in terms if isinstance(term, Term)]
+    if not carried:
+        return [HeldOut(None, str(term)) for term in terms], HeldOut(None, "no finding is in the bank's model")
     try:
         readings = look(second.along(name), name, model.group_of(name))
-        if not terms:
-            return [results[k] for k in range(len(findings))], HeldOut(None, "no finding is in the bank's model")
-        whole = _evidence(model, record, found, name, readings, [*terms.values()])
-        together = HeldOut(_compared(_evidence(model, record, found, name, readings, []), whole))
-        for k, term in terms.items():
-            try:
-                others = [one for one in terms.values() if one is not term]
-                without = _evidence(model, record, found, name, readings, others)
-                results[k] = HeldOut(_compared(without, whole))
-            except UserError as error:
-                results[k] = HeldOut(None, str(error))
+        whole = _evidence(model, record, found, name, readings, carried)
     except UserError as error:
         none = HeldOut(None, str(error))
-        return [results.get(k, none) for k in range(len(findings))], none
-    return [results[k] for k in range(len(findings))], together
+        return [HeldOut(None, term) if isinstance(term, str) else none for term in terms], none
+
+    def gained(others: Sequence[Term]) -> HeldOut:
+        """By all terms over the `others`."""
+        try:
+            return HeldOut(_compared(_evidence(model, record, found, name, readings, others), whole))
+        except UserError as error:
+            return HeldOut(None, str(error))
+
+    each = [
+        HeldOut(None, term) if isinstance(term, str) else gained([one for one in carried if one is not term])
+        for term in terms
+    ]
+    return each, gained([])
 
 
 def why_stays(finding: Finding) -> str:
@@ -188,11 +185,4 @@ def _compared(without: Array, whole: Array) -> dict[str, Any]:
         raise UserError("the bank takes other samples with the finding than without")
     n = whole[0]
     steps = np.diff(whole[1] - without[1]) / np.maximum(np.diff(n), 1.0)
-    return {
-        "log_score_per_sample": {
-            "before": float(without[1, -1] / n[-1]),
-            "after": float(whole[1, -1] / n[-1]),
-            "sd": float(steps.std(ddof=1)) / math.sqrt(steps.size),
-            "samples": int(n[-1]),
-        }
-    }
+    return score_entry(float(without[1, -1] / n[-1]), float(whole[1, -1] / n[-1]), spread(steps), n[-1])

@@ -20,6 +20,7 @@ from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.score import gain, inflation
 from selfcal.diagnosis.separate import next_record
+from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.state import Look, State
 from selfcal.logs.recording import SIDE_CHANNELS, Recording
 from selfcal.model.regressors import coefficient_unit
@@ -73,25 +74,16 @@ def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Find
         "not_found": _not_found(one, record, factor, unit),
         "not_judged": _not_judged(one, record),
         "discrepancies": [
-            {
-                "statistic": row.name,
-                "measured": row.measured,
-                "simulated_q005": row.q005,
-                "simulated_q995": row.q995,
-                "p": row.p,
-                "after": None
-                if row.name not in after
-                else {
-                    "measured": after[row.name].measured,
-                    "simulated_q005": after[row.name].q005,
-                    "simulated_q995": after[row.name].q995,
-                    "p": after[row.name].p,
-                },
-            }
+            {"statistic": row.name, **_band(row), "after": _band(after[row.name]) if row.name in after else None}
             for row in one.before
             if not row.q005 <= row.measured <= row.q995
         ],
     }
+
+
+def _band(row: Statistic) -> dict[str, float]:
+    """A statistic beside its simulated band."""
+    return {"measured": row.measured, "simulated_q005": row.q005, "simulated_q995": row.q995, "p": row.p}
 
 
 def _finding(finding: Finding, record: Record, factor: float, unit: str, final: State) -> dict[str, Any]:

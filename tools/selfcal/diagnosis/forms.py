@@ -38,8 +38,6 @@ FORMS = ("static", "lag", "rate", "square", "first_order", "cube", "play", "free
 PARTS = {"square": ("static", "square"), "cube": ("static", "square", "cube"), "first_order": ("static", "lag")}
 #: Forms with a time constant of a lag.
 LATE = ("lag", "first_order")
-#: Forms that `first_order` is a sum of.
-FIRST_ORDER = ("static", "lag", "rate")
 #: Estimate key of a column's coefficient; of all others `coefficient`.
 KEYS = {"rate": "rate", "square": "square", "cube": "cube"}
 #: Widths of the means that a channel is smoothed by, s: its own noise and lattice would hide what it does. The model
@@ -260,6 +258,7 @@ def _differs(column: Array, plain: Array, spread: float) -> bool:
 
 
 def _look(state: State, channel: Channel) -> list[Look]:
+    """The look at the best form, its size that of the channel without noise of its own."""
     found = columns.tried(state, list(shapes_of(channel, state)), slow=channel.slow)
     if not found or max(one.net for one in found.values()) < 1.0:
         return []
@@ -282,18 +281,10 @@ def _look(state: State, channel: Channel) -> list[Look]:
             return []
     rivals = tuple(one.shape for one in alike if one.shape.form != chosen.shape.form)
     chosen = curve.best(state, chosen, chosen.shape.regressors[0].values) if chosen.shape.form == FREE else chosen
-    before, chosen = _whole(state, channel, chosen)
-    if before is state:
-        return [_of_shape(state, channel, chosen, rivals)]
-    return [replace(_of_shape(before, channel, chosen), before=before)]
-
-
-def _of_shape(state: State, channel: Channel, chosen: Tried, rivals: tuple[Shape, ...] = ()) -> Look:
-    """The look at a form; of a channel with noise of its own the size is of the channel without it."""
     more = {"form_also_possible": [one.form for one in rivals]} if rivals else {}
     shape = replace(chosen.shape, stated={**chosen.shape.stated, **more})
-    found = replace(columns.look(state, channel.cause, replace(chosen, shape=shape)), rivals=rivals)
-    return replace(found, measure=partial(_noiseless, channel, shape)) if channel.noisy else found
+    look = replace(columns.look(state, channel.cause, replace(chosen, shape=shape)), rivals=rivals)
+    return [replace(look, measure=partial(_noiseless, channel, shape)) if channel.noisy else look]
 
 
 def _noiseless(channel: Channel, shape: Shape, state: State) -> dict[str, Any]:
@@ -304,26 +295,6 @@ def _noiseless(channel: Channel, shape: Shape, state: State) -> dict[str, Any]:
     (key, _), window = shape.keys[0], max(1, round(float(shape.regressors[0].entry.get("window_s", 0.0)) / state.dt))
     kept = _kept(state, shape.columns[0], channel, window)
     return {key: {part: value / kept if part != "unit" else value for part, value in sizes[key].items()}}
-
-
-def _whole(state: State, channel: Channel, chosen: Tried) -> tuple[State, Tried]:
-    """`first_order` in the place of its parts that were found and the one chosen, if it explains no less than they
-    together, and the state without; else both as they are. A column of the model file, whose entry here has no unit,
-    stays."""
-    parts = {(channel.column, channel.input, part) for part in FIRST_ORDER}
-    own = {one.name for one in state.regressors if form_of(one) in parts and "unit" in one.entry}
-    if not own or chosen.shape.form not in FIRST_ORDER or "first_order" not in channel.forms:
-        return state, chosen
-    before = state.without(own).refit()
-    found = columns.tried(before, list(shapes_of(replace(channel, forms=("first_order",)), before)), slow=channel.slow)
-    if not found:
-        return state, chosen
-    whole = found["first_order"]
-    gain = before.best.ln_likelihood + whole.gain - state.best.ln_likelihood
-    if gain < chosen.gain:
-        return state, chosen
-    price = replace(whole.shape, price=chosen.shape.price, free=chosen.shape.free)
-    return before, replace(whole, gain=gain, shape=price)
 
 
 def _constant(state: State, one: Tried) -> bool:

@@ -19,7 +19,7 @@ from selfcal.base import units as unit_module
 from selfcal.base.grid import half_means, regridded
 from selfcal.diagnosis.model_tree import digits
 from selfcal.likelihood.fit import best
-from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES, in_sd
+from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES, error_entry, in_sd, score_entry, spread
 from selfcal.likelihood.joint import (
     LEAST_AXES,
     LINE,
@@ -39,8 +39,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: Name of the quantity in the document.
 ID = "hidden_input"
-#: Samples of which an error ahead is taken, at least.
-LEAST = 60
 #: Correlation times that the search begins at.
 LN_LOOKS = math.log(2.0)
 #: Jumps that are named at most.
@@ -193,31 +191,19 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
     axis, half = hidden.names.index(name), hidden.y.shape[1] // 2
     scores = np.array([one.scores()[half:, axis] for _, one in (before, after)])
     scores = scores[:, np.isfinite(scores).all(axis=0)]
-    pieces = [part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]
+    sd = spread(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]))
     factor *= float(hidden.scale[axis])
     rmse: dict[str, dict[str, float]] = {}
     for horizon in HORIZONS_S:
         steps = max(1, round(horizon / hidden.dt))
         read = hidden.y[axis, half + steps - 1 :]
         errors = [ahead(model, one, steps)[half : half + read.size, axis] - read for model, one in (before, after)]
-        good = np.isfinite(errors[0]) & np.isfinite(errors[1])
-        if good.sum() < LEAST:
-            continue
-        rms = [factor * math.sqrt(float((error[good] ** 2).mean())) for error in errors]
-        parts = np.array([[part.mean() for part in np.array_split(error[good] ** 2, 8)] for error in errors])
-        sd = factor**2 * float(np.std(parts[1] - parts[0], ddof=1)) / math.sqrt(8.0) / max(sum(rms), 1e-300)
-        rmse[f"{horizon:g}"] = {"before": rms[0], "after": rms[1], "sd": sd}
+        row = error_entry(factor * errors[0], factor * errors[1])
+        if row is not None:
+            rmse[f"{horizon:g}"] = row
     level = float(scores[0].mean()) - math.log(factor)
     more = float((scores[1] - scores[0]).mean())
-    return {
-        "log_score_per_sample": {
-            "before": level,
-            "after": level + more,
-            "sd": float(np.std(pieces, ddof=1)) / math.sqrt(PIECES),
-            "samples": scores.shape[1],
-        },
-        "bias_rmse": {"unit": unit, "horizon_s": rmse},
-    }
+    return score_entry(level, level + more, sd, scores.shape[1]) | {"bias_rmse": {"unit": unit, "horizon_s": rmse}}
 
 
 def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str], start_s: float) -> dict[str, Any]:
@@ -276,11 +262,9 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     scores = [np.nansum(side.scores(), axis=1) for side in before_after]
     more = before_after[1].ln_likelihood - before_after[0].ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())
-    pieces = [part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]
-    sd = float(np.std(pieces, ddof=1)) / math.sqrt(PIECES)
+    sd = spread(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]))
     before = float(scores[0].mean())
-    score = {"before": before, "after": before + more / n, "sd": sd, "samples": int(n)}
-    return {"log_score_per_sample": score}
+    return score_entry(before, before + more / n, sd, n)
 
 
 def extend(tree: dict[str, Any], hidden: Hidden) -> None:

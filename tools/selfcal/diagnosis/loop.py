@@ -386,8 +386,7 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
             best = next((look for look in looks if look.cause in record.channels), looks[0])
             best = best if best.net > looks[0].net - ALIKE else looks[0]
             after = one.state.refit(**best.changes)
-            before = best.before or one.state
-            known = score.gain(best, before, after, record)
+            known = score.gain(best, one.state, after, record)
             harms = _refuted(best, known)
             if harms:
                 (one.dropped if _free(best) else one.harmful).append(best)
@@ -396,12 +395,8 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
         idle = idle | set(waiting) if len(causes_of) >= BUSY else set()
         rivals = tuple(look for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
         possible = tuple(dict.fromkeys(look.cause for look in rivals))
+        one.findings.append(Finding(best, number, one.state, after, possible, rivals, held_out=known))
         one.state = after
-        replaced = [finding for finding in one.findings if _gone(finding, after)]
-        best = replace(best, gain=best.gain + sum(finding.look.gain for finding in replaced))
-        best = replace(best, net=best.net + sum(finding.look.net for finding in replaced))
-        one.findings = [finding for finding in one.findings if not _gone(finding, after)]
-        one.findings.append(Finding(best, number, before, after, possible, rivals, held_out=known))
         number += 1
 
 
@@ -417,14 +412,6 @@ def _refuted(look: Look, held_out: HeldOut | None) -> bool:
     if _free(look):
         return held_out is None or held_out.gain is None or in_sd([held_out.gain]) <= 0.0
     return held_out is not None and held_out.harms
-
-
-def _gone(finding: Finding, state: State) -> bool:
-    """Whether a later finding took the place of this one's columns."""
-    kept = {id(column) for column in state.regressors}
-    return (
-        finding.record is None and bool(finding.columns) and not any(id(column) in kept for column in finding.columns)
-    )
 
 
 def _looked(one: Diagnosed, record: Record, causes: Sequence[Looks]) -> tuple[list[Look], set[Looks]]:

@@ -21,7 +21,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import passed, run
-from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut
+from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut, error_entry, score_entry, spread
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
 
@@ -91,8 +91,9 @@ def gain(
         first = split + min(int(np.argmax(column[split:] != 0.0)) for column in added)
         piece = int(np.searchsorted(cut.edges, first, "right")) - 1
         later[piece] -= max(0.0, look.gain - look.net) / cut.sizes[piece]
-    sd = float((later - scores).std(ddof=1)) / math.sqrt(PIECES)
-    return _held_out(cut, scores, later, sd, before.unit, _errors(after, old, new, cut.marks, horizons))
+    return _held_out(
+        cut, scores, later, spread(later - scores), before.unit, _errors(after, old, new, cut.marks, horizons)
+    )
 
 
 def _held_out(
@@ -100,17 +101,8 @@ def _held_out(
 ) -> HeldOut:
     """From the scores of the pieces."""
     share = cut.sizes / cut.sizes.sum()
-    return HeldOut(
-        {
-            "log_score_per_sample": {
-                "before": float(before @ share),
-                "after": float(after @ share),
-                "sd": sd,
-                "samples": int(cut.sizes.sum()),
-            },
-            "bias_rmse": {"unit": unit, "horizon_s": ahead},
-        }
-    )
+    entry = score_entry(float(before @ share), float(after @ share), sd, cut.sizes.sum())
+    return HeldOut({**entry, "bias_rmse": {"unit": unit, "horizon_s": ahead}})
 
 
 def _cut(before: State, after: State, split: int) -> Cut | None:
@@ -175,7 +167,8 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
     """The model of a state: a sum over nodes of the drift, with the weights that the samples before a mark leave them.
 
     The nodes are what the whole record leaves possible."""
-    series, prior, window, nodes = state.series, _prior(state), _window(state.dt), list(state.drifts())
+    series, prior, window = state.series, _prior(state), _window(state.dt)
+    nodes = list(state.possible(state.none, rich=False))
     ln_evidence = np.empty((len(nodes), marks.size))
     bias = {horizon: np.empty((len(nodes), places.size)) for horizon, places in horizons.items()}
     total = np.cumsum(np.pad(series.columns, ((0, 0), (1, 0))), axis=1)
@@ -207,15 +200,9 @@ def _errors(
     for horizon, places in horizons.items():
         first = places + _ahead(horizon, state.dt) - 1
         read = np.array([_mean(state.y[at : at + window]) for at in first])
-        errors = [squares[horizon] - read for _, squares in (old, new)]
-        good = np.isfinite(errors[0]) & np.isfinite(errors[1])
-        if good.sum() < 10:
-            continue
-        square = [error[good] ** 2 for error in errors]
-        rms = [math.sqrt(float(squares.mean())) for squares in square]
-        pieces = np.array([[part.mean() for part in np.array_split(squares, 8)] for squares in square])
-        spread = float(np.std(pieces[1] - pieces[0], ddof=1)) / math.sqrt(8) / max(rms[0] + rms[1], 1e-300)
-        found[f"{horizon:g}"] = {"before": rms[0], "after": rms[1], "sd": spread}
+        row = error_entry(old[1][horizon] - read, new[1][horizon] - read)
+        if row is not None:
+            found[f"{horizon:g}"] = row
     return found
 
 

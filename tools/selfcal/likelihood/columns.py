@@ -318,26 +318,15 @@ def nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Arra
     if not m:
         return np.empty((1, 0)), np.empty((0, 0))
     best = scores(np.exp(middle)[None])[:, 0]
-    reach = np.full(m, REACH_FIRST)
+    reach, steps = np.full(m, REACH_FIRST), np.eye(m)
     for _ in range(REACHES):
         moved = np.clip(middle + np.vstack([np.diag(reach), -np.diag(reach)]), *limits.T)
-        fall = best[0] - scores(np.exp(moved))[0].reshape(2, m).max(axis=0)
-        if np.all(fall > 0.3):
+        falls = best[0] - scores(np.exp(moved))[0].reshape(2, m)
+        steps = np.diag(NODE * reach / np.sqrt(np.maximum(2.0 * falls.mean(axis=0), 0.1)))
+        flat = falls.min(axis=0) <= 0.3
+        if not flat.any():
             break
-        reach = np.where(fall > 0.3, reach, 1.6 * reach)
-    stencil = np.array(list(product((-1.0, 0.0, 1.0), repeat=m)))
-    values = scores(np.exp(np.clip(middle + stencil * reach, *limits.T)))[0]
-    # A parabola through the stencil.
-    pairs = [(i, j) for i in range(m) for j in range(i, m)]
-    products = [stencil[:, i] * stencil[:, j] for i, j in pairs]
-    design = np.column_stack([np.ones(len(stencil)), stencil, *products])
-    bend = np.linalg.lstsq(design, values, rcond=None)[0][1 + m :]
-    curvature = np.zeros((m, m))
-    for (i, j), value in zip(pairs, bend, strict=True):
-        curvature[i, j] -= value
-        curvature[j, i] -= value
-    sizes, ways = np.linalg.eigh(curvature)
-    steps = NODE * (reach[:, None] * ways) / np.sqrt(np.maximum(sizes, 0.1))
+        reach = np.where(flat, 1.6 * reach, reach)
     found: dict[tuple[int, ...], Array] = {}
     seen = waiting = {(0,) * m}
     while waiting and len(found) < NODES_MOST:

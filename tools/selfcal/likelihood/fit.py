@@ -41,9 +41,8 @@ NEAR = 1e-4
 TOGETHER = 4
 #: Steps of a fit at most, how far one goes at most in any parameter, and how much shorter one is that went too far.
 STEPS, FARTHEST, SHORTER = 40, 3.0, 0.25
-#: A step that promises less than this share of `ftol` is not taken. Its curvature is taken as other than expected by
-#: this factor at most.
-SETTLED, BENT_MOST = 0.2, 20.0
+#: A step that promises less than this share of `ftol` is not taken.
+SETTLED = 0.2
 #: A size of less information than this may as well be nothing: its standard deviation is a factor of two.
 WEAK = 2.0
 #: Drifts that are nothing below a size, and where they are then looked for.
@@ -396,7 +395,6 @@ def _climbed(series: Series, here: Fit) -> Fit:
     low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
     size = np.array([name in SIZES for name in terms.names])
     reach = FARTHEST
-    before: tuple[Array, Array] | None = None
     for _ in range(STEPS):
         slope, information = slopes(series, here)
         here = replace(here, information=information)
@@ -404,7 +402,6 @@ def _climbed(series: Series, here: Fit) -> Fit:
             return here
         weak = size & (np.diag(information) < WEAK)
         falling = weak & (slope < -2.0 * SETTLED * series.ftol) & (here.theta > low)
-        information = _bent(size, information, before, slope)
         while True:
             move, gain = _move(size, slope, information, low - here.theta, high - here.theta, reach)
             if gain >= SETTLED * series.ftol:
@@ -419,31 +416,13 @@ def _climbed(series: Series, here: Fit) -> Fit:
             if more > 0.0:
                 break
             reach *= SHORTER
-        before, here = (move, slope), replace(there, information=here.information)
+        here = replace(there, information=here.information)
         # A small gain that came as promised, by a step that nothing has shortened, was the last one.
         whole = float(np.abs(move).max()) < 0.4 * reach and not (weak & (slope < 0.0)).any()
         if whole and gain < 3.0 * series.ftol and abs(more - gain) < 0.2 * gain:
             break
         reach = min(FARTHEST, reach / SHORTER)
     return here
-
-
-def _bent(size: Mask, information: Array, before: tuple[Array, Array] | None, slope: Array) -> Array:
-    """The information with the curvature that the last step has shown along itself: a model that is wrong has another.
-
-    `size`: whether each parameter is one. `before`: that step, and the slope at its start."""
-    if before is None:
-        return information
-    move, was = before
-    fallen = size & (move < 0.0)
-    step = np.where(fallen, -0.5 * np.expm1(-2.0 * np.where(fallen, move, 0.0)), move)
-    along = information @ step
-    expected, shown = float(step @ along), float(step @ (np.where(fallen, np.exp(2.0 * move), 1.0) * was - slope))
-    if not 0.0 < shown < math.inf or expected <= 0.0:
-        return information
-    share = min(max(shown / expected, 1.0 / BENT_MOST), BENT_MOST)
-    bent: Array = information + (share - 1.0) / expected * np.outer(along, along)
-    return bent
 
 
 def _move(size: Mask, slope: Array, information: Array, low: Array, high: Array, reach: float) -> tuple[Array, float]:
@@ -464,33 +443,22 @@ def _move(size: Mask, slope: Array, information: Array, low: Array, high: Array,
 
 
 def _highest(slope: Array, information: Array, bounds: Array) -> tuple[Array, float]:
-    """Where slope x - x information x / 2 is highest between `bounds` [2, k], which hold 0, and how high."""
-    k = slope.size
-    x = np.zeros(k)
-    held = np.zeros(k, bool)
-    curvature = information + 1e-12 * np.diag(np.diag(information)) + 1e-300 * np.eye(k)
-    for _ in range(8 * k):
+    """Where slope x - x information x / 2 is highest between `bounds` [2, k], which hold 0, and how high. The first
+    number on the way that comes to a bound is held there, and the others go on."""
+    x, held = np.zeros(slope.size), np.zeros(slope.size, bool)
+    curvature = information + 1e-12 * np.diag(np.diag(information)) + 1e-300 * np.eye(slope.size)
+    while not held.all():
         free = ~held
-        if free.any():
-            ahead = x.copy()
-            left = slope[free] - curvature[np.ix_(free, held)] @ x[held]
-            ahead[free] = np.linalg.lstsq(curvature[np.ix_(free, free)], left, rcond=1e-14)[0]
-            way = ahead - x
-            bound = np.where(way > 0.0, bounds[1], bounds[0])
-            share = np.where(way != 0.0, (bound - x) / np.where(way != 0.0, way, 1.0), np.inf)
-            first = int(np.argmin(share))
-            if share[first] < 1.0:
-                x += max(0.0, share[first]) * way
-                x[first] = bound[first]
-                held[first] = True
-                continue
-            x = ahead
-        pull = slope - curvature @ x
-        inwards = np.where(x <= bounds[0], pull, -pull) * held
-        freed = int(np.argmax(inwards))
-        if inwards[freed] <= 1e-9 * float(np.abs(slope).max()):
+        way = np.zeros(slope.size)
+        left = slope[free] - curvature[free] @ x
+        way[free] = np.linalg.lstsq(curvature[np.ix_(free, free)], left, rcond=1e-14)[0]
+        room = np.where(way > 0.0, bounds[1], bounds[0]) - x
+        share = np.where(way != 0.0, room / np.where(way != 0.0, way, 1.0), np.inf)
+        first = int(np.argmin(share))
+        x = x + min(1.0, max(0.0, float(share[first]))) * way
+        if share[first] >= 1.0:
             break
-        held[freed] = False
+        held[first] = True
     return x, float(slope @ x - 0.5 * x @ curvature @ x)
 
 

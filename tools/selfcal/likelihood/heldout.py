@@ -7,6 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
+from selfcal.likelihood.statemodel import Array
+
 #: How far ahead the bias is predicted, s.
 HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
 #: Pieces of the held-out time whose scatter gives the uncertainty.
@@ -26,6 +30,28 @@ class HeldOut:
     def harms(self) -> bool:
         """Whether the finding predicts the rest of the record clearly worse."""
         return harmful([self])
+
+
+def score_entry(before: float, after: float, sd: float, samples: float) -> dict[str, Any]:
+    """The contract's entry of two log scores a sample and the deviation of their difference."""
+    return {"log_score_per_sample": {"before": before, "after": after, "sd": sd, "samples": int(samples)}}
+
+
+def spread(steps: Array) -> float:
+    """Standard deviation of the mean of pieces."""
+    return float(np.std(steps, ddof=1)) / math.sqrt(len(steps))
+
+
+def error_entry(before: Array, after: Array) -> dict[str, float] | None:
+    """Root mean squares of two errors [n] at the same places, and the deviation of their difference, by pieces three
+    times as long: they last longer. None: fewer are known than a score has pieces."""
+    good = np.isfinite(before) & np.isfinite(after)
+    if good.sum() < PIECES:
+        return None
+    squares = [error[good] ** 2 for error in (before, after)]
+    rms = [math.sqrt(float(each.mean())) for each in squares]
+    first, second = (np.array([part.mean() for part in np.array_split(each, PIECES // 3)]) for each in squares)
+    return {"before": rms[0], "after": rms[1], "sd": spread(second - first) / max(sum(rms), 1e-300)}
 
 
 def harmful(parts: Sequence[HeldOut]) -> bool:

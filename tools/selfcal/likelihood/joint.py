@@ -44,6 +44,8 @@ FASTEST_S = 10.0
 #: Prior standard deviations of ln sizes and ln rates about the middle of their limits: they keep what the record does
 #: not know from running away, and change ln likelihood by a few tenths elsewhere.
 PRIOR_SD = 3.0
+#: Standard deviations of a drift's ln size or ln rate, and of a loading over the white noise, about: units of a search.
+OF_DRIFT, OF_LOADING = 0.5, 0.1
 #: Widths of the size of a column, in its own standard deviations.
 WIDTHS = (1.0, 2.0, 4.0, 8.0, 16.0, 30.0)
 #: ln of the odds that an axis has a column which another one has, before its own readings: of axes without it, 1 in 100
@@ -216,35 +218,14 @@ class _Cost:
         S[:, np.arange(m), np.arange(m)] += own_drift * white**2
         return S, values, bends
 
-    def deviations(self, x: Array) -> Array:
-        """Standard deviation of each parameter if it alone were unknown, by Fisher's information.
-
-        A change of row and column i by z has the information 2 ((S^-1 z)_i^2 + z' S^-1 z (S^-1)_ii) in each bin."""
-        count, m = self.bins.count, self.m
-        own, root, lengths, loading, ln_rate = self.parts(x)
-        S, values, bends = self.spectra(own, root, loading, ln_rate)
-        Q, white, every = np.linalg.inv(S), np.exp(own[:, 0]), np.arange(m)
-        q = Q[:, every, every] * white**2
-        of_own = np.stack(
-            [
-                2.0 + 2.0 * S[:, every, every] * q / white**2,
-                (2.0 * np.exp(2.0 * own[:, 1]) * q) ** 2,
-                (2.0 * np.exp(2.0 * own[:, 2]) * values[:, :m] * q) ** 2,
-                (np.exp(2.0 * own[:, 2]) * bends[:, :m] * q) ** 2,
-            ],
-            axis=2,
+    @property
+    def units(self) -> Array:
+        """About how well a record knows each parameter."""
+        m, sharp = self.m, float(self.bins.count.sum()) ** -0.5
+        own = np.tile([sharp, *(OWN - 1) * [OF_DRIFT]], m)
+        return np.concatenate(
+            [own, np.full(m * (m - 1) // 2, sharp), *([m * [OF_LOADING], [OF_DRIFT]] if self.f else [])]
         )
-        row, column = _lower(m)
-        z = (root[:, column] - root[row, column] * (root @ root[row].T)) * white[:, None] / lengths[row]
-        z = np.column_stack([z, np.repeat((loading * white)[:, None], m, axis=1)])
-        at = np.append(row, every)
-        Qz = Q @ z
-        of_rows = 2.0 * ((Qz[:, at, np.arange(at.size)] * white[at]) ** 2 + (z * Qz).sum(axis=1) * q[:, at])
-        of_rows *= np.repeat([self.bins.white**2, values[:, m] ** 2], [row.size, m], axis=0).T
-        of_rate = (bends[:, m] * (z[:, -1] * Qz[:, :, -1]).sum(axis=1)) ** 2
-        known = [(count @ of_own.reshape(-1, m * OWN) + np.tile(self.weight, m)), count @ of_rows[:, : row.size]]
-        known += [count @ of_rows[:, row.size :], [count @ of_rate + 1.0 / PRIOR_SD**2]] if self.f else []
-        return np.asarray(1.0 / np.sqrt(np.maximum(np.concatenate(known), 1.0 / PRIOR_SD**2)))
 
     def __call__(self, x: Array) -> tuple[float, Array]:
         bins, m = self.bins, self.m
@@ -317,10 +298,10 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
 
 def _least(cost: _Cost, start: Array, bounds: Array) -> tuple[float, Array]:
     """The least cost within bounds [parameters, 2], and where it is. It is sought in units of how well each parameter
-    is known: else it takes five times as many steps."""
+    is known: else it takes four times as many steps."""
     from scipy.optimize import minimize  # a quarter of a second to import: for records of several axes alone
 
-    unit = cost.deviations(start)
+    unit = cost.units
 
     def scaled(z: Array) -> tuple[float, Array]:
         value, slope = cost(z * unit)

@@ -163,6 +163,11 @@ class State:
         """The fit of one drift with further columns [k, n]."""
         return _fit_from(self.series.beside(more), terms, self.fits)
 
+    @property
+    def none(self) -> Array:
+        """No further column [0, n]."""
+        return np.empty((0, self.y.size))
+
     def possible(self, more: Array, *, rich: bool) -> Iterator[tuple[Fit, Array, float]]:
         """The fit of every near drift with further columns [k, n], `rich`: of one of two terms as well. Of each the
         parameters that the record leaves possible, and ln of the share of those that they stand for."""
@@ -170,12 +175,9 @@ class State:
         fits = [self.fitted_with(terms, more) for terms in self.near()]
         if rich and not self.extras.flicker:
             fits.append(refit(series, self.rich))
-        yield from _nodes(series, fits)
-
-    def drifts(self) -> Iterator[tuple[Fit, Array, float]]:
-        """The same of the model as it is."""
-        near = self.near()
-        yield from _nodes(self.series, [one for one in self.fits if one.terms in near])
+        for one in fits:
+            for theta, ln_share in nodes(series, one):
+                yield one, theta, ln_share
 
     def posterior(self, *alternatives: Array) -> tuple[Array, Array, Array]:
         """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
@@ -214,11 +216,9 @@ class State:
     @cached_property
     def ln_marginal(self) -> float:
         """ln likelihood of the record over every near drift, one of two terms, and their parameters."""
-        none = np.empty((0, self.y.size))
-        rich = [] if self.extras.flicker else [self.rich]
         each = [
-            ln_share + _ln_marginal(next(self.sums(one.terms, theta, [none])))
-            for one, theta, ln_share in (*self.drifts(), *_nodes(self.series, rich))
+            ln_share + _ln_marginal(next(self.sums(one.terms, theta, [self.none])))
+            for one, theta, ln_share in self.possible(self.none, rich=True)
         ]
         return float(logsumexp(each))
 
@@ -226,10 +226,9 @@ class State:
         """Gains [a] of ln likelihood by further columns [k, n] at every near drift, one of two terms, and their
         parameters; ln of the share of the record's likelihood without them that each stands for; and the last column's
         coefficients and variances there [a, 2]."""
-        none = np.empty((0, more.shape[1]))
         gains, shares, sizes = [], [], []
         for one, theta, ln_share in self.possible(more, rich=True):
-            less, sums = self.sums(one.terms, theta, [none, more])
+            less, sums = self.sums(one.terms, theta, [self.none, more])
             c, inverse, rss = sums.coefficients()
             gains.append(max(0.0, ln_likelihood(sums) - ln_likelihood(less)))
             shares.append(ln_share + _ln_marginal(less))
@@ -297,12 +296,6 @@ class State:
         return self.best.sigma * math.sqrt(2.0 * NET_LEAST / sums.G[1, 1]) if sums.G[1, 1] > 0.0 else math.inf
 
 
-def _nodes(series: Series, fits: Sequence[Fit]) -> Iterator[tuple[Fit, Array, float]]:
-    for one in fits:
-        for theta, ln_share in nodes(series, one):
-            yield one, theta, ln_share
-
-
 def _ln_marginal(sums: Sums) -> float:
     """ln likelihood at the best sigma, over coefficients with a flat prior."""
     return ln_likelihood(sums) + 0.5 * float(np.linalg.slogdet(sums.coefficients()[1])[1])
@@ -354,8 +347,8 @@ def ln_looks(bend: Array, gain: float) -> float:
 class Look:
     """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
     interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be. `measure`: sizes
-    beside a model that lacks the look's columns alone. `before`: the state less earlier columns of its channel, which
-    it takes the place of. `shape`: of its columns, `rivals`: other forms of it that are as likely."""
+    beside a model that lacks the look's columns alone. `shape`: of its columns, `rivals`: other forms of it that are as
+    likely."""
 
     cause: str
     gain: float
@@ -366,7 +359,6 @@ class Look:
     shown_by: str = ""
     others: tuple[str, ...] = ()
     measure: Callable[[State], Mapping[str, Any]] | None = None
-    before: State | None = None
     shape: Shape | None = None
     rivals: tuple[Shape, ...] = ()
 

@@ -18,7 +18,7 @@ from scipy.special import gammaincinv
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.columns import LN_SLOW, SMALLER
+from selfcal.likelihood.columns import LN_SLOW, SMALLER, top
 from selfcal.likelihood.edges import scan
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
 from selfcal.likelihood.statemodel import Array, Mask
@@ -28,8 +28,6 @@ AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)
 DWELLS = (15.0, 50.0, 150.0, 450.0)
 #: The drift without levels, so that both are judged by one filter: ln of walk and white noise over the fitted ones.
 WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
-#: Rounds of draws about the best, and draws of each.
-ROUNDS, DRAWS = 6, 120
 #: Share of samples of another noise level at most: gaps have some, a change of the noise has more.
 UNEVEN_MOST = 0.05
 #: Places of a dwell time's posterior.
@@ -102,9 +100,12 @@ def looks(state: State, record: Record) -> list[Look]:
     none = float(walks.max()) + _law(state)
     if net(float(value.max()) - none, 3, LN_LOOKS) < 1.0:
         return []
-    theta, gain = _best(y, tried[int(value.argmax())], float(value.max()))
+    theta = tried[int(value.argmax())]
+    if _jumps(_smoothed(y, theta) > 0.5) < JUMPS_LEAST:
+        return []
+    theta, gain = _best(y, theta)
     upper = _smoothed(y, theta) > 0.5
-    jumps = int(np.count_nonzero(np.diff(upper)))
+    jumps = _jumps(upper)
     if jumps < JUMPS_LEAST:
         return []
     stays = _stays(upper)
@@ -170,23 +171,11 @@ def _law(state: State) -> float:
     return max(0.0, state.best.ln_likelihood - walk.ln_likelihood)
 
 
-def _best(y: Array, middle: Array, value: float) -> tuple[Array, float]:
-    """The likeliest parameters from `middle` on, of the ln likelihood `value`, and theirs."""
-    random = np.random.default_rng(1)
-    spread = np.diag([0.3, 0.8, 0.8, 0.8, 0.03])
-    for _ in range(ROUNDS):
-        drawn = middle + random.standard_normal((DRAWS, middle.size)) @ spread.T
-        found = switching(y, drawn)[0]
-        order = np.argsort(-found)
-        if found[order[0]] > value:
-            middle, value = drawn[order[0]], float(found[order[0]])
-        weight = np.exp(np.clip(found - value, -50.0, 0.0))
-        weight = np.maximum(weight, 1e-6)  # so that a few far draws do not end the search
-        weight[order[DRAWS // 3 :]] = 0.0
-        apart = drawn - middle
-        covariance = (weight[:, None] * apart).T @ apart / weight.sum()
-        spread = np.linalg.cholesky(1.5 * covariance + 1e-5 * np.eye(middle.size))
-    return middle, value
+def _best(y: Array, middle: Array) -> tuple[Array, float]:
+    """The likeliest parameters from `middle` on, and their ln likelihood."""
+    unbounded = np.tile([LEAST, 1.0 / LEAST], (middle.size, 1))
+    theta = np.log(top(lambda some: switching(y, np.log(some))[0], np.exp(middle).tolist(), unbounded))
+    return theta, float(switching(y, theta[None])[0][0])
 
 
 def _amplitude(levels: Array, removed: float, state: State) -> dict[str, Any]:
@@ -194,6 +183,10 @@ def _amplitude(levels: Array, removed: float, state: State) -> dict[str, Any]:
     state = replace(state, y=state.y + removed * levels)
     weight, means, sds = (of[0] for of in state.posterior(levels))
     return {"amplitude": mixture(weight, means[:, 0], sds[:, 0], state.unit)}
+
+
+def _jumps(upper: Mask) -> int:
+    return int(np.count_nonzero(np.diff(upper)))
 
 
 def _stays(upper: Mask) -> list[tuple[float, float]]:
