@@ -12,13 +12,12 @@ have grown: an axis alone moves there where most of its readings are pushed.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 from scipy.special import binom, fdtrc, gammainc, gammaincinv
 
@@ -82,14 +81,13 @@ class Moved:
 class Energy:
     """Squares of axes over their variance, `most` [axes] at most, in pieces of `piece_s`: `sums` and `counts` [axes,
     bands, pieces], of single readings, of means of BANDS_S, and of pushes, whose own `squares` [axes, pieces] are
-    summed too. `apart`: the readings of each axis about their level, over their noise [n], and the piece of each [n].
-    """
+    summed too. `apart`: the readings of an axis about their level, over their noise [n], and the piece of each [n]."""
 
     piece_s: float
     sums: Array
     counts: Array
     squares: Array
-    apart: tuple[tuple[NDArray[np.float32], NDArray[np.int32]], ...]
+    apart: Callable[[int], tuple[Array, Rows]]
     most: Array
 
     @cached_property
@@ -182,7 +180,14 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     tame = [_tame(recording.columns[name].values[each]) for name, each in zip(names, there, strict=True)]
     scaled_rows = [_scaled(own) for own, _ in tame]
     rows = _apart_from_each_other([own for own, _ in tame], scaled_rows)
-    readings = []
+
+    def pieces(at: Array) -> Rows:
+        return np.minimum((at / piece_s + 1e-6).astype(np.int64), count - 1)
+
+    def apart(k: int) -> tuple[Array, Rows]:
+        scaled = _scaled(_tame(recording.columns[names[k]].values[there[k]])[0])
+        return scaled, pieces(clocks[k].time_s[there[k]][: scaled.size])
+
     for k, (clock, own) in enumerate(zip(clocks, rows, strict=True)):
         time = clock.time_s[there[k]]
         sizes = [1, *(round(band_s * clock.rate_hz) for band_s in BANDS_S)]
@@ -196,14 +201,12 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
             scaled = _scaled(_tame(means, around)[0] if pushes else means, around)
             if pushes:
                 scaled = np.maximum(np.abs(scaled) - PUSH, 0.0)
-            piece = np.minimum((at[: scaled.size] / piece_s + 1e-6).astype(np.int64), count - 1)
+            piece = pieces(at[: scaled.size])
             square = np.minimum(scaled**2, tame[k][1])
             totals = counts[k, band], sums[k, band], *([squares[k]] if pushes else [])
             for power, total in enumerate(totals):
                 total[:] = np.bincount(piece, square**power, minlength=count)
-            if not band:
-                readings.append((scaled_rows[k].astype(np.float32), piece.astype(np.int32)))
-    return Energy(piece_s, sums, counts, squares, tuple(readings), np.array([one for _, one in tame]))
+    return Energy(piece_s, sums, counts, squares, apart, np.array([one for _, one in tame]))
 
 
 def _scaled(y: Array, size: int = LEVEL) -> Array:
@@ -222,8 +225,8 @@ def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> li
     found = list(rows)
     for size in {one.size for one in scaled} - {0}:
         own = [k for k, one in enumerate(scaled) if one.size == size]
-        together = np.atleast_2d(np.corrcoef(np.clip([scaled[k] for k in own], -WILD[0], WILD[0])))
-        copies = (np.abs(np.tril(together, -1)) > COPY).any(axis=1)
+        together = _correlation([scaled[k] for k in own])
+        copies: Mask = np.any(np.abs(np.tril(together, -1)) > COPY, axis=1)
         for k in np.flatnonzero(copies).tolist():
             found[own[k]] = np.zeros(size)
         own = [k for k, copy in zip(own, copies, strict=True) if not copy]
@@ -240,6 +243,16 @@ def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> li
             for k, row in zip(own, mixed, strict=True):
                 found[k] = row
     return found
+
+
+def _correlation(rows: Sequence[Array] | Array) -> Array:
+    """Correlation of rows [k, n] about 0 and of deviation 1, without wild values [k, k]."""
+    tame = np.array(rows, np.float32)  # half of the memory
+    np.clip(tame, -WILD[0], WILD[0], out=tame)
+    tame -= tame.mean(axis=1, keepdims=True)
+    products = (tame @ tame.T).astype(np.float64)
+    size = np.sqrt(np.diag(products))
+    return np.asarray(products / np.outer(size, size))
 
 
 def _level(y: Array, size: int = LEVEL) -> Array:
@@ -261,16 +274,16 @@ def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
 
 
 def stretches(energy: Energy) -> list[Stretch]:
-    """The stretches in which the sensor moves. Those that are found no longer hide others beside them."""
-    found: list[Stretch] = []
+    """The stretches in which the sensor moves. Those that are found no longer hide others beside them: their energy
+    is taken out."""
+    found, energy = list[Stretch](), replace(energy)
     while more := _loud_windows(energy, found):
-        sums, counts, squares = energy.sums.copy(), energy.counts.copy(), energy.squares.copy()
         margin = math.ceil(MARGIN_S / energy.piece_s)
         for one in more:
             gone = slice(max(0, one.begin - margin), one.end + margin)
-            sums[..., gone] = counts[..., gone] = squares[..., gone] = 0.0
+            energy.sums[..., gone] = energy.counts[..., gone] = energy.squares[..., gone] = 0.0
         found += more
-        energy = replace(energy, sums=sums, counts=counts, squares=squares)
+        energy = replace(energy)  # without the sums before each piece
     together = [one for one in found if one.axes.sum() > 1]
     return [one for one in found if one.axes.sum() == 1] if together and _of_one_source(energy, together) else found
 
@@ -290,7 +303,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         begin = np.arange(0, pieces - length + 1, max(1, length // 4))
         nats, inside, wide = _nats(energy, begin, length, wide)
         own = np.quantile(nats, OWN, axis=2, keepdims=True) / math.log(0.5 / (1.0 - OWN))
-        nats = nats / np.maximum(1.0, own)
+        nats /= np.maximum(1.0, own)
         nats, others = nats[:-1], nats[-1]
         loudest = nats.max(axis=1)
         alone = np.where(inside, loudest, 0.0)
@@ -437,12 +450,12 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
     """Whether the axes that moved share a source at rest, each with another one, and it alone is loud where they moved.
     It is the direction in which they are loudest, in units of the axes' joint noise at rest."""
     axes = np.flatnonzero(np.any([one.axes for one in moved], axis=0))
-    parts = [energy.apart[k] for k in axes]
+    parts = [energy.apart(k) for k in axes.tolist()]
     if len({piece.size for _, piece in parts}) > 1:
         return False
     values, piece = np.array([part for part, _ in parts]), parts[0][1]
     inside = np.any([(piece >= one.begin) & (piece < one.end) for one in moved], axis=0)
-    together = np.corrcoef(np.clip(values[:, ~inside], -WILD[0], WILD[0]))
+    together = _correlation(values[:, ~inside])
     linked = np.abs(together) > SHARED + CORRELATED / math.sqrt(values.shape[1])
     linked = np.linalg.matrix_power(linked.astype(float), axes.size) > 0.0  # by others too
     loudest = np.max([one.nats[axes] for one in moved], axis=0)
