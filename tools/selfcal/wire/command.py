@@ -62,12 +62,12 @@ def read_key(path: Path | str) -> bytes:
     """A key file: 32 hexadecimal digits. Raises UserError for anything else."""
     try:
         key = bytes.fromhex(read_text(Path(path), MOST_META_BYTES, "no key").strip())
+        KEY.unpack(key)
     except FileNotFoundError as error:
         make = f"{called()} command new-key --key {shlex.quote(str(path))}"
         raise UserError(f"{path}: there is no such key; --key names the module's, `{make}` makes one") from error
     except OSError as error:
         raise UserError(f"{path}: cannot read the key: {error.strerror}") from error
-        KEY.unpack(key)
     except (ValueError, struct.error) as error:
         raise UserError(f"{path}: a key is {2 * KEY.size} hexadecimal digits") from error
     return key
