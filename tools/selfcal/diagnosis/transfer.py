@@ -218,37 +218,41 @@ def quiet(values: Array, lattice: float = 0.0) -> Array:
     if n < ROUGH or not np.any(np.diff(values, 2)):
         return values
 
-    def smoothed(order: int, ln_stiff: float) -> tuple[float, Array]:
-        """Restricted likelihood, less, and the curve, whose differences of this order are white."""
-        parts = np.diff(np.eye(order + 1), order)[:, 0]
-        bands = np.zeros((order + 1, n))  # of D'D, D the differences
-        bands[order] = np.convolve(parts**2, np.ones(n - order))
-        for apart in range(1, order + 1):
-            bands[order - apart, apart:] = np.convolve(parts[apart:] * parts[:-apart], np.ones(n - order))
-        bands *= math.exp(ln_stiff)
-        bands[order] += 1.0
-        root = cholesky_banded(bands)
+    def bands_of(order: int) -> Array:
+        """Diagonals [order + 1, n] of D'D, D the differences of this order."""
+        parts, ends = np.diff(np.eye(order + 1), order)[:, 0], np.ones(n - order)
+        bands = np.zeros((order + 1, n))
+        for apart in range(order + 1):
+            bands[order - apart, apart:] = np.convolve(parts[apart:] * parts[: parts.size - apart], ends)
+        return bands
+
+    def smoothed(bands: Array, ln_stiff: float) -> tuple[float, Array]:
+        """Restricted likelihood, less, and the curve, whose differences of the order of `bands` are white."""
+        order = len(bands) - 1
+        stiff = math.exp(ln_stiff) * bands
+        stiff[order] += 1.0
+        root = cholesky_banded(stiff)
         curve = cho_solve_banded((root, False), about)
         left = max(float(about @ (about - curve)), 1e-300)
         # Twice the second term is ln det D D': of a walk n, of an integrated one n^2 (n^2 - 1) / 12.
         scale = 0.5 * math.log(n if order == 1 else n**2 * (n**2 - 1.0) / 12.0)
         return 0.5 * (n - order) * (math.log(left) - ln_stiff) - scale + float(np.log(root[order]).sum()), curve
 
-    tried = []
-    for order in (1, 2):
-        found = minimize_scalar(
-            lambda x, order=order: smoothed(order, x)[0], bounds=STIFF, method="bounded", options={"xatol": 0.1}
-        )
-        tried.append((float(found.fun), order, float(found.x)))
-    _, order, stiff = min(tried)
+    def likeliest(bands: Array) -> tuple[float, float, Array]:
+        """Restricted likelihood, less, at the likeliest ln of the stiffness, that, and the bands."""
+        options = {"xatol": 0.1}
+        found = minimize_scalar(lambda x: smoothed(bands, x)[0], bounds=STIFF, method="bounded", options=options)
+        return float(found.fun), float(found.x), bands
+
+    _, stiff, bands = min(map(likeliest, map(bands_of, (1, 2))), key=lambda tried: tried[0])
 
     def fine(ln_stiff: float) -> float:
         """How far what the curve leaves is above the noise of rounding."""
-        return float(np.var(about - smoothed(order, ln_stiff)[1])) - lattice**2 / 12.0
+        return float(np.var(about - smoothed(bands, ln_stiff)[1])) - lattice**2 / 12.0
 
     if fine(stiff) < 0.0 < fine(STIFF[1]):
         stiff = brentq(fine, stiff, STIFF[1], xtol=0.05)
-    return np.asarray(values.mean() + smoothed(order, stiff)[1])
+    return np.asarray(values.mean() + smoothed(bands, stiff)[1])
 
 
 def late(values: Array, lag_s: complex, dt: float) -> NDArray[Any]:

@@ -23,8 +23,18 @@ Knots = tuple[tuple[float, float], ...]
 POWER = {"square": 2, "cube": 3}
 #: `selfcal_column_kind_t`: names in C, by number.
 COLUMN_KINDS = (
-    *("TIME", "CHANNEL", "RATE", "SINE", "COSINE", "STEP", "TURN_ON", "PULSE"),
-    *("LAG", "SLOPE", "SQUARE", "CUBE"),
+    "TIME",
+    "CHANNEL",
+    "RATE",
+    "SINE",
+    "COSINE",
+    "STEP",
+    "TURN_ON",
+    "PULSE",
+    "LAG",
+    "SLOPE",
+    "SQUARE",
+    "CUBE",
 )
 KIND = {name: number for number, name in enumerate(COLUMN_KINDS)}
 #: Kind, channel, number and second number of a column: `selfcal_source_t`.

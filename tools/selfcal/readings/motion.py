@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
@@ -90,7 +89,6 @@ class Energy:
     apart: Callable[[int], tuple[Array, Rows]]
     most: Array
 
-    @cached_property
     def before(self) -> tuple[Array, ...]:
         """Sums, counts and squares of all pieces before each one, and of all, [..., pieces + 1]."""
         every = (self.sums, self.counts, self.squares)
@@ -276,14 +274,13 @@ def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
 def stretches(energy: Energy) -> list[Stretch]:
     """The stretches in which the sensor moves. Those that are found no longer hide others beside them: their energy
     is taken out."""
-    found, energy = list[Stretch](), replace(energy)
+    found: list[Stretch] = []
     while more := _loud_windows(energy, found):
         margin = math.ceil(MARGIN_S / energy.piece_s)
         for one in more:
             gone = slice(max(0, one.begin - margin), one.end + margin)
             energy.sums[..., gone] = energy.counts[..., gone] = energy.squares[..., gone] = 0.0
         found += more
-        energy = replace(energy)  # without the sums before each piece
     together = [one for one in found if one.axes.sum() > 1]
     return [one for one in found if one.axes.sum() == 1] if together and _of_one_source(energy, together) else found
 
@@ -298,10 +295,10 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         lengths.append(last + max(1, last & -last if last & (last - 1) else last // 2))
     found: list[tuple[float, int, int, Mask]] = []
     wide, used = np.ones((axes, bands)), np.flatnonzero(energy.counts.any(axis=(0, 2)))
-    lengths = lengths if used.size else []
+    lengths, before = lengths if used.size else [], energy.before()
     for length in lengths:
         begin = np.arange(0, pieces - length + 1, max(1, length // 4))
-        nats, inside, wide = _nats(energy, begin, length, wide)
+        nats, inside, wide = _nats(energy, before, begin, length, wide)
         own = np.quantile(nats, OWN, axis=2, keepdims=True) / math.log(0.5 / (1.0 - OWN))
         nats /= np.maximum(1.0, own)
         nats, others = nats[:-1], nats[-1]
@@ -320,7 +317,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     for net, first, length, which in sorted(found, key=lambda one: (one[0] <= sure, one[3].sum() == 1, -one[0])):
         if not taken[first : first + length].any():
             a, b = _ends(energy, *_ends(energy, first, first + length, which), which)
-            nats = _nats(energy, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
+            nats = _nats(energy, before, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
             of_others = np.count_nonzero(which) == 1
             more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else TOGETHER))
             which = which | more if of_others else more  # noqa: PLW2901
@@ -332,24 +329,26 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     return [one for one in apart if one.net > sure or (one.axes.sum() > 1 and one.net >= max(least, default=sure))]
 
 
-def _nats(energy: Energy, begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
+def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
     """Nats of windows of a length over their louder side [axes, and the others but the loudest as one, bands, windows].
     Whether an axis has both sides, or is pushed most of the time [axes, windows]. How much wider than of white noise
-    the means lie, `wide` at least [axes, bands]."""
+    the means lie, `wide` at least [axes, bands]. `before`: of the energy."""
     axes, bands, pieces = energy.sums.shape
     most = max(1e-9, float(energy.counts.sum(axis=2).max()) / pieces)
     side = max(SIDE * length, round(PUSH_S / energy.piece_s), math.ceil(SIDE_SQUARES / most))
     nats, wide = np.zeros((axes + 1, bands, begin.size)), wide.copy()
     inside = np.zeros((axes, begin.size), bool)
     for band in range(bands):  # one by one: a long record has many windows
-        nats[:, band], both, wide[:, band] = _of_band(energy, band, begin, length, side, wide[:, band])
+        nats[:, band], both, wide[:, band] = _of_band(energy, before, band, begin, length, side, wide[:, band])
         inside |= both
     return nats, inside, wide
 
 
-def _of_band(energy: Energy, band: int, begin: Rows, length: int, side: int, wide: Array) -> tuple[Array, Mask, Array]:
+def _of_band(
+    energy: Energy, before: Sequence[Array], band: int, begin: Rows, length: int, side: int, wide: Array
+) -> tuple[Array, Mask, Array]:
     """What `_nats` has of a band, with sides of so many pieces: [axes + 1, windows], [axes, windows], [axes]."""
-    sums, counts = (every[:, band] for every in energy.before[:2])
+    sums, counts = (every[:, band] for every in before[:2])
     pieces, pushes = energy.sums.shape[2], band == energy.sums.shape[1] - 1
 
     def inside(every: Array, first: Rows, last: Rows) -> Array:
@@ -374,7 +373,7 @@ def _of_band(energy: Energy, band: int, begin: Rows, length: int, side: int, wid
         # Pushes are rare and large, also in noise that has grown: their own spread beside the window counts.
         second, fourth, many = (
             inside(every, begin - 1 - side, begin - 1) + inside(every, begin + length + 1, begin + length + 1 + side)
-            for every in (sums, energy.before[2], counts)
+            for every in (sums, before[2], counts)
         )
         free /= np.maximum(0.5 * (fourth * many / np.maximum(second**2, 1.0) - 1.0), 1.0)
     own_free, side_free = np.maximum(n * free, 0.5), np.maximum(beside * free, 0.5)
