@@ -7,7 +7,8 @@ a lattice of a quarter of the noise; text with eight significant digits; the sam
 
 - Readings: the tests of `readings/tests.py` name 2 in 1000 sound axes at most. Each test is run with 20 times its share
   as well, and names no more axes than a binomial count exceeds in 1 of 1000 runs.
-- Causes and verdict: 1 in 100 modules has a finding. `identify` looks at all records, `diagnose` at every fifth one.
+- Causes and verdict: 1 in 100 modules has a finding. `identify` looks at all records, `diagnose` at every fifth one,
+  both at 20 times their shares as well; then each check of `identify` keeps to its own.
 
 Exit code 1: a count is beyond what its share exceeds in 1 of 1000 runs.
 """
@@ -22,6 +23,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -44,9 +46,13 @@ MEANT = 10
 #: Length of a record, s, by its rate, Hz.
 SECONDS = {1.0: 1200.0, 10.0: 1200.0, 100.0: 300.0}
 #: Share of axes in which readings are called wrong, and of modules that have a finding.
-OF_READINGS, OF_MODULES = 2e-3, 1e-2
+OF_READINGS, MOST = 2e-3, 1e-2
 #: Factor on the share of each test of the readings, so that a count shows what the share itself hides.
 TIMES = 20.0
+#: Checks of `identify` that chance may fail; `allan` is all its averaging times together.
+OF_IDENTIFY = {"channel", "turn_on", "jump", "allan"} | {
+    f"innovation_{name}" for name in ("mean", "lag1", "excess_kurtosis", "ln_variance_ratio_of_halves")
+}
 #: Every so many records are diagnosed.
 DIAGNOSED = 5
 
@@ -112,11 +118,11 @@ def _of_log(look: Callable[[Path], Wrong], seed: int, rate: float) -> Wrong:
             return {name: [f"{type(error).__name__}: {error}"] for name in AXES}
 
 
-def with_larger_shares() -> None:
-    """Multiply the share of every test by TIMES, before the modules that take thresholds from it are imported."""
+def with_larger_shares(table: str) -> None:
+    """Multiply the shares of a table by TIMES, before the modules that take their limits from it are imported."""
     from selfcal.readings import budget
 
-    budget.SHARES = {test: min(0.5, TIMES * share) for test, share in budget.SHARES.items()}
+    setattr(budget, table, {test: min(0.5, TIMES * share) for test, share in getattr(budget, table).items()})
 
 
 def of_tests(seed: int, rate: float) -> Wrong:
@@ -146,8 +152,7 @@ def of_identify(seed: int, rate: float) -> Wrong:
 
         axes = identify(path)["axes"]
         return {
-            name: [entry.get("error", "")]
-            + [key for key, check in entry.get("checks", {}).items() if not check["passed"]]
+            name: [entry["error"]] if "error" in entry else [k for k, c in entry["checks"].items() if not c["passed"]]
             for name, entry in axes.items()
             if not entry.get("adequate")
         }
@@ -172,17 +177,15 @@ def of_diagnose(seed: int, rate: float) -> Wrong:
 
 
 def each(
-    look: Callable[[int, float], Wrong], work: list[tuple[int, float]], workers: int, first: Callable[[], None] | None
+    look: Callable[[int, float], Wrong], work: list[tuple[int, float]], workers: int, larger: str = ""
 ) -> Iterator[tuple[int, float, Wrong]]:
-    """What a look says of every record, in processes of its own, printed as it comes."""
+    """What a look says of every record, in processes of its own, printed as it comes. `larger`: a table of shares."""
+    first = partial(with_larger_shares, larger) if larger else None
     with ProcessPoolExecutor(workers, get_context("spawn"), initializer=first) as pool:
         for (seed, rate), wrong in zip(work, pool.map(look, *zip(*work, strict=True)), strict=True):
             for name, why in wrong.items():
                 form = FORMS[seed % len(FORMS)]
-                print(
-                    f"  {look.__name__} {rate:g} Hz, seed {seed}, {form}, {name}: {', '.join(filter(None, why))}",
-                    flush=True,
-                )
+                print(f"  {look.__name__} {rate:g} Hz, seed {seed}, {form}, {name}: {', '.join(why)}", flush=True)
             yield seed, rate, wrong
 
 
@@ -206,21 +209,29 @@ def main() -> int:
     seeds = range(options.seed, options.seed + options.records)
     work = [(seed, rate) for seed in seeds for rate in options.rate or SECONDS]
     axes, start, right = len(work) * len(AXES), time.perf_counter(), True
-    from selfcal.readings.budget import SHARES
+    from selfcal.readings.budget import CHECKS, OF_MODULES, SHARES
 
     named: Counter[str] = Counter()
-    for _, _, wrong in each(of_tests, work, options.workers, with_larger_shares):
+    for _, _, wrong in each(of_tests, work, options.workers, "SHARES"):
         named.update(test for tests in wrong.values() for test in tests)
     right &= not named.keys() - SHARES.keys()
     for test, share in SHARES.items():
         right &= held(f"{test}, {TIMES:g} times its share", named[test], axes, min(0.5, TIMES * share))
-    count = sum(len(wrong) for *_, wrong in each(of_tests, work, options.workers, None))
+    count = sum(len(wrong) for *_, wrong in each(of_tests, work, options.workers))
     right &= held("readings called wrong, of axes", count, axes, OF_READINGS)
-    count = sum(bool(wrong) for *_, wrong in each(of_identify, work, options.workers, None))
-    right &= held("identify, modules that are not adequate", count, len(work), OF_MODULES)
+    failed: Counter[str] = Counter()
+    for *_, wrong in each(of_identify, work, options.workers, "OF_MODULES"):
+        for checks in wrong.values():
+            failed.update({"allan" if check.startswith("allan") else check for check in checks})
+    for check in sorted(OF_IDENTIFY | failed.keys() - SHARES.keys()):
+        share = TIMES * OF_MODULES["checks"] / (len(AXES) * CHECKS) if check in OF_IDENTIFY else 0.0
+        right &= held(f"{check}, {TIMES:g} times its share", failed[check], axes, share)
+    count = sum(bool(wrong) for *_, wrong in each(of_identify, work, options.workers))
+    right &= held("identify, modules that are not adequate", count, len(work), MOST)
     part = work[::DIAGNOSED]
-    count = sum(bool(wrong) for *_, wrong in each(of_diagnose, part, options.workers, None))
-    right &= held("diagnose, modules with a finding", count, len(part), OF_MODULES)
+    for times, larger in ((TIMES, "OF_MODULES"), (1.0, "")):
+        count = sum(bool(wrong) for *_, wrong in each(of_diagnose, part, options.workers, larger))
+        right &= held(f"diagnose, modules with a finding, {times:g} times its share", count, len(part), times * MOST)
     print(f"{time.perf_counter() - start:.0f} s")
     return int(not right)
 

@@ -19,12 +19,13 @@ from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import CHANGE
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
+from selfcal.readings.budget import AXES, CHECKS, OF_MODULES
 from selfcal.readings.codes import Misread
 from selfcal.readings.readings import Readings
 from selfcal.readings.tests import TESTS
 
-#: Largest deviation of a check's statistic that passes, sd: a false alarm in 16 000 checks.
-CHECK_LIMIT = 4.0
+#: Largest deviation of a check's statistic that passes, sd: 4, a false alarm in 16 000 checks.
+CHECK_LIMIT = -float(ndtri(0.5 * OF_MODULES["checks"] / (AXES * CHECKS)))
 #: Largest distance of a part from its batch that passes, sd: one law's two parameters exceed it in 1 of 1000 parts.
 BATCH_LIMIT = 3.5
 #: Least prior probability of a law of the batch.
@@ -292,14 +293,25 @@ def innovation_checks(
     kurtosis = float(((whole - whole.mean()) ** 4).mean() / whole.var() ** 2 - 3.0)
     nothing = 1e-30 * float(whole.var())  # of a dead band, a half may have no variance
     ratio = math.log(max(float(whole[half:].var()), nothing) / max(float(whole[:half].var()), nothing))
-    # Standard deviations under white normal innovations.
-    checks = {
-        "innovation_mean": (float(whole.mean() / whole.std()), 1.0 / math.sqrt(n)),
-        "innovation_lag1": (lag1, 1.0 / math.sqrt(n)),
-        "innovation_excess_kurtosis": (kurtosis, math.sqrt(24.0 / n)),
-        "innovation_ln_variance_ratio_of_halves": (ratio, math.sqrt(8.0 / n)),
+    alone = 1.0 / math.sqrt(n)  # standard deviation of the first two for white normal innovations
+    checks: dict[str, tuple[float, float]] = {
+        "innovation_mean": (float(whole.mean() / whole.std()), CHECK_LIMIT * alone),
+        "innovation_lag1": (lag1, CHECK_LIMIT * alone),
+        "innovation_excess_kurtosis": (kurtosis, abs(kurtosis_at(math.copysign(CHECK_LIMIT, kurtosis), n))),
+        "innovation_ln_variance_ratio_of_halves": (ratio, CHECK_LIMIT * math.sqrt(8.0) * alone),
     }
     return {
-        name: {"value": value, "limit": CHECK_LIMIT * sd, "passed": abs(value) <= CHECK_LIMIT * sd}
-        for name, (value, sd) in checks.items()
+        name: {"value": value, "limit": limit, "passed": abs(value) <= limit} for name, (value, limit) in checks.items()
     }
+
+
+def kurtosis_at(z: float, n: int) -> float:
+    """Excess kurtosis of `n` normal numbers, 20 at least, that is as rare as a deviation of `z` standard deviations: it
+    is skewed even at n of thousands. Anscombe and Glynn, Biometrika 70 (1983), 227-234, equation 3, solved for it."""
+    mean, variance = 3.0 * (n - 1) / (n + 1), 24.0 * n * (n - 2) * (n - 3) / ((n + 1) ** 2 * (n + 3) * (n + 5))
+    skewness = 6.0 * (n * n - 5 * n + 2) / ((n + 7) * (n + 9))
+    skewness *= math.sqrt(6.0 * (n + 3) * (n + 5) / (n * (n - 2) * (n - 3)))
+    a = 6.0 + 8.0 / skewness * (2.0 / skewness + math.sqrt(1.0 + 4.0 / skewness**2))
+    root = 1.0 - 2.0 / (9.0 * a) - z * math.sqrt(2.0 / (9.0 * a))
+    x = ((1.0 - 2.0 / a) / root**3 - 1.0) * math.sqrt(0.5 * (a - 4.0))
+    return mean + math.sqrt(variance) * x - 3.0

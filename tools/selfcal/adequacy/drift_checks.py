@@ -13,7 +13,9 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
+from scipy.special import ndtr
 
+from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.bank.blocks import Blocks
 from selfcal.bank.result import AxisResult
 from selfcal.base.errors import UserError
@@ -28,7 +30,7 @@ from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables
 
 #: Largest worth of a column that passes, nats: as rare as CHECK_LIMIT standard deviations, searches counted.
-LEAST = 9.67
+LEAST = -math.log(2.0 * ndtr(-CHECK_LIMIT))
 #: Sizes of the drift that are tried with a column, as ln of a divisor; and least gain of a smaller size, nats: noise
 #: that axes share is no drift.
 SIZES, CLEARLY = (0.0, 0.7, *SMALLER), 3.0

@@ -42,14 +42,14 @@ from selfcal.likelihood.joint import (
     refitted,
     without_lines,
 )
-from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, P_MODULE, State
+from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.model.forms import formed, slope
 
 #: Chance makes an evidence of T nats and more on this times e^-T of modules on which nothing acts (`make module-null`).
 NULL = 0.05
 #: Evidence of a candidate that is named, nats.
-NAMED = math.log(NULL / P_MODULE)
+NAMED = math.log(NULL) + EVIDENT
 #: Means of this length at least, s: whatever the rate, what is slow is in them.
 MEANS_S = 1.0
 #: Means that the joint model takes at least, and the share of them that an axis may lack.

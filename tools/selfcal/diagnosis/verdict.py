@@ -21,11 +21,12 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic, judged
 from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import NET_LEAST, Look, State
+from selfcal.readings.budget import AXES, OF_MODULES
 
 #: Pictures of the checks of `identify`, by the beginning of their names.
 SHOWN = (("innovation_mean", "innovation_means"), ("innovation_ln_variance", "noise_level"))
 #: Probability that the statistics call an axis of a fitting record inadequate, and that a channel's coherence does.
-P_FAMILY, P_COHERENCE = 2e-3, 5e-4
+P_FAMILY, P_COHERENCE = (OF_MODULES[name] / AXES for name in ("statistics", "coherence"))
 #: Drift within a block of means over its white noise from which on the means alone show nothing: sqrt(6), less a tenth.
 WITHIN = 2.2
 #: A first ensemble screens: axes below this have a second one, which knows its tail, unless there is no doubt.

@@ -16,18 +16,17 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import half_means, in_blocks
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Terms
+from selfcal.readings.budget import AXES, LOOKS, OF_MODULES
 
 if TYPE_CHECKING:
     from selfcal.likelihood.columns import Shape
 
-#: A look's p-value must lie below this: most causes gain less by chance than this allows: measured by `make hidden`.
-P_LOOK = 5e-4
+#: A look's p-value must lie below this.
+P_LOOK = OF_MODULES["causes"] / (AXES * LOOKS)
 NET_LEAST = -math.log(P_LOOK)
-#: Share of the modules on which nothing acts in which a search over all axes may name a candidate.
-P_MODULE = 0.01
-#: Evidence of a candidate that is named, nats. It is a Bayes factor: chance makes one of e^T in a share of e^-T at most
-#: (Markov's inequality).
-EVIDENT = -math.log(P_MODULE)
+#: Evidence of all axes together that is named, nats. It is a Bayes factor: chance makes one of e^T in a share of e^-T
+#: at most (Markov's inequality).
+EVIDENT = -math.log(OF_MODULES["together"])
 #: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
 FAR = 40.0
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
