@@ -13,7 +13,7 @@ import pytest
 from drifts import fitted, of_one
 from scipy.stats import binom, kurtosistest, norm
 
-from selfcal.adequacy.checks import against, kurtosis_at
+from selfcal.adequacy.checks import CHECK_LIMIT, against, kurtosis_at
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
@@ -135,7 +135,7 @@ def test_a_check_of_identify_is_a_finding() -> None:
     }
     assert list(against(checks)) == ["innovation_lag1", "allan_64s"]
     assert against(checks)["allan_64s"] == 5.1
-    assert against(checks)["innovation_lag1"] == pytest.approx(6.0)
+    assert against(checks)["innovation_lag1"] == pytest.approx(1.5 * CHECK_LIMIT)
 
 
 def result(random: np.random.Generator, look: Look | None, unfinished: str = "") -> Diagnosed:

@@ -123,6 +123,7 @@ def with_larger_shares(table: str) -> None:
     from selfcal.readings import budget
 
     setattr(budget, table, {test: min(0.5, TIMES * share) for test, share in getattr(budget, table).items()})
+    budget.P_LOOK *= TIMES if table == "OF_MODULES" else 1.0
 
 
 def of_tests(seed: int, rate: float) -> Wrong:
@@ -209,7 +210,7 @@ def main() -> int:
     seeds = range(options.seed, options.seed + options.records)
     work = [(seed, rate) for seed in seeds for rate in options.rate or SECONDS]
     axes, start, right = len(work) * len(AXES), time.perf_counter(), True
-    from selfcal.readings.budget import CHECKS, OF_MODULES, SHARES
+    from selfcal.readings.budget import P_LOOK, SHARES
 
     named: Counter[str] = Counter()
     for _, _, wrong in each(of_tests, work, options.workers, "SHARES"):
@@ -224,7 +225,7 @@ def main() -> int:
         for checks in wrong.values():
             failed.update({"allan" if check.startswith("allan") else check for check in checks})
     for check in sorted(OF_IDENTIFY | failed.keys() - SHARES.keys()):
-        share = TIMES * OF_MODULES["checks"] / (len(AXES) * CHECKS) if check in OF_IDENTIFY else 0.0
+        share = TIMES * P_LOOK if check in OF_IDENTIFY else 0.0
         right &= held(f"{check}, {TIMES:g} times its share", failed[check], axes, share)
     count = sum(bool(wrong) for *_, wrong in each(of_identify, work, options.workers))
     right &= held("identify, modules that are not adequate", count, len(work), MOST)

@@ -132,7 +132,7 @@ def test_what_the_command_line_says(tmp_path: Path) -> None:
     there = {"key_file": tmp_path / "k", "interface": "slcan"}
     with pytest.raises(UserError, match=r"to which module\? --channel names its serial port"):
         command("save", None, channel="", **there)
-    with pytest.raises(UserError, match=r"no such key; --key names .*`selfcal command new-key --key .*none` makes"):
+    with pytest.raises(UserError, match=r"no such key; --key names .*`.*selfcal command new-key --key .*none` makes"):
         command("save", None, key_file=tmp_path / "none", interface="slcan", channel="/dev/null")
     with pytest.raises(UserError, match=r"no such command: sing \(there are .*save.*new-key, build-flag\)"):
         command("sing", None, channel="/dev/null", **there)

@@ -35,6 +35,7 @@ from firmware import (
 )
 from parts.flash import half_erased, half_programmed
 from parts.machine import EXC_IRQ0
+from scipy.stats import poisson
 from unicorn import UC_HOOK_CODE, Uc
 from unicorn import arm_const as arm
 
@@ -294,8 +295,8 @@ def test_sensor_bad_from_the_start(name: str, code: int) -> None:
     ),
 )
 def test_spi_bit_flips(target: str, chance: float) -> None:
-    """Bits turned over on either wire: no wrong sample is taken. Two bursts carry 192 bits of the six channels, so that
-    at 1e-3 every sixth sample is lost."""
+    """Bits turned over on either wire: two bursts carry 96 bits of the six channels each, so that at 1e-3 every sixth
+    sample is lost. The sensor has no checksum: a wrong sample is taken where both bursts have the same bit turned."""
     seconds = often(8 if target == "stm32f405" else 3)
     board = quiet(target, seed=int(1 / chance))
     tap = Tap(board)
@@ -314,7 +315,7 @@ def test_spi_bit_flips(target: str, chance: float) -> None:
         f"{len(tap.pushed)} samples taken, {lost:.0f} refused, {wrong} wrong",
     )
     assert board.spi.flipped > 0
-    assert wrong == 0
+    assert wrong <= poisson.isf(1e-3, 96 * chance**2 * len(tap.pushed))
     # a MOSI bit may make the burst a write or another register: rates and ranges are set anew at the next start
     assert not board.machine.faults
     assert not board.machine.resets

@@ -19,13 +19,13 @@ from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import CHANGE
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
-from selfcal.readings.budget import AXES, CHECKS, OF_MODULES
+from selfcal.readings.budget import P_LOOK
 from selfcal.readings.codes import Misread
 from selfcal.readings.readings import Readings
 from selfcal.readings.tests import TESTS
 
-#: Largest deviation of a check's statistic that passes, sd: 4, a false alarm in 16 000 checks.
-CHECK_LIMIT = -float(ndtri(0.5 * OF_MODULES["checks"] / (AXES * CHECKS)))
+#: Largest deviation of a check's statistic that passes, sd: 4.
+CHECK_LIMIT = -float(ndtri(0.5 * P_LOOK))
 #: Largest distance of a part from its batch that passes, sd: one law's two parameters exceed it in 1 of 1000 parts.
 BATCH_LIMIT = 3.5
 #: Least prior probability of a law of the batch.

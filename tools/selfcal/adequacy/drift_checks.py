@@ -13,9 +13,7 @@ from typing import Any
 
 import numpy as np
 from scipy.ndimage import uniform_filter1d
-from scipy.special import ndtr
 
-from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.bank.blocks import Blocks
 from selfcal.bank.result import AxisResult
 from selfcal.base.errors import UserError
@@ -23,14 +21,12 @@ from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, Shape
 from selfcal.likelihood.fit import ROUGH_FTOL, finish
-from selfcal.likelihood.state import MEANS_MOST, State
+from selfcal.likelihood.state import MEANS_MOST, NET_LEAST, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables
 
-#: Largest worth of a column that passes, nats: as rare as CHECK_LIMIT standard deviations, searches counted.
-LEAST = -math.log(2.0 * ndtr(-CHECK_LIMIT))
 #: Sizes of the drift that are tried with a column, as ln of a divisor; and least gain of a smaller size, nats: noise
 #: that axes share is no drift.
 SIZES, CLEARLY = (0.0, 0.7, *SMALLER), 3.0
@@ -82,14 +78,14 @@ def _check(
     trials = columns.tried(state, shapes, slow=True).values()
     best = max(trials, key=lambda trial: trial.net, default=None)
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)
-    if worth > LEAST and drift:
+    if worth > NET_LEAST and drift:
         full, *smaller = (
             max(float(state.scores([shape.columns], fit.shrunk(by))[0]) for fit in state.fits) for by in SIZES
         )
         none = finish(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
         drifts = state.best.ln_likelihood > none.ln_likelihood + CLEARLY
         worth = worth if drifts and max(smaller) > full + CLEARLY else 0.0
-    passed = {"value": worth, "limit": LEAST, "passed": worth <= LEAST, "deviations": math.sqrt(2.0 * worth)}
+    passed = {"value": worth, "limit": NET_LEAST, "passed": worth <= NET_LEAST, "deviations": math.sqrt(2.0 * worth)}
     return {**passed, **stated(shape)}
 
 

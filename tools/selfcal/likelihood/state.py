@@ -16,13 +16,12 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import half_means, in_blocks
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Terms
-from selfcal.readings.budget import AXES, LOOKS, OF_MODULES
+from selfcal.readings.budget import OF_MODULES, P_LOOK
 
 if TYPE_CHECKING:
     from selfcal.likelihood.columns import Shape
 
-#: A look's p-value must lie below this.
-P_LOOK = OF_MODULES["causes"] / (AXES * LOOKS)
+#: Evidence of a look at one axis that is named, net of its search, nats.
 NET_LEAST = -math.log(P_LOOK)
 #: Evidence of all axes together that is named, nats. It is a Bayes factor: chance makes one of e^T in a share of e^-T
 #: at most (Markov's inequality).
