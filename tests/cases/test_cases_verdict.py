@@ -14,9 +14,10 @@ from drifts import fitted, of_one
 from scipy.stats import binom, kurtosistest, norm
 
 from selfcal.adequacy.checks import CHECK_LIMIT, against, kurtosis_at
+from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
-from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.record import LEAST, Record
 from selfcal.diagnosis.statistics import Statistic, judged
 from selfcal.diagnosis.verdict import coherence, joined, look_of
 from selfcal.likelihood.state import NET_LEAST, Look, State
@@ -107,8 +108,8 @@ def test_the_limits_of_the_kurtosis_are_those_of_normal_numbers(n: int) -> None:
 
 def test_both_budgets_are_kept() -> None:
     """Shares of axes whose readings are called wrong, and of modules that have a finding, as stated by the project."""
-    assert sum(SHARES.values()) <= 2e-3
-    assert sum(OF_MODULES.values()) <= 1e-2
+    assert round(sum(SHARES.values()), 9) <= 2e-3
+    assert round(sum(OF_MODULES.values()), 9) <= 1e-2
 
 
 def test_identify_and_diagnose_have_one_verdict(tmp_path: Path) -> None:
@@ -179,7 +180,8 @@ def test_the_allan_deviation_is_the_picture_of_its_statistic() -> None:
 @pytest.mark.parametrize("kind", ["to zero", "less the band", "held"])
 @pytest.mark.filterwarnings("error")
 def test_a_dead_band_is_shown(kind: str, tmp_path: Path) -> None:
-    """It is never adequate, and no number of the model file is out of its limits."""
+    """It is never adequate, and no number of the model file is out of its limits. Where hardly a reading moves, no law
+    can be judged: the refusal says so."""
     random = np.random.default_rng([57, len(kind)])
     for _ in range(case_records(1, 12)):
         n = SAMPLES
@@ -193,7 +195,12 @@ def test_a_dead_band_is_shown(kind: str, tmp_path: Path) -> None:
             for k in range(1, n):
                 if abs(y[k] - y[k - 1]) < width:
                     y[k] = y[k - 1]
-        axis = diagnose(log_of(tmp_path / "dead.npz", 0.04 * y, 1.0), write_model=tmp_path / "found.yaml")["axes"]["gx"]
+        log = log_of(tmp_path / "dead.npz", 0.04 * y, 1.0)
+        if kind == "held" and np.count_nonzero(np.diff(y)) < LEAST:
+            with pytest.raises(UserError, match="of its readings neither stick nor are clipped"):
+                diagnose(log)
+            continue
+        axis = diagnose(log, write_model=tmp_path / "found.yaml")["axes"]["gx"]
         assert axis["verdict"] == "inadequate"
         Model.load(tmp_path / "found.yaml")
         (tmp_path / "found.yaml").unlink()

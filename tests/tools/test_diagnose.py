@@ -452,7 +452,8 @@ def test_shaken_accelerometers_move_no_gyroscope(tmp_path: Path) -> None:
         shown = diagnose(log)["axes"]
         for name in axes:
             causes = {finding["cause"] for finding in shown[name]["findings"]}
-            assert causes - {"outliers"} == ({"motion"} if name in moved else set())
+            left = set() if name[0] == "g" else {"outliers", "unexplained"}  # of a burst that is not found
+            assert causes - left == ({"motion"} if name in moved else set())
     print(f"{events} events, {gyros} of {3 * events} gyroscopes")
     assert events >= 12
     assert gyros <= binom.ppf(0.999, 3 * events, 0.05)

@@ -274,8 +274,8 @@ def _axis_of(
         return found[there[np.maximum(0, np.searchsorted(there, np.arange(found.size), side="right") - 1)]]
 
     y, r = grid.means(clock, spread(readings.values if each == 1 else readings.drawn))
-    if np.isfinite(y).sum() < LEAST:
-        return "too few of its readings are none that stick or are clipped"
+    if (usable := int(np.isfinite(y).sum())) < LEAST:
+        return f"{usable} of its readings neither stick nor are clipped, a diagnosis needs {LEAST} or more"
     moving = np.zeros(grid.n, bool)
     if readings.moving.any():
         # A mean of which one sample moved is left out: the next ones may ring on below what is loud.
