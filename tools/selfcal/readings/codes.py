@@ -249,6 +249,8 @@ class Cells:
     def limit(self, side: int) -> csr_matrix:
         """All above the largest reading, or below the smallest, are read as it."""
         ends = self.there[self.there < self.many - 1]
+        if not ends.size:  # the pile has all
+            return self.own
         end = self.origin + self.width * (self.first + int(ends[-1] if side > 0 else ends[0]))
         clip = np.minimum if side > 0 else np.maximum
         if self.pile is None or side * (self.pile - end) < -self.width:
