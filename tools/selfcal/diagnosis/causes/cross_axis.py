@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis import forms
+from selfcal.diagnosis import forms, hidden
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, shown, sized
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import Channel, form_of
@@ -55,7 +55,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     several axes is likelier than several of one; and of one pair the weaker coupling is kept: a mechanical one is
     below 1. Returns the axes whose model changed."""
     changed = [*_own_ramps(record, found), *_star(record, found)]
-    static = [leak for leak in _leaks(found) if leak[2].look.estimate["form"] == "static"]
+    static = [leak for leak in leaks(found) if leak[2].look.estimate["form"] == "static"]
     pairs = {(name, other): finding for name, other, finding in static}
     partners = _partners(found)
     for (name, other), finding in pairs.items():
@@ -82,15 +82,19 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             if finding.look.cause == "cross_axis":
                 of_other.setdefault(str(finding.look.estimate["other"]), []).append(k)
         for other, places in of_other.items():
-            if not _source_shown(record, found, name, other, [one.findings[k] for k in places]):
-                for k in places:
-                    look = one.findings[k].look
-                    look = replace(look, estimate={**look.estimate, "source": "not shown"})
-                    one.findings[k] = replace(one.findings[k], look=look)
+            unsure = ""
+            if one.hidden is not None and one.hidden.explains(name, other, 0.0):
+                unsure = hidden.ID
+            elif not _source_shown(record, found, name, other, [one.findings[k] for k in places]):
+                unsure = "not shown"
+            for k in places if unsure else ():
+                look = one.findings[k].look
+                look = replace(look, estimate={**look.estimate, "source": unsure})
+                one.findings[k] = replace(one.findings[k], look=look)
     return changed
 
 
-def _leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
+def leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
     """Of each leak the axis that follows, the other one, and the finding."""
     return [
         (name, str(finding.look.estimate["other"]), finding)
@@ -102,7 +106,7 @@ def _leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
 
 def _partners(found: Mapping[str, Diagnosed]) -> Counter[str]:
     """Axes that each goes together with, whichever follows."""
-    pairs = {frozenset((name, other)) for name, other, _ in _leaks(found)}
+    pairs = {frozenset((name, other)) for name, other, _ in leaks(found)}
     return Counter(name for pair in pairs for name in pair)
 
 
@@ -115,7 +119,7 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     """Drop an axis that shows in another by nothing but what its own model explains: a step or a ramp, of which both
     may have their own. Returns the axes whose model changed."""
     changed = []
-    for name, other, finding in _leaks(found):
+    for name, other, finding in leaks(found):
         source = found[other].state if other in found else record.axes[other]
         if all(column.cause == "cross_axis" for column in source.regressors):
             continue
@@ -132,14 +136,14 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     other way round explains it nearly as well. Returns the axes whose model changed."""
     changed: list[str] = []
     partners = _partners(found)
-    for name, other, finding in _leaks(found):
+    for name, other, finding in leaks(found):
         if partners[name] <= partners[other] or other not in found:
             continue
         one, source = found[name], found[other]
         free = without(one.state, other)
         back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
         lost = one.state.best.ln_likelihood - free.best.ln_likelihood
-        if back and back[0].net >= NET_LEAST and back[0].gain > lost - ALIKE:
+        if back and back[0].gain > lost - ALIKE:  # of the pair that is shown already, the likelier source
             _drop(one, finding, free)
             after = source.state.refit(**back[0].changes)
             source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
@@ -213,7 +217,7 @@ CAUSE = Cause(
     least=_least,
     grouping=Grouping(
         alike=lambda a, b: bool(a.estimate["other"] == b.estimate["other"]),
-        piece=lambda look, axes, jumps: look.estimate["other"] in axes,
+        piece=lambda look, axes, jumps: look.estimate["other"] in axes and look.estimate.get("source") == hidden.ID,
         settle=_settle,
     ),
     written=Written(entry=_entry, of_column=forms.of_other),
