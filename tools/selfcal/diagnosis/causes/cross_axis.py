@@ -16,7 +16,8 @@ from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State
+from selfcal.likelihood.joint import WIDTHS, act_apart
+from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.model.forms import formed
@@ -54,7 +55,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, one source of
     several axes is likelier than several of one; and of one pair the weaker coupling is kept: a mechanical one is
     below 1. Returns the axes whose model changed."""
-    changed = [*_own_ramps(record, found), *_star(record, found)]
+    changed = [*_arms(record, found), *_own_ramps(record, found), *_star(record, found)]
     static = [leak for leak in leaks(found) if leak[2].look.estimate["form"] == "static"]
     pairs = {(name, other): finding for name, other, finding in static}
     partners = _partners(found)
@@ -76,6 +77,9 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         if ahead > 0.0:
             _drop(found[name], finding, without(found[name].state, other))
             changed.append(name)
+    arms: dict[str, set[str]] = {}
+    for name, other, _ in leaks(found):
+        arms.setdefault(other, set()).add(name)
     for name, one in found.items():
         of_other: dict[str, list[int]] = {}
         for k, finding in enumerate(one.findings):
@@ -83,7 +87,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                 of_other.setdefault(str(finding.look.estimate["other"]), []).append(k)
         for other, places in of_other.items():
             unsure = ""
-            if one.hidden is not None and one.hidden.explains(name, other, 0.0):
+            if one.hidden is not None and one.hidden.explains(other, arms[other]):
                 unsure = hidden.ID
             elif not _source_shown(record, found, name, other, [one.findings[k] for k in places]):
                 unsure = "not shown"
@@ -113,6 +117,39 @@ def _partners(found: Mapping[str, Diagnosed]) -> Counter[str]:
 def _drop(one: Diagnosed, finding: Finding, free: State) -> None:
     one.findings.remove(finding)
     one.state = free
+
+
+def _arms(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    """Give the source that all axes together show best to each axis that it leaks into: none need show it alone. Beside
+    a quantity the white noise of the axes must show it too. Returns the axes whose model changed."""
+    gains = dict.fromkeys(found, 0.0)
+    for name, one in found.items():
+        others = {other: values for other, values in record.other_axes(name).items() if other in found}
+        for other, gain in zip(others, one.state.scores([*others.values()]) if others else (), strict=True):
+            gains[other] += float(gain)
+    for _, other, finding in leaks(found):
+        gains[other] = gains.get(other, 0.0) + finding.look.gain
+    source = max(gains, key=lambda name: gains[name], default="")
+    free = {name: without(one.state, source) for name, one in found.items() if name != source}
+    if len(free) < 2 or gains[source] < NET_LEAST:
+        return []
+    columns = {name: record.other_axes(name)[source] for name in free}
+    each = [free[name].bayes(columns[name], np.array(WIDTHS)) for name in free]
+    star = act_apart(*map(np.array, zip(*each, strict=True)))
+    names = [[*free][k] for k in star.axes]
+    if len(names) < 2 or star.evidence - math.log(len(gains)) < EVIDENT:
+        return []
+    quantity = found[names[0]].hidden
+    if quantity is not None and quantity.explains(source, names):
+        return []
+    changed = []
+    for name in {*names} - {name for name, other, _ in leaks(found) if other == source}:
+        for look in forms.look(free[name], [_channel(record, source, columns[name])])[:1]:
+            after = free[name].refit(**look.changes)
+            found[name].findings.append(Finding(look, 0, free[name], after))
+            found[name].state = after
+            changed.append(name)
+    return changed
 
 
 def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:

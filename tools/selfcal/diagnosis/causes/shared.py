@@ -249,7 +249,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             continue
         hidden = next((found[name].hidden for name in names if name in found), None)
         upto = 0.5 / one.dt if both.band is None else both.band[1] / (pair.u.size * one.dt)
-        if hidden is not None and hidden.explains(*names, upto):
+        if hidden is not None and hidden.explains(names[0], names[1:], upto):
             continue
         for name, other in (names, names[::-1]):
             if name in found:
