@@ -141,7 +141,7 @@ def test_noise_in_a_band_of_a_common_source(rate: float) -> None:
 def written(folder: Path, axes: dict[str, Array]) -> Path:
     """A log of 1 Hz."""
     path = folder / "pair.npz"
-    columns = {f"{name}[deg/s]": y for name, y in axes.items()}
+    columns = {f"{name}[{'deg/s' if name[0] == 'g' else 'm/s^2'}]": y for name, y in axes.items()}
     np.savez(path, allow_pickle=False, **{"t[s]": np.arange(len(columns["gx[deg/s]"])) * 1.0, **columns})
     return path
 
@@ -155,10 +155,21 @@ def test_one_source_of_several_axes_is_one_leak(tmp_path: Path, seed: int, sourc
     axes = {name: random.standard_normal(2 * SAMPLES) + drift(random, 2 * SAMPLES, 0.02) for name in names}
     followers = {name for name in names if name != source and name != "gz"}
     axes |= {name: axes[name] + 0.12 * axes[source] for name in followers}
-    columns = {f"{name}[{'deg/s' if name[0] == 'g' else 'm/s^2'}]": y for name, y in axes.items()}
-    np.savez(tmp_path / "star.npz", allow_pickle=False, **{"t[s]": np.arange(2.0 * SAMPLES), **columns})
-    leaks = [finding for finding in diagnose(tmp_path / "star.npz")["findings"] if finding["cause"] == "cross_axis"]
+    leaks = [finding for finding in diagnose(written(tmp_path, axes))["findings"] if finding["cause"] == "cross_axis"]
     assert [(leak["estimate"]["other"], set(leak["axes"])) for leak in leaks] == [(source, followers)]
+
+
+def test_a_source_that_no_pair_shows_is_a_leak(tmp_path: Path) -> None:
+    """0.5 x 4000 x 0.038^2 = 3 nats of the white noise on each of four axes, and some of the drift: by itself gz alone
+    shows it."""
+    random = np.random.default_rng(14)
+    names = ("gx", "gy", "gz", "ax", "ay")
+    axes = {name: random.standard_normal(2 * SAMPLES) + drift(random, 2 * SAMPLES, 0.02) for name in names}
+    axes |= {name: axes[name] + 0.038 * axes["gy"] for name in names if name != "gy"}
+    (leak,) = diagnose(written(tmp_path, axes))["findings"]
+    assert leak["cause"] == "cross_axis"
+    assert leak["estimate"]["other"] == "gy"
+    assert len(leak["axes"]) >= 3
 
 
 def test_a_leak_is_no_common_source(tmp_path: Path) -> None:

@@ -89,15 +89,16 @@ def test_a_law_and_a_channel_are_one_source_and_other_causes_are_not() -> None:
 
 
 def test_pieces_of_a_hidden_quantity_are_its_own() -> None:
-    """Jumps of its times, leaks among its axes, and the slow noise that these share. Not its white noise, nor an axis
-    that it does not move."""
+    """Jumps of its times, leaks among its axes that it explains, and the slow noise that these share. Not its white
+    noise, nor a leak that comes beside it, nor an axis that it does not move."""
     quantity = {"axes": {"gx": {}, "gy": {}, "ax": {}}, "estimate": {"jumps": [{"time_s": 812.0, "size": 3.0}]}}
     slow, white = {"band_hz": [0.0, 0.04]}, {}
     members = [
         member("gx", "step", 60.0, 815.0),
         member("gx", "step", 59.0, 1100.0),
         member("az", "step", 58.0, 813.0),
-        member("ax", "cross_axis", 57.0, other="gy"),
+        member("ax", "cross_axis", 57.0, other="gy", source="hidden_input"),
+        member("gy", "cross_axis", 56.5, other="ax"),
         member("ax", "cross_axis", 56.0, other="gz"),
         member("gy", "shared", 55.0, other="gx", **slow),
         member("gx", "shared", 54.0, other="gy", **white),
@@ -106,6 +107,7 @@ def test_pieces_of_a_hidden_quantity_are_its_own() -> None:
         ("hidden_input", "ax 57", "gx 60", "gy 55"),
         ("step", "gx 59"),
         ("step", "az 58"),
+        ("cross_axis", "gy 56.5"),
         ("cross_axis", "ax 56"),
         ("shared", "gx 54"),
     }

@@ -7,7 +7,7 @@ found. Jumps of several axes at one time come before the quantity: it would foll
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -32,7 +32,7 @@ from selfcal.likelihood.joint import (
     fitted,
     without_each,
     without_lines,
-    without_pair,
+    without_pairs,
 )
 from selfcal.likelihood.state import EVIDENT, NET_LEAST, Regressor, State, interval, net
 from selfcal.likelihood.statemodel import Array
@@ -139,13 +139,13 @@ class Hidden:
         # Before the record it acts on an axis as likely as not.
         return On(size, sd, float(expit(gain - math.log1p(abs(size) / sd))), Regressor(ID, ID, column, "1", {}))
 
-    def explains(self, one: str, two: str, upto_hz: float) -> bool:
-        """Whether noise that two axes share below a frequency is the quantity's: beside it their white noise does not
-        go together."""
-        if not {one, two} <= set(self.names) or upto_hz > 0.501 / self.dt:
+    def explains(self, one: str, others: Collection[str], upto_hz: float = 0.0) -> bool:
+        """Whether noise that an axis shares with some others below a frequency is the quantity's: beside it their white
+        noise does not go together."""
+        if not {one, *others} <= set(self.names) or upto_hz > 0.501 / self.dt:
             return False
-        at = [self.names.index(name) for name in (one, two)]
-        return without_pair(self.bins, self.model, at[0], at[1]) < NET_LEAST
+        at, *places = [self.names.index(name) for name in (one, *others)]
+        return without_pairs(self.bins, self.model, at, places) < NET_LEAST
 
     @cached_property
     def of_others(self) -> dict[str, Array]:

@@ -15,7 +15,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
-from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
+from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import logsumexp, softmax
 
 from selfcal.base.grid import half_means
@@ -76,6 +76,8 @@ LOCKED, HELD = 6, 0.02
 MULTIPLES, LN_ALONE = 5, math.log(2.0)
 #: ln of the ways in which the phases of a line on the axes may go together.
 LN_PHASES = math.log(2.0)
+#: Jumps of all levels, the largest ones, of which each two may be the ends of a pulse.
+PAIRED = 30
 #: Samples at each end in which no step is looked for, and of a pulse at least.
 EDGE, SHORTEST = 4, 4
 #: Share of the information of a step far from the ends, from which on two of them are taken as there.
@@ -223,15 +225,19 @@ def sizes(score: Array, known: Array) -> Array:
 
 def _best(gain: Array, score: Array, known: Array, apart: int) -> list[int]:
     """The best places of scores [n, m]: of all axes together, by their `gain` [n], and of each alone."""
-    found = []
     alone = 0.5 * score**2 / np.maximum(np.diagonal(known, axis1=-2, axis2=-1), 1e-300)
-    for each, count in [(gain, PLACES), *((one, 1) for one in alone.T)]:
-        left = np.array(each)
-        for _ in range(count):
-            at = int(np.argmax(left))
-            found.append(at)
-            left[max(0, at - apart) : at + apart + 1] = -math.inf
-    return list(dict.fromkeys(found))
+    found = [_peaks(gain, PLACES, apart), *(_peaks(one, 1, apart) for one in alone.T)]
+    return list(dict.fromkeys(at for each in found for at in each))
+
+
+def _peaks(gain: Array, count: int, apart: int) -> list[int]:
+    """Places of the largest gains [n], none within so many samples of a larger one."""
+    found, left = [], np.array(gain)
+    for _ in range(count):
+        at = int(np.argmax(left))
+        found.append(at)
+        left[max(0, at - apart) : at + apart + 1] = -math.inf
+    return found
 
 
 def _shared(gain: Array, at: int) -> float:
@@ -270,7 +276,14 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         gain = 0.5 * (some @ np.linalg.inv(cross + cross.T) * some).sum(axis=1)
         at = int(np.argmax(gain)) * apart
         best.append((float(gain.max()), at, at + length))
-    places = [_moved(seen, first, last) for _, first, last in sorted(best, reverse=True)[:PLACES]]
+    # A jump of each level is known more sharply than a long pulse is shifted.
+    ends = np.sort(_peaks(np.where(near_end, 0.0, full(shock, seen.course.known)), PAIRED, EDGE))
+    pairs = ends[np.transpose(np.triu_indices(ends.size, 1))]
+    first, last = pairs[(np.diff(pairs)[:, 0] <= lengths[-1]) & ~seen.passed[pairs].all(axis=1)].T
+    cross = seen.cross[0] - seen.cross[last - first]
+    gain = full(shock[first] - shock[last], cross + np.swapaxes(cross, 1, 2))
+    paired = [*zip(gain.tolist(), first.tolist(), last.tolist(), strict=True)]
+    places = [_moved(seen, *one[1:]) for each in (best, paired) for one in sorted(each, reverse=True)[:PLACES]]
     places = [one for one in dict.fromkeys(places) if one[1] - one[0] >= SHORTEST]
     t = np.arange(seen.n)
     columns = np.array([(t >= begin) & (t < end) for begin, end, _ in places], dtype=np.float64).reshape(-1, seen.n)
@@ -325,17 +338,10 @@ def lines(seen: Seen) -> Iterator[Candidate]:
     turns = np.arange(V.shape[0]) * n / padded
     place = np.minimum(np.rint(turns).astype(int), U.shape[0] - 1)
     price = np.where(usable[place], ln_lines(turns, n, np.ones(1)), math.inf)[:, None]
-    inverse = np.linalg.inv(known)[place]
     alone = 0.5 * np.abs(V) ** 2 / np.diagonal(known, axis1=1, axis2=2)[place]
-    gain = 0.5 * np.einsum("ki,kij,kj->k", V.conj(), inverse, V).real
-    gains = np.where(usable[place][:, None], np.column_stack([gain, alone]), 0.0)
-    comb = gains[: 1 + (len(gains) - 1) // MULTIPLES].copy()
-    for k in range(2, MULTIPLES + 1):  # what chance gives each axis is taken off
-        near = maximum_filter1d(gains[:, 0], 2 * (k // 2) + 1)[::k][: len(comb)]
-        comb[:, 0] += np.maximum(near - len(seen.y), 0.0)
-    comb[turns[: len(comb)] < SLOW_TURNS] = 0.0
-    places = [int(at) for each in (comb[:, :1], gains) for at in np.argmax(each - price[: len(each)], axis=0)]
-    for at in dict.fromkeys(places) if usable.any() else ():
+    gains = np.where(usable[place][:, None], np.column_stack([alone, _combs(V, known[place], usable[place])]), 0.0)
+    gains[turns < SLOW_TURNS, len(seen.y) + 2 :] = 0.0
+    for at in dict.fromkeys(np.argmax(gains - price, axis=0).tolist()) if usable.any() else ():
         most = 1 if turns[at] < SLOW_TURNS else min(MULTIPLES, (len(gains) - 1) // at)
         multiples = [k for k in range(1, most + 1) if usable[place[k * at]]]
         there = known[place[at * np.array(multiples)]]
@@ -355,20 +361,44 @@ def lines(seen: Seen) -> Iterator[Candidate]:
             for acts, phases, columns in _phased(parts, parts @ weights, there[: len(parts) // 2]):
                 cost = kinds + phases + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
                 found.append(Candidate("periodic", theta, acts, cost, columns))
-        yield _ranked(found)[0]
+        best, every = _ranked(found)[0], float(logsumexp([one.evidence for one in found]))
+        yield replace(best, price=best.act.evidence - every)  # the kinds share the evidence for a line
+
+
+def _combs(V: NDArray[np.complex128], known: Array, usable: Mask) -> Array:
+    """Gains of lines by their spectrum V [places, m] with information `known` [places, m, m]: with a phase on each
+    axis, and with 1, 2, ... multiples [places, 1 + multiples] of one waveform for all axes. A multiple may lie a bin
+    or two off its place."""
+    white = np.linalg.solve(np.linalg.cholesky(known), V[:, :, None])
+    power = np.where(usable[:, None, None], (white * np.swapaxes(white, 1, 2).conj()).real, 0.0)
+    loud = np.trace(power, axis1=1, axis2=2)
+    total, gains = power, np.zeros((len(V), 1 + MULTIPLES))
+    gains[:, 0] = 0.5 * loud
+    for k in range(1, MULTIPLES + 1):
+        at = k * np.arange(1 + (len(V) - 1 - k // 2) // k)
+        near = np.abs(at + np.arange(-(k // 2), k // 2 + 1)[:, None])
+        best = np.take_along_axis(near, np.argmax(loud[near], axis=0)[None], axis=0)[0]
+        total = power if k == 1 else total[: len(at)] + power[best]
+        gains[: len(at), k] = 0.5 * np.linalg.eigvalsh(total)[:, -1]
+    return gains
 
 
 def _phased(waves: Array, score: Array, known: Array) -> Iterator[tuple[Act, float, Array]]:
-    """Cosines and sines `waves` [2 k, n] by their scores [2 k, m] and information [k, m, m]: with a phase on each axis,
-    and with one for all, as a single source has it. Of each what it acts on, its price and its columns."""
+    """Cosines and sines `waves` [2 k, n] by their scores [2 k, m] and information [k, m, m]: each with a phase on each
+    axis, and of one waveform for all, as a single source has it. Of each what it acts on, its price and its columns."""
     yield act(score, np.repeat(known, 2, axis=0)), LN_PHASES, waves
-    pairs = score.reshape(len(known), 2, -1)
-    sizes, ways = np.linalg.eigh(pairs @ np.linalg.solve(known, np.swapaxes(pairs, 1, 2)))
-    turn = ways[:, None, :, 1]
-    # Phases that differ: half a turn over the width of the likelihood of one, 1 / sqrt(the fall of the square).
-    apart = np.maximum(0.5 * math.pi * (sizes[:, 1] - sizes[:, 0]), 1.0)
-    price = LN_PHASES + 0.5 * float(np.log(apart).sum())
-    yield act((turn @ pairs)[:, 0], known), price, (turn @ waves.reshape(len(known), 2, -1))[:, 0]
+    loud = np.sqrt(np.repeat(np.trace(np.linalg.solve(known[0], known), axis1=1, axis2=2), 2) / score.shape[1])
+    of_first = score / loud[:, None]
+    sizes, ways = np.linalg.eigh(of_first @ np.linalg.solve(known[0], of_first.T))
+    form, falling = ways[:, -1] / loud, np.repeat(np.arange(1, 1 + len(known)), 2)
+    # Waveforms that differ: half a sphere over the width of the likelihood of one, 1 / sqrt(the fall of the square).
+    half = 0.5 * sizes.size
+    fall = np.maximum(sizes[-1] - sizes[:-1], 2.0 / math.pi)  # no width is beyond half a turn
+    price = half * math.log(math.pi) - math.lgamma(half) + 0.5 * float(np.log(fall / (2.0 * math.pi)).sum())
+    # Before the record amplitudes fall like a square wave's: directions of normal ones (Tyler 1987, Biometrika 74).
+    price += float(np.log(loud / falling).sum() + half * np.log(((form * falling) ** 2).sum()))
+    there = np.tensordot((form**2).reshape(-1, 2).sum(axis=1), known, 1)
+    yield act((form @ score)[None], there), LN_PHASES + max(0.0, price), (form @ waves)[None]
 
 
 def _waves(f: float, n: int, multiples: Sequence[int]) -> Array:

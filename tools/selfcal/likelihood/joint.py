@@ -324,10 +324,11 @@ def without_each(bins: Bins, model: Joint) -> Array:
     return _value(bins, model) - np.array([_value(bins, one) for one in none])
 
 
-def without_pair(bins: Bins, model: Joint, one: int, two: int) -> float:
-    """The same where the white noise of two axes does not go together; infinite where the others need it to."""
+def without_pairs(bins: Bins, model: Joint, one: int, others: Sequence[int]) -> float:
+    """The same where the white noise of an axis does not go together with some others'; infinite where the rest need it
+    to."""
     correlation = model.correlation.copy()
-    correlation[one, two] = correlation[two, one] = 0.0
+    correlation[one, others] = correlation[others, one] = 0.0
     if float(np.linalg.eigvalsh(correlation)[0]) < 1e-6:
         return math.inf
     return _value(bins, model) - _value(bins, replace(model, correlation=correlation))

@@ -10,13 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis import forms
+from selfcal.diagnosis import forms, hidden
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, shown, sized
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State
+from selfcal.likelihood.joint import WIDTHS, act_apart
+from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.model.forms import formed
@@ -54,8 +55,8 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, one source of
     several axes is likelier than several of one; and of one pair the weaker coupling is kept: a mechanical one is
     below 1. Returns the axes whose model changed."""
-    changed = [*_own_ramps(record, found), *_star(record, found)]
-    static = [leak for leak in _leaks(found) if leak[2].look.estimate["form"] == "static"]
+    changed = [*_arms(record, found), *_own_ramps(record, found), *_star(record, found)]
+    static = [leak for leak in leaks(found) if leak[2].look.estimate["form"] == "static"]
     pairs = {(name, other): finding for name, other, finding in static}
     partners = _partners(found)
     for (name, other), finding in pairs.items():
@@ -76,21 +77,28 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         if ahead > 0.0:
             _drop(found[name], finding, without(found[name].state, other))
             changed.append(name)
+    arms: dict[str, set[str]] = {}
+    for name, other, _ in leaks(found):
+        arms.setdefault(other, set()).add(name)
     for name, one in found.items():
         of_other: dict[str, list[int]] = {}
         for k, finding in enumerate(one.findings):
             if finding.look.cause == "cross_axis":
                 of_other.setdefault(str(finding.look.estimate["other"]), []).append(k)
         for other, places in of_other.items():
-            if not _source_shown(record, found, name, other, [one.findings[k] for k in places]):
-                for k in places:
-                    look = one.findings[k].look
-                    look = replace(look, estimate={**look.estimate, "source": "not shown"})
-                    one.findings[k] = replace(one.findings[k], look=look)
+            unsure = ""
+            if one.hidden is not None and one.hidden.explains(other, arms[other]):
+                unsure = hidden.ID
+            elif not _source_shown(record, found, name, other, [one.findings[k] for k in places]):
+                unsure = "not shown"
+            for k in places if unsure else ():
+                look = one.findings[k].look
+                look = replace(look, estimate={**look.estimate, "source": unsure})
+                one.findings[k] = replace(one.findings[k], look=look)
     return changed
 
 
-def _leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
+def leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
     """Of each leak the axis that follows, the other one, and the finding."""
     return [
         (name, str(finding.look.estimate["other"]), finding)
@@ -102,7 +110,7 @@ def _leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
 
 def _partners(found: Mapping[str, Diagnosed]) -> Counter[str]:
     """Axes that each goes together with, whichever follows."""
-    pairs = {frozenset((name, other)) for name, other, _ in _leaks(found)}
+    pairs = {frozenset((name, other)) for name, other, _ in leaks(found)}
     return Counter(name for pair in pairs for name in pair)
 
 
@@ -111,11 +119,44 @@ def _drop(one: Diagnosed, finding: Finding, free: State) -> None:
     one.state = free
 
 
+def _arms(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+    """Give the source that all axes together show best to each axis that it leaks into: none need show it alone. Beside
+    a quantity the white noise of the axes must show it too. Returns the axes whose model changed."""
+    gains = dict.fromkeys(found, 0.0)
+    for name, one in found.items():
+        others = {other: values for other, values in record.other_axes(name).items() if other in found}
+        for other, gain in zip(others, one.state.scores([*others.values()]) if others else (), strict=True):
+            gains[other] += float(gain)
+    for _, other, finding in leaks(found):
+        gains[other] = gains.get(other, 0.0) + finding.look.gain
+    source = max(gains, key=lambda name: gains[name], default="")
+    free = {name: without(one.state, source) for name, one in found.items() if name != source}
+    if len(free) < 2 or gains[source] < NET_LEAST:
+        return []
+    columns = {name: record.other_axes(name)[source] for name in free}
+    each = [free[name].bayes(columns[name], np.array(WIDTHS)) for name in free]
+    star = act_apart(*map(np.array, zip(*each, strict=True)))
+    names = [[*free][k] for k in star.axes]
+    if len(names) < 2 or star.evidence - math.log(len(gains)) < EVIDENT:
+        return []
+    quantity = found[names[0]].hidden
+    if quantity is not None and quantity.explains(source, names):
+        return []
+    changed = []
+    for name in {*names} - {name for name, other, _ in leaks(found) if other == source}:
+        for look in forms.look(free[name], [_channel(record, source, columns[name])])[:1]:
+            after = free[name].refit(**look.changes)
+            found[name].findings.append(Finding(look, 0, free[name], after))
+            found[name].state = after
+            changed.append(name)
+    return changed
+
+
 def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     """Drop an axis that shows in another by nothing but what its own model explains: a step or a ramp, of which both
     may have their own. Returns the axes whose model changed."""
     changed = []
-    for name, other, finding in _leaks(found):
+    for name, other, finding in leaks(found):
         source = found[other].state if other in found else record.axes[other]
         if all(column.cause == "cross_axis" for column in source.regressors):
             continue
@@ -132,14 +173,14 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     other way round explains it nearly as well. Returns the axes whose model changed."""
     changed: list[str] = []
     partners = _partners(found)
-    for name, other, finding in _leaks(found):
+    for name, other, finding in leaks(found):
         if partners[name] <= partners[other] or other not in found:
             continue
         one, source = found[name], found[other]
         free = without(one.state, other)
         back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
         lost = one.state.best.ln_likelihood - free.best.ln_likelihood
-        if back and back[0].net >= NET_LEAST and back[0].gain > lost - ALIKE:
+        if back and back[0].gain > lost - ALIKE:  # of the pair that is shown already, the likelier source
             _drop(one, finding, free)
             after = source.state.refit(**back[0].changes)
             source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
@@ -213,7 +254,7 @@ CAUSE = Cause(
     least=_least,
     grouping=Grouping(
         alike=lambda a, b: bool(a.estimate["other"] == b.estimate["other"]),
-        piece=lambda look, axes, jumps: look.estimate["other"] in axes,
+        piece=lambda look, axes, jumps: look.estimate["other"] in axes and look.estimate.get("source") == hidden.ID,
         settle=_settle,
     ),
     written=Written(entry=_entry, of_column=forms.of_other),

@@ -7,6 +7,7 @@ a module does not know of it. The gain is the joint log score of the pair less t
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +19,7 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
 from selfcal.diagnosis.cause import Cause, Grouping, Scored, shown
-from selfcal.diagnosis.causes.cross_axis import without
+from selfcal.diagnosis.causes.cross_axis import leaks, without
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, interval, net
@@ -235,18 +236,20 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     An axis that is not in `found` has the model that it was fitted with at first."""
     states = {**record.axes, **{name: one.state for name, one in found.items()}}
     states = {name: state for name, state in states.items() if state.whitened.size and not state.below_lattice}
-    changed = [name for name, one in found.items() if name in states and _leaks(one, states)]
-    states |= {name: found[name].state for name in changed}
     pairs = [pair for pair in combinations(states, 2) if any(name in found for name in pair)]
+    ln_pairs = math.log(max(1, len(pairs)))
+    sources = Counter(other for _, other, _ in leaks(found))
+    changed = [name for name, one in found.items() if name in states and _leaks(one, states, sources, ln_pairs)]
+    states |= {name: found[name].state for name in changed}
     for names in pairs:
         one, two = (states[name] for name in names)
         pair = pair_of(one.whitened, two.whitened, one.dt)
-        both = common(pair, math.log(len(pairs)))
+        both = common(pair, ln_pairs)
         if both is None or both.net < NET_LEAST:
             continue
         hidden = next((found[name].hidden for name in names if name in found), None)
         upto = 0.5 / one.dt if both.band is None else both.band[1] / (pair.u.size * one.dt)
-        if hidden is not None and hidden.explains(*names, upto):
+        if hidden is not None and hidden.explains(names[0], names[1:], upto):
             continue
         for name, other in (names, names[::-1]):
             if name in found:
@@ -285,21 +288,23 @@ def _accounted(name: str, one: Diagnosed, found: Mapping[str, Diagnosed]) -> boo
     return dropped
 
 
-def _leaks(one: Diagnosed, states: Mapping[str, State]) -> bool:
+def _leaks(one: Diagnosed, states: Mapping[str, State], sources: Mapping[str, int], ln_pairs: float) -> bool:
     """Judge whether an axis that follows another shares a source with it instead; returns whether its model changed.
 
     A leak has one coefficient at all frequencies, the drift's included. A common source is in the noise alone. The one
-    that explains more stays."""
+    that explains more stays, net of the searches: the best of many bands gains more than one coefficient does, and a
+    source that leaks into another axis as well is no longer looked for."""
     changed = False
     for finding in [finding for finding in one.findings if finding.look.cause == "cross_axis"]:
         other = str(finding.look.estimate["other"])
         if other not in states:
             continue
         free = without(one.state, other)
-        both = common(pair_of(free.whitened, states[other].whitened, free.dt))
+        both = common(pair_of(free.whitened, states[other].whitened, free.dt), ln_pairs)
         if both is None or both.net < NET_LEAST:
             continue
-        ahead = both.gain - (one.state.best.ln_likelihood - free.best.ln_likelihood)
+        search = finding.look.gain - finding.look.net - (math.log(len(states) - 1) if sources[other] > 1 else 0.0)
+        ahead = both.net - (one.state.best.ln_likelihood - free.best.ln_likelihood - search)
         if ahead > ALIKE:
             one.findings.remove(finding)
             one.state = free
