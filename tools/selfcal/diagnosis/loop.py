@@ -104,10 +104,10 @@ def diagnose_record(
     if len(walked) < len(found):
         raise Stopped
     named = {name: [finding.look for finding in one.findings] for name, one in found.items()}
-    settled = [
-        _weed(found),
-        *(cause.grouping.settle(record, found) for cause in CAUSES.values() if cause.grouping.settle is not None),
-    ]
+    _weed(found)
+    for cause in CAUSES.values():
+        if cause.grouping.settle is not None:
+            cause.grouping.settle(record, found)
 
     def again(name: str) -> None:
         """What a finding that was dropped stood before may be one now."""
@@ -139,11 +139,10 @@ def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
     one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
 
 
-def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
+def _weed(found: Mapping[str, Diagnosed]) -> None:
     """Drop events of several axes that what was found after them explains as well, and axes of which it explains most:
     noise with a memory, or a law that the first model had not, looks like events to it, and a leak shows one of another
-    axis again. Returns the axes whose model changed."""
-    changed: list[str] = []
+    axis again."""
     events: dict[int, list[tuple[Diagnosed, Finding]]] = {}
     for one in found.values():
         for finding in one.findings:
@@ -164,8 +163,6 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
                 continue
             one.findings = [each for each in one.findings if each is not finding]
             one.state = state
-            changed.append(state.axis)
-    return changed
 
 
 def _measure(one: Diagnosed) -> None:

@@ -48,13 +48,14 @@ def _channel(record: Record, name: str, values: Array) -> Channel:
     )
 
 
-def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Two axes that each blame the other: the reading that follows is the one that gains more by it.
 
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, one source of
     several axes is likelier than several of one; and of one pair the weaker coupling is kept: a mechanical one is
-    below 1. Returns the axes whose model changed."""
-    changed = [*_own_ramps(record, found), *_star(record, found)]
+    below 1."""
+    _own_ramps(record, found)
+    _star(record, found)
     static = [leak for leak in _leaks(found) if leak[2].look.estimate["form"] == "static"]
     pairs = {(name, other): finding for name, other, finding in static}
     partners = _partners(found)
@@ -65,7 +66,6 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             known = source.best.ln_likelihood - without(source, name).best.ln_likelihood
             if known > finding.look.gain - ALIKE:
                 _drop(found[name], finding, without(found[name].state, other))
-                changed.append(name)
             continue
         ahead: float = back.look.gain - finding.look.gain
         if abs(ahead) < ALIKE:
@@ -75,7 +75,6 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
             _drop(found[name], finding, without(found[name].state, other))
-            changed.append(name)
     for name, one in found.items():
         of_other: dict[str, list[int]] = {}
         for k, finding in enumerate(one.findings):
@@ -87,7 +86,6 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                     look = one.findings[k].look
                     look = replace(look, estimate={**look.estimate, "source": "not shown"})
                     one.findings[k] = replace(one.findings[k], look=look)
-    return changed
 
 
 def _leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
@@ -111,10 +109,9 @@ def _drop(one: Diagnosed, finding: Finding, free: State) -> None:
     one.state = free
 
 
-def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Drop an axis that shows in another by nothing but what its own model explains: a step or a ramp, of which both
-    may have their own. Returns the axes whose model changed."""
-    changed = []
+    may have their own."""
     for name, other, finding in _leaks(found):
         source = found[other].state if other in found else record.axes[other]
         if all(column.cause == "cross_axis" for column in source.regressors):
@@ -123,14 +120,11 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
         if not any(look.net >= NET_LEAST for look in rest):
             _drop(found[name], finding, free)
-            changed.append(name)
-    return changed
 
 
-def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Turn a leak about, where the axis that follows goes together with more axes than the other one does, and the
-    other way round explains it nearly as well. Returns the axes whose model changed."""
-    changed: list[str] = []
+    other way round explains it nearly as well."""
     partners = _partners(found)
     for name, other, finding in _leaks(found):
         if partners[name] <= partners[other] or other not in found:
@@ -144,8 +138,6 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             after = source.state.refit(**back[0].changes)
             source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
             source.state = after
-            changed += [name, other]
-    return changed
 
 
 def _source_shown(
