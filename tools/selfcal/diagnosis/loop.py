@@ -415,7 +415,7 @@ def _looked(
     """The looks of `causes`, the most worth first; what has no name comes after every cause that has one. `seen` are
     those at this state. A cause waits while its `worth`, when it was last looked at, is less than the best has now."""
     named = Counter(finding.look.cause for finding in one.findings)
-    waiting = sorted((cause for cause in causes if cause not in seen), key=lambda cause: worth.get(cause, math.inf))
+    waiting = sorted((cause for cause in causes if cause not in seen), key=lambda cause: -worth.get(cause, math.inf))
     while True:
         looks = [
             look
@@ -424,9 +424,9 @@ def _looked(
             and not any(map(look.repeats, (*one.harmful, *one.dropped)))
         ]
         best = max(map(_worth, looks), default=-math.inf)
-        if not waiting or worth.get(waiting[-1], math.inf) < best - ALIKE:
+        if not waiting or worth.get(waiting[0], math.inf) < best - ALIKE:
             return sorted(looks, key=lambda look: (_worth(look), look.net), reverse=True)
-        cause = waiting.pop()
+        cause = waiting.pop(0)
         seen[cause] = cause(one.state, record)
         worth[cause] = max(map(_worth, seen[cause]), default=-math.inf)
 
