@@ -11,7 +11,7 @@ import math
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -23,6 +23,10 @@ from scipy.stats import binom
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError
 from selfcal.batch.fail_on import outcome
+from selfcal.diagnosis.cause import Looks
+from selfcal.diagnosis.finding import Diagnosed
+from selfcal.diagnosis.loop import _looked
+from selfcal.diagnosis.record import Record as OfAxes
 from selfcal.diagnosis.swing import MOST as BANDS_MOST
 from selfcal.likelihood.fit import (
     COLUMNS_MOST,
@@ -34,6 +38,7 @@ from selfcal.likelihood.fit import (
     slopes,
 )
 from selfcal.likelihood.fit import run as run_filter
+from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Terms, matrices
 from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
@@ -157,6 +162,48 @@ def test_a_model_of_six_columns_leaves_room_for_a_transient(tmp_path: Path) -> N
     y = 0.2 + 0.05 * np.random.default_rng(4).standard_normal(t.size) + 0.8 * np.exp(-t / 12) + 0.5 * np.exp(-t / 240)
     save(tmp_path / "log.npz", {"gx": ("deg/s", y)}, 4.0)
     assert identify(tmp_path / "log.npz", model=model)["axes"]["gx"]["suspicion"] == "turn_on"
+
+
+def test_marks_change_no_sum() -> None:
+    """A gain stays over a mark: every sum up to one is that of a pass that ends there."""
+    random = np.random.default_rng(2)
+    y = random.normal(size=4000)
+    y[1500:1520] = np.nan
+    terms, theta = Terms(walk=True, flicker=True, bands=((20.0, 0.01, -0.5),)), np.array([-4.0, -2.0])
+    series = Series(y, 0.1, np.ones(y.size), np.vstack([np.ones(y.size), np.sin(np.arange(y.size))]))
+    marks = [1, 700, 1510, 1517, 2900, 2901, 4000]
+    for mark, sums in zip(marks, run_filter(series, terms, theta, marks)[0], strict=True):
+        part = Series(np.where(np.arange(y.size) < mark, y, np.nan), 0.1, series.r, series.columns)
+        alone = run_filter(part, terms, theta)[0][0]
+        assert sums.n == alone.n
+        np.testing.assert_allclose(sums.G, alone.G, rtol=2e-5, atol=1e-3)
+        assert pytest.approx(alone.D, abs=1e-3) == sums.D
+
+
+def test_a_cause_waits_until_it_may_be_the_best() -> None:
+    """A cause is looked at while it was worth as much as the best is now, and each where nothing is worth naming. What
+    has no name waits for every cause that has one."""
+    one, record = Diagnosed(*3 * [cast(Any, None)]), cast(Any, None)
+    nets = {"step": [50.0, 20.0, 0.0, 0.0], "ramp": [31.0, 1.0, 1.0], "pulse": [9.0, 2.0], "unexplained": [700.0]}
+    looked: list[str] = []
+
+    def cause(name: str) -> Looks:
+        def looks(state: State, record: OfAxes) -> list[Look]:
+            looked.append(name)
+            return [Look(name, 99.0, nets[name].pop(0), {}, {})]
+
+        return looks
+
+    worth = dict(zip(map(cause, nets), (60.0, 30.0, 27.0, -math.inf), strict=True))
+    for due, named in (
+        (["step"], ["step"]),
+        (["step", "ramp"], ["ramp", "step"]),
+        (["ramp", "pulse", "step"], ["pulse", "ramp", "step"]),
+        (["pulse", "ramp", "step", "unexplained"], ["unexplained", "pulse", "ramp", "step"]),
+    ):
+        looked.clear()
+        assert [look.cause for look in _looked(one, record, [*worth], worth, {})] == named
+        assert sorted(looked) == sorted(due)
 
 
 def test_a_column_of_zeros_has_no_coefficient() -> None:

@@ -18,13 +18,14 @@ namespace {
 constexpr int settled_samples = 8;
 constexpr double settled = 1e-12;
 // Below a change a sample the gain stays for so many samples, and the covariance goes over them in one jump. s is off
-// by 6e-6 of itself at most. Such errors have no sign: over 10^6 samples they sum to some 0.005 nats.
+// by 6e-6 of itself at most. Such errors have no sign: over 10^6 samples they sum to some 0.005 nats. The jump of a
+// stretch goes on from that of the shorter one.
 struct Stretch {
     double slow;
     int doublings;
 };
-constexpr Stretch stretches[] = {{1e-9, 10}, {1e-7, 6}};
-constexpr int stretch_count = 2;
+constexpr Stretch stretches[] = {{1e-7, 6}, {1e-8, 8}, {1e-9, 10}};
+constexpr int stretch_count = 3;
 
 // Samples that share one gain are cut into so many pieces of one length, and the pieces go through the filter side by
 // side: a chain of multiply-adds waits for its own results, and eight chains wait together.
@@ -210,7 +211,7 @@ template <class T, int D> struct Jump {
     alignas(aligned) Square<T, D> A, B, C;
     double r = -1.0;
 
-    void prepare(const Model<T, D> &m, double noise, int doublings) {
+    void of_one(const Model<T, D> &m, double noise) {
         r = noise;
         copy<T, D>(m.F, A);
         copy<T, D>(m.Q, B);
@@ -219,6 +220,9 @@ template <class T, int D> struct Jump {
                 C[a][b] = m.h[a] * m.h[b] / m.noise(r);
         if (m.driver >= 0)
             B[m.driver][m.driver] = B[m.driver][m.driver] * r;
+    }
+
+    void twice(int doublings) {
         for (int k = 0; k < doublings; k++) {
             Square<T, D> X, Y, AT, CX, next;
             copy<T, D>(A, X); // (1 + B C)^-1 A
@@ -322,42 +326,49 @@ template <class T, int D> struct Filter {
     // Whether the sample may be read with the last one's gain, once that has settled.
     bool alike(std::size_t i) const { return std::isfinite(in.y[i]) && in.r[i] == r; }
 
-    // Covariance, gain and s of sample i; the covariance goes on to the next one.
+    // Covariance, gain and s of sample i; the covariance goes on to the next one. It is symmetric: of its derivatives
+    // one half is worked out, of mere numbers all, as whole rows are vectors.
     void covariance(std::size_t i) {
         const bool present = std::isfinite(in.y[i]);
-        T Ph[D], K[D], A[D][D], FA[D][D];
+        T Ph[D] = {}, K[D], A[D][D], FA[D][D + 2]; // FA: from its second column on, between columns of 0
         s = m.noise(in.r[i]);
-        for (int a = 0; a < D; a++) {
-            Ph[a] = 0.0;
-            for (int b = 0; b < D; b++)
+        for (int b = 0; b < D; b++)
+            for (int a = 0; a < D; a++)
                 Ph[a] += P[b][a] * m.h[b];
+        for (int a = 0; a < D; a++)
             s += m.h[a] * Ph[a];
-        }
         const T inverse = present ? T(1.0) / s : T(0.0);
         for (int a = 0; a < D; a++)
             K[a] = Ph[a] * inverse;
         for (int a = 0; a < D; a++)
-            for (int b = a; b < D; b++)
-                A[a][b] = A[b][a] = P[a][b] - K[a] * Ph[b];
+            for (int b = plain_numbers ? 0 : a; b < D; b++) {
+                A[a][b] = P[a][b] - K[a] * Ph[b];
+                if (!plain_numbers)
+                    A[b][a] = A[a][b];
+            }
         for (int a = 0; a < D; a++) {
-            const int before = a > 0 ? a - 1 : 0, after = a < D - 1 ? a + 1 : a;
+            const int before = a > 0 ? a - 1 : 0, after = a < D - 1 ? a + 1 : a, first = plain_numbers ? 0 : before;
             FK[a] = on[a] * K[a];
-            for (int b = before; b < D; b++) // no more is needed of a symmetric P
-                FA[a][b] = on[a] * A[a][b];
+            FA[a][0] = FA[a][D + 1] = 0.0;
+            for (int b = first; b < D; b++)
+                FA[a][b + 1] = on[a] * A[a][b];
             if (!tied[a])
                 continue;
             FK[a] += below[a] * K[before] + above[a] * K[after];
-            for (int b = before; b < D; b++)
-                FA[a][b] += below[a] * A[before][b] + above[a] * A[after][b];
+            for (int b = first; b < D; b++)
+                FA[a][b + 1] += below[a] * A[before][b] + above[a] * A[after][b];
         }
-        for (int a = 0; a < D; a++)
-            for (int b = a; b < D; b++) {
-                const int before = b > 0 ? b - 1 : 0, after = b < D - 1 ? b + 1 : b;
-                T next = m.Q[a][b] + FA[a][b] * on[b];
-                if (tied[b])
-                    next += FA[a][before] * below[b] + FA[a][after] * above[b];
-                P[a][b] = P[b][a] = next;
-            }
+        for (int a = 0; a < D; a++) {
+            for (int b = plain_numbers ? 0 : a; b < D; b++)
+                P[a][b] = m.Q[a][b] + FA[a][b + 1] * on[b];
+            if (!diagonal)
+                for (int b = plain_numbers ? 0 : a; b < D; b++)
+                    if (plain_numbers || tied[b])
+                        P[a][b] += FA[a][b] * below[b] + FA[a][b + 2] * above[b];
+        }
+        for (int a = 0; a < D && !plain_numbers; a++)
+            for (int b = 0; b < a; b++)
+                P[a][b] = P[b][a];
         if (m.driver >= 0)
             P[m.driver][m.driver] += m.Q[m.driver][m.driver] * (in.r[i] - 1.0);
         scale = T(1.0) / root(s);
@@ -384,17 +395,28 @@ template <class T, int D> struct Filter {
         return std::min(even_to, end);
     }
 
+    // The jump of stretch k, from those of the shorter ones.
+    void prepare(int k) {
+        if (jumps[k].r == r)
+            return;
+        if (k > 0) {
+            prepare(k - 1);
+            jumps[k] = jumps[k - 1];
+        } else
+            jumps[k].of_one(m, r);
+        jumps[k].twice(stretches[k].doublings - (k > 0 ? stretches[k - 1].doublings : 0));
+    }
+
     // Gain of sample i, for a stretch of alike samples where it moves slowly enough; the covariance goes beyond them.
-    void gain(std::size_t i, std::size_t stop) {
-        for (int k = 0; k < stretch_count; k++) {
+    void gain(std::size_t i) {
+        for (int k = stretch_count; k-- > 0;) {
             const std::size_t length = std::size_t{1} << stretches[k].doublings;
-            if (slowly[k] < settled_samples || stop - i < length || even(i, i + length) < i + length)
+            if (slowly[k] < settled_samples || in.n - i < length || even(i, i + length) < i + length)
                 continue;
             Square<T, D> before;
             copy<T, D>(P, before);
             covariance(i);
-            if (jumps[k].r != r)
-                jumps[k].prepare(m, r, stretches[k].doublings);
+            prepare(k);
             copy<T, D>(before, P);
             jumps[k].over(P);
             since = static_cast<double>(length);
@@ -658,36 +680,39 @@ template <class T, int D> struct Filter {
 
     void run() {
         std::size_t mark = 0, i = 0;
+        bool present = false;
         for (;;) {
             while (mark < in.mark_count && in.marks[mark] == i)
                 leave(mark++);
             if (i == in.n)
                 return;
-            const bool present = std::isfinite(in.y[i]);
-            const std::size_t stop = mark < in.mark_count ? in.marks[mark] : in.n;
-            if (quiet >= settled_samples && alike(i))
-                held = even(i, stop);
-            else {
-                gain(i, stop);
-                if (gains != nullptr)
-                    keep(i);
+            if (i == held) {
+                present = std::isfinite(in.y[i]);
+                if (quiet >= settled_samples && alike(i))
+                    held = even(i, in.n);
+                else {
+                    gain(i);
+                    if (gains != nullptr)
+                        keep(i);
+                }
+                if (m.driver >= 0 && held < in.n)
+                    P[m.driver][m.driver] += m.Q[m.driver][m.driver] * (in.r[held] - in.r[i]);
             }
-            if (m.driver >= 0 && held < in.n)
-                P[m.driver][m.driver] += m.Q[m.driver][m.driver] * (in.r[held] - in.r[i]);
+            const std::size_t to = mark < in.mark_count ? std::min(held, in.marks[mark]) : held;
             if (diagonal)
-                advance<true>(i, held);
+                advance<true>(i, to);
             else
-                advance<false>(i, held);
+                advance<false>(i, to);
             if (out.s != nullptr)
-                for (std::size_t j = i; j < held; j++)
+                for (std::size_t j = i; j < to; j++)
                     out.s[j] = value_of(s);
             if (present) {
-                const double samples = static_cast<double>(held - i);
+                const double samples = static_cast<double>(to - i);
                 ln_s += ln_now * samples;
                 spread.add(ln_now, samples);
-                counted += held - i;
+                counted += to - i;
             }
-            i = held;
+            i = to;
         }
     }
 };

@@ -103,14 +103,14 @@ class Grouping:
     alike   whether two looks are one event or source: the same time, line, channel or law.
     pairs   its looks name the other axis of a pair (`other`): pairs that meet are one group of axes.
     piece   whether a look is a piece of a hidden quantity, of which it gets the axes and the times of jumps, s.
-    settle  after the rounds of all axes: joins, moves or adds findings; returns the axes to be judged anew.
+    settle  after the rounds of all axes: joins, moves or adds findings.
     most    times at most that the loop names it on an axis; 0: as often as it is found.
     """
 
     alike: Callable[[Look, Look], bool] = lambda a, b: False
     pairs: bool = False
     piece: Callable[[Look, Collection[str], Sequence[float]], bool] = field(default=lambda look, axes, jumps: False)
-    settle: Callable[[Record, Mapping[str, Diagnosed]], Sequence[str]] | None = None
+    settle: Callable[[Record, Mapping[str, Diagnosed]], None] | None = None
     most: int = 0
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from itertools import chain
 from types import MappingProxyType
 
 import numpy as np
@@ -39,7 +41,7 @@ SPENT = "its work was bounded (tools/pages/diagnose.md): there may be more cause
 UNLASTING = 2.0 * NET_LEAST
 #: Means that hold a jump: the one in which it lies, and the one beside it that may be that.
 HOLDS = 2
-#: From this finding on, a cause that is not worth telling waits until none of the others is.
+#: From this finding on, a cause waits that was worth less than another one when it was last looked at.
 BUSY = 3
 
 
@@ -91,7 +93,6 @@ def diagnose_record(
                     _rounds(record, one, advance, causes or (QUICK if name in means else LOOKS))
             except work.Spent:
                 spent = SPENT
-            _measure(one)
             walked[name] = spent
 
     def end(name: str) -> None:
@@ -103,10 +104,10 @@ def diagnose_record(
     if len(walked) < len(found):
         raise Stopped
     named = {name: [finding.look for finding in one.findings] for name, one in found.items()}
-    settled = [
-        _weed(found),
-        *(cause.grouping.settle(record, found) for cause in CAUSES.values() if cause.grouping.settle is not None),
-    ]
+    _weed(found)
+    for cause in CAUSES.values():
+        if cause.grouping.settle is not None:
+            cause.grouping.settle(record, found)
 
     def again(name: str) -> None:
         """What a finding that was dropped stood before may be one now."""
@@ -116,10 +117,10 @@ def diagnose_record(
         causes = tuple(looks for looks in (QUICK if name in means else LOOKS) if looks in OWN)
         if gone:
             walk(name, causes)
-        else:
+        with suppress(Stopped):
             _measure(one)
 
-    work.each(again, dict.fromkeys(name for names in settled for name in names))
+    work.each(again, found)
     tilt.settle(record, found)
     work.each(end, found)
     return found
@@ -138,11 +139,10 @@ def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
     one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
 
 
-def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
+def _weed(found: Mapping[str, Diagnosed]) -> None:
     """Drop events of several axes that what was found after them explains as well, and axes of which it explains most:
     noise with a memory, or a law that the first model had not, looks like events to it, and a leak shows one of another
-    axis again. Returns the axes whose model changed."""
-    changed: list[str] = []
+    axis again."""
     events: dict[int, list[tuple[Diagnosed, Finding]]] = {}
     for one in found.values():
         for finding in one.findings:
@@ -163,8 +163,6 @@ def _weed(found: Mapping[str, Diagnosed]) -> list[str]:
                 continue
             one.findings = [each for each in one.findings if each is not finding]
             one.state = state
-            changed.append(state.axis)
-    return changed
 
 
 def _measure(one: Diagnosed) -> None:
@@ -370,33 +368,30 @@ def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], stat
 def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], causes: Sequence[Looks]) -> None:
     """Name what is worth it of some causes until nothing is."""
     number = 1 + max((finding.round for finding in one.findings), default=0)
-    idle: set[Looks] = set()
+    worth: dict[Looks, float] = {}
+    seen: dict[Looks, list[Look]] = {}  # at this state
     while number <= ROUNDS and not one.state.below_lattice:
         advance(f"{one.state.axis}: round {number}")
-        waiting = [cause for cause in causes if cause in idle]
-        looks, idle = _looked(one, record, [cause for cause in causes if cause not in idle])
-        harms = True
-        while harms:  # the state stays, and so do the other looks at it
-            if waiting and (not looks or looks[0].net < NET_LEAST):
-                more, unworthy = _looked(one, record, waiting)
-                looks, idle, waiting = _by_worth([*looks, *more]), idle | unworthy, []
-            if not looks or looks[0].net < NET_LEAST:
-                return
-            # Of what is as likely a channel that was recorded comes first.
-            best = next((look for look in looks if look.cause in record.channels), looks[0])
-            best = best if best.net > looks[0].net - ALIKE else looks[0]
-            after = one.state.refit(**best.changes)
-            known = score.gain(best, one.state, after, record)
-            harms = _refuted(best, known)
-            if harms:
-                (one.dropped if _free(best) else one.harmful).append(best)
-                looks = [look for look in looks if not look.repeats(best)]
-        causes_of = {(finding.round, finding.event, finding.look.cause) for finding in one.findings}  # motion once
-        idle = idle | set(waiting) if len(causes_of) >= BUSY else set()
+        looks = _looked(one, record, causes, worth, seen)
+        if not looks or looks[0].net < NET_LEAST:
+            return
+        # Of what is as likely a channel that was recorded comes first.
+        best = next((look for look in looks if look.cause in record.channels), looks[0])
+        best = best if best.net > looks[0].net - ALIKE else looks[0]
+        after = one.state.refit(**best.changes) if best.changes else one.state
+        known = score.gain(best, one.state, after, record)
+        if _refuted(best, known):
+            (one.dropped if _free(best) else one.harmful).append(best)
+            continue
         rivals = tuple(look for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
         possible = tuple(dict.fromkeys(look.cause for look in rivals))
         one.findings.append(Finding(best, number, one.state, after, possible, rivals, held_out=known))
-        one.state = after
+        if best.changes:
+            one.state = after
+            seen.clear()
+        causes_of = {(finding.round, finding.event, finding.look.cause) for finding in one.findings}  # motion once
+        if len(causes_of) < BUSY:
+            worth.clear()
         number += 1
 
 
@@ -414,27 +409,31 @@ def _refuted(look: Look, held_out: HeldOut | None) -> bool:
     return held_out is not None and held_out.harms
 
 
-def _looked(one: Diagnosed, record: Record, causes: Sequence[Looks]) -> tuple[list[Look], set[Looks]]:
-    """The looks of `causes`, the most worth first, and the causes of which none is worth naming."""
+def _looked(
+    one: Diagnosed, record: Record, causes: Sequence[Looks], worth: dict[Looks, float], seen: dict[Looks, list[Look]]
+) -> list[Look]:
+    """The looks of `causes`, the most worth first; what has no name comes after every cause that has one. `seen` are
+    those at this state. A cause waits while its `worth`, when it was last looked at, is less than the best has now."""
     named = Counter(finding.look.cause for finding in one.findings)
-    found: list[Look] = []
-    idle: set[Looks] = set()
-    for cause in causes:
+    waiting = sorted((cause for cause in causes if cause not in seen), key=lambda cause: -worth.get(cause, math.inf))
+    while True:
         looks = [
             look
-            for look in cause(one.state, record)
+            for look in chain(*seen.values())
             if named[look.cause] < (CAUSES[look.cause].grouping.most or ROUNDS)
             and not any(map(look.repeats, (*one.harmful, *one.dropped)))
         ]
-        found += looks
-        if all(look.net < NET_LEAST for look in looks):
-            idle.add(cause)
-    return _by_worth(found), idle
+        best = max(map(_worth, looks), default=-math.inf)
+        if not waiting or worth.get(waiting[0], math.inf) < best - ALIKE:
+            return sorted(looks, key=lambda look: (_worth(look), look.net), reverse=True)
+        cause = waiting.pop(0)
+        seen[cause] = cause(one.state, record)
+        worth[cause] = max(map(_worth, seen[cause]), default=-math.inf)
 
 
-def _by_worth(looks: Sequence[Look]) -> list[Look]:
-    """The most worth first; what has no name comes after every cause that has one."""
-    return sorted(looks, key=lambda look: (look.cause == "unexplained" or look.net < NET_LEAST, -look.net))
+def _worth(look: Look) -> float:
+    """Nats of a look that may be named."""
+    return -math.inf if look.cause == "unexplained" or look.net < NET_LEAST else look.net
 
 
 def _unexplained(one: Diagnosed) -> None:

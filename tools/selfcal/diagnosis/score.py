@@ -22,17 +22,13 @@ from selfcal.diagnosis.extend import WIDE
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import passed, run
 from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut, error_entry, score_entry, spread
-from selfcal.likelihood.state import Look, State
+from selfcal.likelihood.state import Look, Sequential, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
 
 #: Samples to score, and between the first and the last prediction, at least.
 LEAST = 30
 #: The bias is a mean over so long, s.
 BIAS_S = 60.0
-
-
-#: ln evidence [marks] of the samples before each mark; by horizon the bias that is predicted from each of its places.
-Sequential = tuple[Array, Mapping[float, Array]]
 
 
 @dataclass(frozen=True)
@@ -166,7 +162,11 @@ def _posterior(G: Array, D: Array, n: Array, prior: Array) -> tuple[Array, Array
 def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Sequential:
     """The model of a state: a sum over nodes of the drift, with the weights that the samples before a mark leave them.
 
-    The nodes are what the whole record leaves possible."""
+    The nodes are what the whole record leaves possible. The state keeps its sums: the next finding is scored against
+    them."""
+    key = marks.tobytes()
+    if key in state.sequential:
+        return state.sequential[key]
     series, prior, window = state.series, _prior(state), _window(state.dt)
     nodes = list(state.possible(state.none, rich=False))
     ln_evidence = np.empty((len(nodes), marks.size))
@@ -188,7 +188,8 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
         horizon: (weight[:, np.searchsorted(marks, places)] * bias[horizon]).sum(axis=0)
         for horizon, places in horizons.items()
     }
-    return logsumexp(ln_evidence, axis=0), predicted
+    state.sequential[key] = logsumexp(ln_evidence, axis=0), predicted
+    return state.sequential[key]
 
 
 def _errors(

@@ -40,6 +40,8 @@ MEANS_MOST, SLOW_S = 3000, 1.0
 
 #: No term beside white noise and the drift.
 NONE = Terms()
+#: ln evidence [marks] of the samples before each mark; by horizon the bias that is predicted from each of its places.
+Sequential = tuple[Array, Mapping[float, Array]]
 
 
 @dataclass(frozen=True)
@@ -160,6 +162,11 @@ class State:
     def fitted_with(self, terms: Terms, more: Array) -> Fit:
         """The fit of one drift with further columns [k, n]."""
         return _fit_from(self.series.beside(more), terms, self.fits)
+
+    @cached_property
+    def sequential(self) -> dict[bytes, Sequential]:
+        """Its scores on held-out time that are known, by their marks."""
+        return {}
 
     @property
     def none(self) -> Array:

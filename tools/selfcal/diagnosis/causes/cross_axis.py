@@ -49,13 +49,15 @@ def _channel(record: Record, name: str, values: Array) -> Channel:
     )
 
 
-def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Two axes that each blame the other: the reading that follows is the one that gains more by it.
 
     White noise correlates both ways alike, and only the drifts tell the two apart. Where they do not, one source of
     several axes is likelier than several of one; and of one pair the weaker coupling is kept: a mechanical one is
-    below 1. Returns the axes whose model changed."""
-    changed = [*_arms(record, found), *_own_ramps(record, found), *_star(record, found)]
+    below 1."""
+    _arms(record, found)
+    _own_ramps(record, found)
+    _star(record, found)
     static = [leak for leak in leaks(found) if leak[2].look.estimate["form"] == "static"]
     pairs = {(name, other): finding for name, other, finding in static}
     partners = _partners(found)
@@ -66,7 +68,6 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             known = source.best.ln_likelihood - without(source, name).best.ln_likelihood
             if known > finding.look.gain - ALIKE:
                 _drop(found[name], finding, without(found[name].state, other))
-                changed.append(name)
             continue
         ahead: float = back.look.gain - finding.look.gain
         if abs(ahead) < ALIKE:
@@ -76,7 +77,6 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
             _drop(found[name], finding, without(found[name].state, other))
-            changed.append(name)
     arms: dict[str, set[str]] = {}
     for name, other, _ in leaks(found):
         arms.setdefault(other, set()).add(name)
@@ -95,7 +95,6 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                 look = one.findings[k].look
                 look = replace(look, estimate={**look.estimate, "source": unsure})
                 one.findings[k] = replace(one.findings[k], look=look)
-    return changed
 
 
 def leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
@@ -119,9 +118,9 @@ def _drop(one: Diagnosed, finding: Finding, free: State) -> None:
     one.state = free
 
 
-def _arms(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Give the source that all axes together show best to each axis that it leaks into: none need show it alone. Beside
-    a quantity the white noise of the axes must show it too. Returns the axes whose model changed."""
+    a quantity the white noise of the axes must show it too."""
     gains = dict.fromkeys(found, 0.0)
     for name, one in found.items():
         others = {other: values for other, values in record.other_axes(name).items() if other in found}
@@ -132,30 +131,26 @@ def _arms(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     source = max(gains, key=lambda name: gains[name], default="")
     free = {name: without(one.state, source) for name, one in found.items() if name != source}
     if len(free) < 2 or gains[source] < NET_LEAST:
-        return []
+        return
     columns = {name: record.other_axes(name)[source] for name in free}
     each = [free[name].bayes(columns[name], np.array(WIDTHS)) for name in free]
     star = act_apart(*map(np.array, zip(*each, strict=True)))
     names = [[*free][k] for k in star.axes]
     if len(names) < 2 or star.evidence - math.log(len(gains)) < EVIDENT:
-        return []
+        return
     quantity = found[names[0]].hidden
     if quantity is not None and quantity.explains(source, names):
-        return []
-    changed = []
+        return
     for name in {*names} - {name for name, other, _ in leaks(found) if other == source}:
         for look in forms.look(free[name], [_channel(record, source, columns[name])])[:1]:
             after = free[name].refit(**look.changes)
             found[name].findings.append(Finding(look, 0, free[name], after))
             found[name].state = after
-            changed.append(name)
-    return changed
 
 
-def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Drop an axis that shows in another by nothing but what its own model explains: a step or a ramp, of which both
-    may have their own. Returns the axes whose model changed."""
-    changed = []
+    may have their own."""
     for name, other, finding in leaks(found):
         source = found[other].state if other in found else record.axes[other]
         if all(column.cause == "cross_axis" for column in source.regressors):
@@ -164,14 +159,11 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
         if not any(look.net >= NET_LEAST for look in rest):
             _drop(found[name], finding, free)
-            changed.append(name)
-    return changed
 
 
-def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
+def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Turn a leak about, where the axis that follows goes together with more axes than the other one does, and the
-    other way round explains it nearly as well. Returns the axes whose model changed."""
-    changed: list[str] = []
+    other way round explains it nearly as well."""
     partners = _partners(found)
     for name, other, finding in leaks(found):
         if partners[name] <= partners[other] or other not in found:
@@ -185,8 +177,6 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
             after = source.state.refit(**back[0].changes)
             source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
             source.state = after
-            changed += [name, other]
-    return changed
 
 
 def _source_shown(

@@ -163,9 +163,8 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
     return columns.located(state, "periodic", replace(known, sharper=None))
 
 
-def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    """Lines that axes have in common have one frequency, that of the axis that shows it best. Returns the axes whose
-    model changed."""
+def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
+    """Lines that axes have in common have one frequency, that of the axis that shows it best."""
     lines = [
         (name, finding)
         for name, one in found.items()
@@ -173,7 +172,6 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         if finding.look.cause == "periodic" and finding.columns and finding.record is None
     ]
     first: list[tuple[str, float]] = []
-    changed = []
     for name, finding in sorted(lines, key=lambda line: -line[1].look.gain):
         one, hz = found[name], _hz(finding.look)
         common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME), hz)
@@ -191,10 +189,8 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
         own = finding.before.refit(**at(finding.before, record, theta).changes)
         one.findings[one.findings.index(finding)] = replace(finding, look=look, after=own)
         one.state = after
-        changed.append(name)
     for one in found.values():
         _harmonics(one)
-    return changed
 
 
 def _hz(look: Look) -> float:
@@ -237,7 +233,9 @@ def _breadth(line: Look) -> float:
 
 
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
-    """The line that the first half alone shows."""
+    """The line that the first half alone shows. A band has no column that it could show."""
+    if look.shape is None:
+        return after
     part = replace(record, present=record.present[:split])
     found = _line(before.first(split), part)
     if not found:

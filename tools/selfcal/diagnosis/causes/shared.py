@@ -230,8 +230,8 @@ def by_frequency(pair: Pair) -> tuple[Array, Array, Array]:
     return hz, cross.real / np.maximum(bins, 1.0), np.sqrt(0.5 / free)
 
 
-def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
-    """Noise that two axes share, on both, with the evidence of the pair. Returns the axes whose model changed.
+def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
+    """Noise that two axes share, on both, with the evidence of the pair.
 
     An axis that is not in `found` has the model that it was fitted with at first."""
     states = {**record.axes, **{name: one.state for name, one in found.items()}}
@@ -239,8 +239,10 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
     pairs = [pair for pair in combinations(states, 2) if any(name in found for name in pair)]
     ln_pairs = math.log(max(1, len(pairs)))
     sources = Counter(other for _, other, _ in leaks(found))
-    changed = [name for name, one in found.items() if name in states and _leaks(one, states, sources, ln_pairs)]
-    states |= {name: found[name].state for name in changed}
+    judged = {name: each for name, each in found.items() if name in states}
+    for each in judged.values():
+        _leaks(each, states, sources, ln_pairs)
+    states |= {name: each.state for name, each in judged.items()}
     for names in pairs:
         one, two = (states[name] for name in names)
         pair = pair_of(one.whitened, two.whitened, one.dt)
@@ -261,7 +263,8 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> list[str]:
                 seen = replace(seen, gain=seen.gain + sum(one.look.gain for one in own))
                 seen = replace(seen, net=seen.net + sum(one.look.net for one in own))
                 findings.append(Finding(seen, last, state, state, partner=partner))
-    return [*changed, *(name for name, one in found.items() if _accounted(name, one, found))]
+    for name, each in found.items():
+        _accounted(name, each, found)
 
 
 def _of_band(band: Look, shared: Look, pair: Pair) -> bool:
@@ -275,26 +278,22 @@ def _of_band(band: Look, shared: Look, pair: Pair) -> bool:
     return bool(low < centre < high and half > BROAD * centre and bins > BROAD_BINS)
 
 
-def _accounted(name: str, one: Diagnosed, found: Mapping[str, Diagnosed]) -> bool:
-    """Drop a dependence on another axis that no form explains where that axis leaks or shares a source; returns whether
-    there was one. Seen from the axis that leaks, its coefficient differs from one frequency to the next."""
+def _accounted(name: str, one: Diagnosed, found: Mapping[str, Diagnosed]) -> None:
+    """Drop a dependence on another axis that no form explains where that axis leaks or shares a source. Seen from the
+    axis that leaks, its coefficient differs from one frequency to the next."""
     known = {str(finding.look.estimate["other"]) for finding in one.findings if "other" in finding.look.estimate}
     for other, two in found.items():
         if any(finding.look.estimate.get("other") == name for finding in two.findings):
             known.add(other)
-    kept = [finding for finding in one.findings if finding.look.changes or finding.look.shown_by not in known]
-    dropped = len(kept) < len(one.findings)
-    one.findings[:] = kept
-    return dropped
+    one.findings[:] = [each for each in one.findings if each.look.changes or each.look.shown_by not in known]
 
 
-def _leaks(one: Diagnosed, states: Mapping[str, State], sources: Mapping[str, int], ln_pairs: float) -> bool:
-    """Judge whether an axis that follows another shares a source with it instead; returns whether its model changed.
+def _leaks(one: Diagnosed, states: Mapping[str, State], sources: Mapping[str, int], ln_pairs: float) -> None:
+    """Judge whether an axis that follows another shares a source with it instead.
 
     A leak has one coefficient at all frequencies, the drift's included. A common source is in the noise alone. The one
     that explains more stays, net of the searches: the best of many bands gains more than one coefficient does, and a
     source that leaks into another axis as well is no longer looked for."""
-    changed = False
     for finding in [finding for finding in one.findings if finding.look.cause == "cross_axis"]:
         other = str(finding.look.estimate["other"])
         if other not in states:
@@ -308,11 +307,9 @@ def _leaks(one: Diagnosed, states: Mapping[str, State], sources: Mapping[str, in
         if ahead > ALIKE:
             one.findings.remove(finding)
             one.state = free
-            changed = True
         elif ahead > -max(ALIKE, LOST * both.gain):
             possible = tuple(dict.fromkeys((*finding.also_possible, "shared")))
             one.findings[one.findings.index(finding)] = replace(finding, also_possible=possible)
-    return changed
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:

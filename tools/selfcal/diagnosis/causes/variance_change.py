@@ -30,6 +30,7 @@ from selfcal.diagnosis.causes.step import ONE_EVENT_S
 from selfcal.diagnosis.forms import LN_SMOOTHINGS, SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
+from selfcal.likelihood.columns import NEARLY
 from selfcal.likelihood.edges import raised
 from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array
@@ -79,7 +80,7 @@ def looks(state: State, record: Record) -> list[Look]:
         gain = slope_of(square, level.values[present])[1]
         if gain > best.get(level.column, (0.0, level))[0]:
             best[level.column] = gain, level
-    found = (_look(state, level) for gain, level in best.values() if net(gain, 1, level.price(gain)) >= 1.0)
+    found = (_look(state, level) for gain, level in best.values() if net(gain, 1, level.price(gain)) > NEARLY)
     return [look for look in found if look is not None]
 
 
