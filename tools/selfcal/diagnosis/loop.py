@@ -41,6 +41,8 @@ SPENT = "its work was bounded (tools/pages/diagnose.md): there may be more cause
 UNLASTING = 2.0 * NET_LEAST
 #: Means that hold a jump: the one in which it lies, and the one beside it that may be that.
 HOLDS = 2
+#: Noise of a fit over that of the first one, below which it has none: of readings that are equal it explains them all.
+NO_NOISE = 1e-6
 #: From this finding on, a cause waits that was worth less than another one when it was last looked at.
 BUSY = 3
 
@@ -380,8 +382,9 @@ def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], caus
         best = best if best.net > looks[0].net - ALIKE else looks[0]
         after = one.state.refit(**best.changes) if best.changes else one.state
         known = score.gain(best, one.state, after, record)
-        if _refuted(best, known):
-            (one.dropped if _free(best) else one.harmful).append(best)
+        emptied = after.best.sigma < NO_NOISE * one.first.best.sigma
+        if emptied or _refuted(best, known):
+            (one.dropped if emptied or _free(best) else one.harmful).append(best)
             continue
         rivals = tuple(look for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
         possible = tuple(dict.fromkeys(look.cause for look in rivals))
