@@ -25,9 +25,10 @@ SHARES: Mapping[str, float] = MappingProxyType(
 
 #: Of modules of six axes at rest with noise and a drift alone, by what says that something is wrong: a look at one axis
 #: (a check of `identify`, a cause of `diagnose`), all axes together, the statistics of the innovations of an axis, and
-#: their coherence with the channels. The sum keeps 1 in 100.
+#: their coherence with the channels. The sum keeps 2 in 100. With a fifth of its share all axes together miss 2 of 24
+#: causes of 30 nats (`make hidden-several`, seeds 470 and 471).
 OF_MODULES: Mapping[str, float] = MappingProxyType(
-    {"looks": 7e-3, "together": 2e-3, "statistics": 8e-4, "coherence": 2e-4}
+    {"looks": 7e-3, "together": 1e-2, "statistics": 8e-4, "coherence": 2e-4}
 )
 AXES = 6
 #: Independent looks at an axis, in effect: the eight checks, and eleven of `diagnose`. Of 348 axes of clean modules
