@@ -272,6 +272,8 @@ def test_columns_are_as_defined(gaps: bool) -> None:
     whole = np.interp(np.arange(n), rows, values[rows])
     assert formed(values[rows], "lag", 9.0, 0.0, dt, missing) == pytest.approx(late(whole, 9.0, dt)[rows], abs=2e-5)
     assert formed(values[rows], "square", about=20.0) == pytest.approx((values[rows] - 20.0) ** 2, rel=1e-6)
+    before = np.interp(rows - 12.3 / dt, np.arange(n), whole)
+    assert formed(values[rows], "delay", 12.3, 0.0, dt, missing) == pytest.approx(before)
     assert formed(values[rows], "play", 2.5) == pytest.approx(play(values[rows], 2.5))
     window = 32
     slope = [np.polyfit(dt * np.arange(window), whole[i - window + 1 : i + 1], 1)[0] for i in rows[rows >= window]]
@@ -304,7 +306,7 @@ def test_a_filtered_rate_is_simulated() -> None:
 def test_a_form_begins_at_rest() -> None:
     """No form has a transient where the channel is constant, and a rate is none."""
     values = np.full(50, 31.7)
-    for form, expected in (("lag", 31.7), ("play", 31.7), ("rate", 0.0)):
+    for form, expected in (("lag", 31.7), ("play", 31.7), ("delay", 31.7), ("rate", 0.0)):
         assert formed(values, form, 12.0) == pytest.approx(expected)
 
 
@@ -324,6 +326,7 @@ def with_regressor(folder: Path, **entry: Any) -> Path:
         ({"form": "late"}, "form: unknown 'late'"),
         ({"form": "lag"}, "'lag_s' is missing"),
         ({"form": "play"}, "'width' is missing"),
+        ({"form": "delay"}, "'delay_s' is missing"),
         ({"form": "free"}, "form: free with knots"),
         ({"form": "square", "knots": [[1, 2], [2, 3]]}, "goes with form: free"),
         ({"form": "free", "knots": [[1, 2], [1, 3]]}, "must rise"),
@@ -344,6 +347,7 @@ def test_a_form_is_checked(tmp_path: Path, entry: dict[str, Any], complaint: str
     ("entry", "unit"),
     [
         ({"form": "play", "width": 5}, "degC"),
+        ({"form": "delay", "delay_s": 5}, "degC"),
         ({"column": "ax", "unit": "m/s^2", "input": "variance"}, "m^2/s^4"),
     ],
 )
@@ -370,11 +374,33 @@ def test_codegen_writes_a_form(tmp_path: Path, entry: dict[str, Any], unit: str,
     assert f"{{SELFCAL_COLUMN_{source}}}" in (tmp_path / "tables" / "selfcal_model.c").read_text()
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_delay_is_found_to_the_second(tmp_path: Path, seed: int) -> None:
+    """Truth: 0.03 deg/s/degC, 40 to 150 s late, of a temperature that wanders faster than that, from rest. The interval
+    holds the delay within twice its half, the written model states it, and takes the temperature out of the drift."""
+    random = np.random.default_rng([61, seed])
+    n, delay = 5000, random.uniform(40.0, 150.0)
+    warm = 30.0 + wander(random, n, 1.0, 3.0, 60.0)
+    gx = N * random.standard_normal(n) + K * random.standard_normal(n).cumsum()
+    gx += 0.03 * np.interp(np.arange(n) - delay, np.arange(n), warm)
+    log, written = tmp_path / "late.npz", tmp_path / "late.yaml"
+    np.savez(log, allow_pickle=False, **{"t[s]": np.arange(n), "gx[deg/s]": gx, "temp[degC]": warm})
+    (finding,) = diagnose(log, write_model=written)["findings"]
+    assert finding["cause"] == "temperature"
+    assert finding["estimate"]["form"] == "delay"
+    found = finding["estimate"]["delay_s"]
+    assert abs(found["median"] - delay) < found["q95"] - found["q05"] < 10.0
+    answer = identify(log, model=written)["axes"]["gx"]
+    assert answer["adequate"]
+    assert answer["parameters"]["random_walk"]["K"]["median"] < 2.0 * K
+
+
 def test_simulate_makes_the_forms(tmp_path: Path) -> None:
     """A reading with the effect less one without is the form of the temperature. The recorded temperature is on a
     lattice of 0.14 degC, the readings on one of 0.05 deg/s: both are a rounding off."""
     coefficient = 2.0
     effects = {"lag": f"coefficient={coefficient},lag_s=150", "play": f"coefficient={coefficient},width=1.5"}
+    effects["delay"] = f"coefficient={coefficient},delay_s=90"
     logs = {name: tmp_path / f"{name}.npz" for name in ("plain", *effects)}
     simulate(None, logs["plain"], seed=3)
     for name, keys in effects.items():
@@ -383,6 +409,7 @@ def test_simulate_makes_the_forms(tmp_path: Path) -> None:
     temperature = read["plain"]["temp"].values
     dt = 3600.0 / temperature.size
     expected = {"lag": late(temperature, 150.0, dt), "play": play(temperature, 1.5)}
+    expected["delay"] = np.interp(np.arange(temperature.size) - 90.0 / dt, np.arange(temperature.size), temperature)
     for name, curve in expected.items():
         added = read[name]["gx"].values - read["plain"]["gx"].values
         assert np.abs(added - coefficient * (curve - curve[0])).max() < coefficient * 0.14 + 0.05 + 1e-6

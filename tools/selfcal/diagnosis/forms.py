@@ -1,8 +1,8 @@
 """How a channel acts on an axis: its forms scored side by side with the drift refitted, and the look at the best.
 
 A channel is the temperature, the supply, another axis, or another axis' short-term variance. Its influence may be
-static, late by a first-order lag, its rate, its square or cube, or come through a play. Each form is one or more
-columns. The simplest form is taken unless another gains clearly more.
+static, late by a first-order lag, its rate, its square or cube, or come through a play or after a fixed delay. Each
+form is one or more columns. The simplest form is taken unless another gains clearly more.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from scipy.fft import rfft
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import chdtrc
 
 from selfcal.base.units import power
@@ -24,8 +24,8 @@ from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Number, Shape, Tried
-from selfcal.likelihood.fit import left
-from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State
+from selfcal.likelihood.fit import left, run
+from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, ln_looks
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, POWER, curved, formed, slope
@@ -33,7 +33,7 @@ from selfcal.model.regressors import coefficient_unit
 
 #: Forms, the simplest first. `first_order` is (coefficient + rate s) / (1 + lag_s s): static, a lag, and a filtered
 #: rate are cases of it.
-FORMS = ("static", "lag", "rate", "square", "first_order", "cube", "play", "free")
+FORMS = ("static", "lag", "rate", "square", "first_order", "cube", "play", "delay", "free")
 #: The columns of each form: a power comes with all that are simpler.
 PARTS = {"square": ("static", "square"), "cube": ("static", "square", "cube"), "first_order": ("static", "lag")}
 #: Forms with a time constant of a lag.
@@ -60,6 +60,7 @@ LN_FORMS = {
     "first_order": 3.0,
     "cube": 2.0,
     "play": 3.0,
+    "delay": 0.0,
     "free": 2.0,
 }
 #: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
@@ -177,12 +178,14 @@ def shape_of(channel: Channel, state: State, form: str, number: float, width_s: 
         len(found),
         stated={"form": form, **own, "input": channel.input, **channel.extra},
     )
-    if form not in (*LATE, "play"):
+    if form not in (*LATE, "play", "delay"):
         return shape
     if form == "play":
         theta = Number(NUMBER["play"], number, channel.of, 0.02 * _span(channel), _span(channel))
     else:
-        theta = Number(NUMBER["lag"], number, "s", state.dt, LONGEST_LAG * channel.values.size * state.dt)
+        theta = Number(
+            NUMBER.get(form, NUMBER["lag"]), number, "s", state.dt, LONGEST_LAG * channel.values.size * state.dt
+        )
     return replace(shape, numbers=(theta,), moved=lambda other: shape_of(channel, state, form, other[0], width_s))
 
 
@@ -225,6 +228,8 @@ def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
             continue
         if form in LATE:
             yield from (shape_of(channel, state, form, lag, 0.0) for lag in _lags(channel, state))
+        elif form == "delay":
+            yield from (_delayed(channel, state, width) for width in dict.fromkeys((widths[0], middle)))
         elif form == "rate":
             windows = [max(window, dt) for window in channel.rate_windows_s if window <= n * dt / 6.0]
             yield from (shape_of(channel, state, form, window, 0.0) for window in dict.fromkeys(windows))
@@ -235,6 +240,26 @@ def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
             yield from (shape_of(channel, state, form, k, width) for k in curve.counts(n) for width in widths[:2])
         else:
             yield from (shape_of(channel, state, form, math.nan, width) for width in widths)
+
+
+def _delayed(channel: Channel, state: State, width_s: float) -> Shape:
+    """The likeliest delay of a channel's means: all of them by one pass of the filter."""
+    about = smoothed(channel.values, max(1, round(width_s / state.dt))) - channel.values.mean()
+    series, fit = state.series.beside(about), state.best
+    column = np.nan_to_num(run(series, fit.terms, fit.theta, innovations=True)[1][:, -1])
+    size = next_fast_len(2 * column.size)
+    score = irfft(rfft(np.nan_to_num(state.whitened), size) * np.conj(rfft(column, size)), size)
+    most = max(2, int(LONGEST_LAG * column.size))
+    bend = np.full(most, 1.0 - float(column[1:] @ column[:-1]) / max(float(column @ column), 1e-300))
+
+    def at(delay_s: float) -> Shape:
+        return replace(
+            shape_of(channel, state, "delay", delay_s, width_s),
+            price=lambda gain: channel.ln_looks + ln_looks(bend, gain),
+            moved=lambda other: at(other[0]),
+        )
+
+    return at((1 + int(np.argmax(score[1:most] ** 2))) * state.dt)
 
 
 def _lags(channel: Channel, state: State) -> list[float]:
@@ -361,7 +386,7 @@ def least(state: State, record: Record, channel: str) -> dict[str, tuple[float, 
 
 #: Keys of `simulate --effect` beside the coefficient: the numbers of a form, and its other coefficients.
 EFFECT_KEYS = {
-    **{key: positive(None) for key in ("lag_s", "width", "window_s")},
+    **{key: positive(None) for key in ("lag_s", "width", "delay_s", "window_s")},
     **{key: Key(None) for key in ("rate", "square", "cube", "knots")},
 }
 
@@ -371,7 +396,7 @@ def added(keys: Mapping[str, Any], channels: Channels, values: Array) -> Array:
     sample."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
     total = np.zeros(values.size)
-    for form in ("lag", "play"):
+    for form in ("lag", "play", "delay"):
         if NUMBER[form] in keys:
             late = formed(values, form, float(keys[NUMBER[form]]), 0.0, interval_s)
             total += float(keys["coefficient"]) * (late - values)

@@ -38,6 +38,7 @@ LABELS = {
     "tau_2_s": "time constant",
     "lag_s": "time constant of the lag",
     "width": "width of the play",
+    "delay_s": "delay",
     "misread": "share read as a neighbour",
     "value": "a dead band about",
     "lag1": "correlation of neighbours",
@@ -52,6 +53,7 @@ FORMS = {
     "first_order": "by its value and its rate behind one first-order lag",
     "cube": "by its cube as well",
     "play": "through a play (hysteresis)",
+    "delay": "late by a fixed time",
     "free": "by a curve of its own",
 }
 #: Forms, as an alternative.
@@ -61,6 +63,7 @@ FORM_NAMES = {
     "cube": "its cube",
     "lag": "a lag",
     "play": "a play",
+    "delay": "a delay",
     "free": "a curve",
 }
 #: What stands out, by the beginning of a statistic's name.

@@ -20,7 +20,7 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 from selfcal.base.units import SENSORS
-from selfcal.model.forms import FORMS, INPUTS, NUMBER, POWER, Knots
+from selfcal.model.forms import FORMS, HOST_FORMS, INPUTS, NUMBER, POWER, Knots
 from selfcal.model.laws import (
     DAMPING_LIMITS,
     FACTORS,
@@ -66,7 +66,7 @@ LOG_NORMAL_SD = (1e-4, 5.0)
 #: Kinds of regressors, and the keys of an entry of each apart from name, kind, sd and probability.
 REGRESSORS: dict[str, tuple[str, ...]] = {
     "time": ("reference",),
-    "column": ("column", "unit", "reference", "window_s", "input", "form", "lag_s", "width", "knots"),
+    "column": ("column", "unit", "reference", "window_s", "input", "form", "lag_s", "width", "delay_s", "knots"),
     "rate": ("column", "unit", "reference", "window_s"),
     "periodic": ("frequency_hz",),
     "step": ("time_s",),
@@ -172,6 +172,7 @@ class Regressor:
     form: str = "static"
     lag_s: float = math.nan
     width: float = math.nan
+    delay_s: float = math.nan
     knots: Knots = ()
 
     @property
@@ -182,7 +183,7 @@ class Regressor:
     @property
     def on_module(self) -> bool:
         """Whether `selfcal_form()` makes its columns."""
-        return self.form not in ("play", "free") and self.input == "value"
+        return self.form not in HOST_FORMS and self.input == "value"
 
     @property
     def offset(self) -> float:
@@ -605,7 +606,7 @@ class _Reader:
             raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
         needed: dict[str, Any] = {
             key: self.number(self.entry(fields, key, where), f"{where}.{key}")
-            for key in ("window_s", "frequency_hz", "time_s", "tau_s", "start_s", "end_s", "lag_s", "width")
+            for key in ("window_s", "frequency_hz", "time_s", "tau_s", "start_s", "end_s", "lag_s", "width", "delay_s")
             if key in REGRESSORS[kind] and (kind != "column" or key in fields or key == NUMBER.get(chosen["form"]))
         }
         if kind == "pulse" and not needed["end_s"] > needed["start_s"]:

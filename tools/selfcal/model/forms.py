@@ -14,9 +14,11 @@ from selfcal import _library32
 from selfcal.base.grid import Array
 
 #: Forms, the simplest first.
-FORMS = ("static", "lag", "rate", "square", "cube", "play", "free")
+FORMS = ("static", "lag", "rate", "square", "cube", "play", "delay", "free")
+#: Those that no module makes.
+HOST_FORMS = ("play", "delay", "free")
 #: Entry with a form's number.
-NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width"}
+NUMBER = {"lag": "lag_s", "rate": "window_s", "play": "width", "delay": "delay_s"}
 #: A curve: values of the channel, rising, and heights. Between two the line through both holds, beyond the ends these.
 Knots = tuple[tuple[float, float], ...]
 #: Power of the channel's unit, by form.
@@ -59,7 +61,7 @@ def made(
 
 
 def source_of(form: str, channel: int, number: float, about: float, mean_s: float) -> Source:
-    """`selfcal_source_t` of a form. A play has the channel's: the library has no play."""
+    """`selfcal_source_t` of a form. Those that the library has not have the channel's."""
     if form == "lag":
         return KIND["LAG"], channel, number, mean_s
     if form == "rate":
@@ -79,14 +81,16 @@ def formed(
 ) -> Array:
     """[n]: the column that `values` [n] of a channel make. Sample i follows `missing[i]` absent ones.
 
-    `number`: the time constant of a lag, s; the window of a rate, s; the whole width of a play. A rate is the slope of
-    the straight line that fits its window best. `about`: what powers are taken about. A lag, a rate and a play begin at
-    rest, at the first value. Between two samples the channel moves on a straight line.
+    `number`: the time constant of a lag, s; the window of a rate, s; the whole width of a play; a delay, s. A rate is
+    the slope of the straight line that fits its window best. `about`: what powers are taken about. A lag, a rate, a
+    play and a delay begin at rest, at the first value. Between two samples the channel moves on a straight line.
     """
     if form == "static" or values.size == 0:
         return values
     if form == "play":
         return played(values, number)
+    if form == "delay":
+        return delayed(values, number / interval_s, missing)
     origin = about if form in POWER else float(values[0])  # float32 has seven digits
     column = made([source_of(form, 0, number, 0.0, 0.0)], interval_s, (values - origin)[:, None], missing)[:, 0]
     return np.asarray(column + origin) if form == "lag" else column
@@ -110,6 +114,13 @@ def played(values: Array, width: float) -> Array:
         position = min(max(position, value - half), value + half)
         out[i] = position
     return out
+
+
+def delayed(values: Array, samples: float, missing: NDArray[np.integer[Any]] | None = None) -> Array:
+    """[n]: `values` [n] so many samples later."""
+    at = np.arange(values.size, dtype=np.float64)
+    at += 0.0 if missing is None else np.cumsum(missing)
+    return np.asarray(np.interp(at - samples, at, values))
 
 
 def curved(values: Array, knots: Knots) -> Array:

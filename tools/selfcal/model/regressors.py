@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model, Regressor
-from selfcal.model.forms import KIND, Source, curved, made, played, source_of, variance_of
+from selfcal.model.forms import KIND, Source, curved, delayed, made, played, source_of, variance_of
 
 #: Columns of a kind of regressor without a channel: names in C, and the entries with their numbers.
 _SHAPES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
@@ -31,12 +31,12 @@ Choice = tuple[Regressor, ...]
 def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
-    The library forms them (`selfcal_form()`), as it does on a module. A play and a curve, which it lacks, are made of
-    its means. Time counts from the first row, s; a step and a pulse have the clock of the recording that the rows were
-    cut from, a turn-on counts from power-on. A column with a `window_s` is the mean over that time up to each row. A
-    step is 1 from its time on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain over the
-    last `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a column
-    that is absent or of another kind.
+    The library forms them (`selfcal_form()`), as it does on a module. A play, a delay and a curve, which it lacks, are
+    made of its means. Time counts from the first row, s; a step and a pulse have the clock of the recording that the
+    rows were cut from, a turn-on counts from power-on. A column with a `window_s` is the mean over that time up to each
+    row. A step is 1 from its time on, a pulse 1 from its start until its end. A rate (the kind) is the channel's gain
+    over the last `window_s`, in the first window its gain since the first row, over `window_s`. Raises UserError for a
+    column that is absent or of another kind.
     """
     if not regressors:
         return np.empty((recording.samples, 0))
@@ -57,6 +57,9 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
     for regressor in regressors:
         if regressor.form == "play":
             columns[:, first] = as_float(played(columns[:, first], regressor.width))
+        elif regressor.form == "delay":
+            samples = regressor.delay_s * recording.rate_hz
+            columns[:, first] = as_float(delayed(columns[:, first], samples, missing))
         elif regressor.form == "free":
             columns[:, first] = as_float(curved(columns[:, first], regressor.knots))
         first += len(regressor.columns)

@@ -14,7 +14,7 @@ from selfcal.base.templates import of_code
 from selfcal.base.units import factor
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.file import LEAST_NODES, NOT_HANDLED, Model
-from selfcal.model.forms import COLUMN_KINDS
+from selfcal.model.forms import COLUMN_KINDS, HOST_FORMS
 from selfcal.model.laws import KIND_CODES, MOST_TERMS
 from selfcal.model.tables import AxisTable, PriorRow, Tables, gate_table
 from selfcal.wire.frames import AXES, carries
@@ -104,7 +104,7 @@ def check_forms(model: Model) -> None:
     """Raises UserError for a regressor of a form that no module makes."""
     for regressor in model.regressors:
         if not regressor.on_module:
-            what = f"form: {regressor.form}" if regressor.form in ("play", "free") else f"input: {regressor.input}"
+            what = f"form: {regressor.form}" if regressor.form in HOST_FORMS else f"input: {regressor.input}"
             raise UserError(
                 f"{model.path}: regressor '{regressor.name}': no module makes `{what}`: leave the regressor out, or "
                 "take `identify`, which does"
