@@ -103,13 +103,15 @@ class Pair:
 
 @dataclass(frozen=True)
 class Common:
-    """What a pair has in common: `coherence` (its sign and phase), `bins` it rests on, `gain` and `net` in nats.
+    """What a pair has in common: `coherence` (its sign and phase), `bins` it rests on, `gain` and `net` in nats:
+    `searched` net of the search, `net` also with what its scatter over bins and pieces allows.
     `band`: bins of the spectrum, first and end; None: white noise."""
 
     coherence: complex
     bins: float
     gain: float
     net: float
+    searched: float
     band: tuple[int, int] | None = None
 
     @property
@@ -148,7 +150,8 @@ def common(pair: Pair, ln_pairs: float = 0.0) -> Common | None:
         # Few loud bins are no evidence for many: the scatter of the products decides.
         sure = min(gain * (1.0 - 1.0 / float(free[at])), float(loud[at]) * abs(coherence / gamma[at]) ** 2)
         band = None if freedom == 1 else (int(edges[low[at]]), int(edges[high[at]]))
-        return Common(coherence, float(free[at]), gain, net(sure, freedom, ln_pairs + LN_FORMS + ln_looks), band)
+        price = ln_pairs + LN_FORMS + ln_looks
+        return Common(coherence, float(free[at]), gain, net(sure, freedom, price), net(gain, freedom, price), band)
 
     loud = np.abs(gamma) ** 2 * many * free / scatter
     white = found(every, complex(gamma[every].real), 1, 0.0)
@@ -302,8 +305,9 @@ def _leaks(one: Diagnosed, states: Mapping[str, State], sources: Mapping[str, in
         both = common(pair_of(free.whitened, states[other].whitened, free.dt), ln_pairs)
         if both is None or both.net < NET_LEAST:
             continue
-        search = finding.look.gain - finding.look.net - (math.log(len(states) - 1) if sources[other] > 1 else 0.0)
-        ahead = both.net - (one.state.best.ln_likelihood - free.best.ln_likelihood - search)
+        search = max(0.0, finding.look.gain - finding.look.net)
+        search -= math.log(len(states) - 1) if sources[other] > 1 else 0.0
+        ahead = both.searched - (one.state.best.ln_likelihood - free.best.ln_likelihood - search)
         if ahead > ALIKE:
             one.findings.remove(finding)
             one.state = free
