@@ -358,7 +358,7 @@ static bool find_accel(const selfcal_tumble_part_t *part, const selfcal_tumble_r
 static void state(wide_t value[], float covariance_of[], const wide_t theta[], const wide_t normal[], const wide_t sd[],
                   size_t parameters, uint16_t bits) {
     for (size_t i = 0; i < parameters; i++) {
-        value[i] = (bits >> i & 1U) != 0U ? theta[i] * sd[i] : (wide_t)NAN;
+        value[i] = ((uint32_t)bits >> i & 1U) != 0U ? theta[i] * sd[i] : (wide_t)NAN;
     }
     scale(covariance_of, normal, sd, parameters);
 }
