@@ -7,6 +7,7 @@ import math
 import numpy as np
 from scipy.fft import rfft
 
+from selfcal.bank.blocks import MOST_DENSE
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording, bridged
 
@@ -22,14 +23,18 @@ def of_readings(
     recording: Recording, axis: str, frequency_hz: float, half_width_hz: float, rate_hz: float
 ) -> tuple[float, float] | None:
     """Frequency, Hz, and amplitude, in the recording's unit, of the line of an axis that makes one of `frequency_hz` in
-    means at `rate_hz`. None where none is clear.
+    means at `rate_hz`. None where none is clear, or more is missing than is there.
 
     Every line at k rate ± frequency does. The one is taken of which most power is left in the means."""
     own = recording.along(axis)
-    y = bridged(own.columns[axis].values)
-    n, recorded_hz = y.size, own.rate_hz
-    power = np.abs(np.asarray(rfft(y - y.mean()))) ** 2
-    bin_hz = recorded_hz / n
+    read, recorded_hz = bridged(own.columns[axis].values), own.rate_hz
+    place_of = np.arange(read.size) + np.cumsum(own.missing_before) - own.missing_before[0]
+    if place_of[-1] >= max(MOST_DENSE, 2 * read.size):
+        return None
+    y = np.zeros(int(place_of[-1]) + 1)  # about its mean: what is missing has no power
+    y[place_of] = read - read.mean()
+    power = np.abs(np.asarray(rfft(y))) ** 2
+    bin_hz = recorded_hz / y.size
     best, place = 0.0, 0.0
     for k in range(math.ceil(0.5 * recorded_hz / rate_hz) + 1):
         for hz in {k * rate_hz + frequency_hz, abs(k * rate_hz - frequency_hz)}:
@@ -40,7 +45,7 @@ def of_readings(
     if best == 0.0:
         return None
     more, _, _ = _line(power, place, max(HALF, math.ceil(WANDERS * place)))
-    return place * bin_hz, 2.0 * math.sqrt(max(more, 0.0)) / n
+    return place * bin_hz, 2.0 * math.sqrt(max(more, 0.0)) / read.size
 
 
 def _line(power: Array, place: float, half: int) -> tuple[float, float, float]:
