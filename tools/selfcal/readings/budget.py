@@ -30,6 +30,7 @@ SHARES: Mapping[str, float] = MappingProxyType(
 OF_MODULES: Mapping[str, float] = MappingProxyType(
     {"looks": 7e-3, "together": 1e-2, "statistics": 8e-4, "coherence": 2e-4}
 )
+#: Axes of a module, by which its shares are split.
 AXES = 6
 #: Independent looks at an axis, in effect: the eight checks, and eleven of `diagnose`. Of 348 axes of clean modules
 #: (seeds 1000 to 1028 of `make false-alarms`, 1 and 10 Hz) 17 gain 5.4 nats for some cause, as 11 e^-5.4 of them do.
