@@ -184,7 +184,7 @@ def test_a_cause_waits_until_it_may_be_the_best() -> None:
     """A cause is looked at while it was worth as much as the best is now, and each where nothing is worth naming. What
     has no name waits for every cause that has one."""
     one, record = Diagnosed(*3 * [cast(Any, None)]), cast(Any, None)
-    nets = {"step": [50.0, 20.0, 0.0, 0.0], "ramp": [31.0, 1.0, 1.0], "pulse": [9.0, 2.0], "unexplained": [700.0]}
+    nets = {"step": [50.0, 20.0, 0.0, 0.0], "ramp": [31.0, 1.0, 1.0], "pulse": [15.0, 2.0], "unexplained": [700.0]}
     looked: list[str] = []
 
     def cause(name: str) -> Looks:
