@@ -142,7 +142,7 @@ def _means(values: Array, recording: Recording, begin: int, block: int, count: i
     """Means [count] of a column over whole blocks of the even grid from the place `begin` on, NaN where it has none."""
     if not recording.missing_before.any():
         return block_means(values[begin : begin + count * block], block)
-    place = np.arange(values.size) + np.cumsum(recording.missing_before) - recording.missing_before[0] - begin
+    place = recording.clock.place - recording.missing_before[0] - begin
     index = np.floor_divide(place, block)
     kept = (index >= 0) & (index < count)
     used = np.bincount(index[kept], minlength=count)

@@ -152,7 +152,7 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
         return None
     block = max(1, round(recording.rate_hz / model.bank_rate_hz))
     tau_s = block / recording.rate_hz
-    interval = ((np.arange(recording.samples) + np.cumsum(recording.missing_before)) // block)[sound]
+    interval = (recording.clock.place // block)[sound]
     size = np.ones(interval.size)
     tau: list[float] = []
     deviations: list[float] = []

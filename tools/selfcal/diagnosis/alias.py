@@ -23,16 +23,17 @@ def of_readings(
     recording: Recording, axis: str, frequency_hz: float, half_width_hz: float, rate_hz: float
 ) -> tuple[float, float] | None:
     """Frequency, Hz, and amplitude, in the recording's unit, of the line of an axis that makes one of `frequency_hz` in
-    means at `rate_hz`. None where none is clear, or more is missing than is there.
+    means at `rate_hz`. None where none is clear, or most of a long grid is missing.
 
     Every line at k rate ± frequency does. The one is taken of which most power is left in the means."""
     own = recording.along(axis)
     read, recorded_hz = bridged(own.columns[axis].values), own.rate_hz
-    place_of = np.arange(read.size) + np.cumsum(own.missing_before) - own.missing_before[0]
-    if place_of[-1] >= max(MOST_DENSE, 2 * read.size):
+    place_of = own.clock.place
+    on_grid = place_of - place_of[0]
+    if on_grid[-1] >= max(MOST_DENSE, 2 * read.size):
         return None
-    y = np.zeros(int(place_of[-1]) + 1)  # about its mean: what is missing has no power
-    y[place_of] = read - read.mean()
+    y = np.zeros(int(on_grid[-1]) + 1)  # about its mean: what is missing has no power
+    y[on_grid] = read - read.mean()
     power = np.abs(np.asarray(rfft(y))) ** 2
     bin_hz = recorded_hz / y.size
     best, place = 0.0, 0.0

@@ -95,7 +95,7 @@ def _whole_means(recording: Recording, bank_rate_hz: float) -> Recording:
     if not recording.missing_before.any():
         return recording
     block = bank_block(recording.rate_hz, bank_rate_hz)
-    place = np.arange(recording.samples) + np.cumsum(recording.missing_before).astype(np.int64)
+    place = recording.clock.place
     cell = (place - place[0]) // block
     whole = np.bincount(cell) == block
     if np.count_nonzero(whole) < FEWEST:
