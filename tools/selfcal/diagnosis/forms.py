@@ -24,7 +24,7 @@ from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Number, Shape, Tried
-from selfcal.likelihood.fit import left, run
+from selfcal.likelihood.fit import left
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, ln_looks
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
@@ -245,10 +245,9 @@ def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
 def _delayed(channel: Channel, state: State, width_s: float) -> Shape:
     """The likeliest delay of a channel's means: all of them by one pass of the filter."""
     about = smoothed(channel.values, max(1, round(width_s / state.dt))) - channel.values.mean()
-    series, fit = state.series.beside(about), state.best
-    column = np.nan_to_num(run(series, fit.terms, fit.theta, innovations=True)[1][:, -1])
+    rest, column = left(state.series, state.best, about).T
     size = next_fast_len(2 * column.size)
-    score = irfft(rfft(np.nan_to_num(state.whitened), size) * np.conj(rfft(column, size)), size)
+    score = irfft(rfft(rest, size) * np.conj(rfft(column, size)), size)
     most = max(2, int(LONGEST_LAG * column.size))
     bend = np.full(most, 1.0 - float(column[1:] @ column[:-1]) / max(float(column @ column), 1e-300))
 
