@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, note, printable
+from selfcal.base.errors import UserError, printable
 from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import beside
@@ -36,8 +36,6 @@ SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 RECORDS = 20
 #: Rounds in which each of several inputs is searched beside the others.
 ROUNDS = 2
-#: Readings of an input for each wild one on either side.
-WILD = 1000
 #: Records for each false misfit.
 MISFIT = 500.0
 #: Quantiles of an interval.
@@ -60,23 +58,6 @@ WORDS = {
     "square": "square coefficient",
     "cube": "cube coefficient",
 }
-
-
-def without_wild(recording: Recording, names: Sequence[str]) -> Recording:
-    """The recording with the wild readings of its inputs bridged: those farther from nearly all others than these are
-    from each other, as a thermometer's error values are."""
-    columns = dict(recording.columns)
-    for name in names:
-        values = columns[name].values
-        there = np.sort(values[np.isfinite(values)])
-        few = max(1, there.size // WILD)
-        low, high = there[min(few, there.size - 1)], there[-1 - min(few, there.size - 1)]
-        wild = (values < 2.0 * low - high) | (values > 2.0 * high - low)
-        if high > low and wild.any():
-            columns[name] = replace(columns[name], values=bridged(np.where(wild, np.nan, values)))
-            said = f"{wild.sum()} of {values.size} readings are far from all others, the first {values[wild][0]:.6g}"
-            note(f"{recording.path}: {name}: {said}: left out")
-    return replace(recording, columns=columns)
 
 
 def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:

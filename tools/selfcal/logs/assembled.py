@@ -21,8 +21,11 @@ from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import PART, split
 from selfcal.logs.loaders.table import Rows
 from selfcal.logs.order import few, in_order
-from selfcal.logs.recorded import Column, Recording, bridged, bridged_at
+from selfcal.logs.recorded import SIDE_UNITS, Column, Recording, bridged, bridged_at
 from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
+
+#: Readings of a side channel for each wild one on either side.
+WILD = 1000
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -51,6 +54,8 @@ def assembled(rows: Rows, header: Header) -> Recording:
         if np.isinf(values).any():
             rows.fail(int(np.argmax(np.isinf(values))), number, f"infinite at {field.lsb:g} {field.unit} an LSB")
         columns[field.name] = Column(field.name, field.unit, values)
+    for name in SIDE_UNITS.keys() & columns.keys():
+        columns[name] = _tame(columns[name], header)
     _check_truth(rows.path, rows.meta)
     stamps, part = columns.pop("t", None), columns.pop(PART, None)
     if stamps is None:
@@ -65,6 +70,23 @@ def assembled(rows: Rows, header: Header) -> Recording:
     if kept.size < count or (np.diff(kept) < 0).any():
         columns = {name: replace(column, values=column.values[kept]) for name, column in columns.items()}
     return _on_clocks(rows, header.rate, columns, kept.size, ordered, header)
+
+
+def _tame(column: Column, header: Header) -> Column:
+    """The channel without its wild readings: those farther from nearly all others than these are from each other, as a
+    thermometer's error values are."""
+    there = np.sort(column.values[np.isfinite(column.values)])
+    few_wild = max(1, there.size // WILD)
+    if there.size < 2 * few_wild + 1:
+        return column
+    low, high = there[few_wild], there[-1 - few_wild]
+    with np.errstate(over="ignore"):
+        wild = (column.values < 2.0 * low - high) | (column.values > 2.0 * high - low)
+    if not high > low or not wild.any():
+        return column
+    said = f"{wild.sum()} of {there.size} readings are far from all others, the first {column.values[wild][0]:.6g}"
+    header.notes.append(f"{column.name}: {said}: left out")
+    return replace(column, values=np.where(wild, np.nan, column.values))
 
 
 def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header) -> tuple[_Stamps, Places]:

@@ -49,7 +49,6 @@ def response(
         answers_of,
         inputs_of,
         plot_response,
-        without_wild,
     )
     from selfcal.logs.recording import check_column, list_of, load
     from selfcal.model.file import Model
@@ -72,7 +71,6 @@ def response(
     rate_hz = min(recording.clock_of(name).rate_hz for name in axes)
     if decimate is None and recording.duration_s * rate_hz > SAMPLES_MOST:
         decimate = SAMPLES_MOST / recording.duration_s
-    recording = without_wild(recording, names)
     record = of_recording(recording, loaded, decimate, axes)
     for name in axes:
         if name not in record.axes:
