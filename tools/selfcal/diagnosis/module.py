@@ -25,7 +25,7 @@ from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SMOOTHINGS, LONGEST_LAG
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
 from selfcal.likelihood.columns import LN_SLOW
-from selfcal.likelihood.edges import scan
+from selfcal.likelihood.edges import peaks, scan
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
     WIDTHS,
@@ -226,18 +226,8 @@ def sizes(score: Array, known: Array) -> Array:
 def _best(gain: Array, score: Array, known: Array, apart: int) -> list[int]:
     """The best places of scores [n, m]: of all axes together, by their `gain` [n], and of each alone."""
     alone = 0.5 * score**2 / np.maximum(np.diagonal(known, axis1=-2, axis2=-1), 1e-300)
-    found = [_peaks(gain, PLACES, apart), *(_peaks(one, 1, apart) for one in alone.T)]
+    found = [peaks(gain, PLACES, apart), *(peaks(one, 1, apart) for one in alone.T)]
     return list(dict.fromkeys(at for each in found for at in each))
-
-
-def _peaks(gain: Array, count: int, apart: int) -> list[int]:
-    """Places of the largest gains [n], none within so many samples of a larger one."""
-    found, left = [], np.array(gain)
-    for _ in range(count):
-        at = int(np.argmax(left))
-        found.append(at)
-        left[max(0, at - apart) : at + apart + 1] = -math.inf
-    return found
 
 
 def _shared(gain: Array, at: int) -> float:
@@ -277,7 +267,7 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         at = int(np.argmax(gain)) * apart
         best.append((float(gain.max()), at, at + length))
     # A jump of each level is known more sharply than a long pulse is shifted.
-    ends = np.sort(_peaks(np.where(near_end, 0.0, full(shock, seen.course.known)), PAIRED, EDGE))
+    ends = np.sort(peaks(np.where(near_end, 0.0, full(shock, seen.course.known)), PAIRED, EDGE))
     pairs = ends[np.transpose(np.triu_indices(ends.size, 1))]
     first, last = pairs[(np.diff(pairs)[:, 0] <= lengths[-1]) & ~seen.passed[pairs].all(axis=1)].T
     cross = seen.cross[0] - seen.cross[last - first]

@@ -19,7 +19,7 @@ from selfcal.diagnosis.causes import shared
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic, judged
-from selfcal.likelihood.fit import run
+from selfcal.likelihood.fit import left
 from selfcal.likelihood.state import NET_LEAST, Look, State
 from selfcal.readings.budget import AXES, OF_MODULES
 
@@ -99,10 +99,8 @@ def coherence(state: State, record: Record) -> list[Statistic]:
     Other axes are looked at in pairs (causes/shared.py)."""
     found = []
     for name, values in record.channels.items():
-        series = state.series.beside(values - values.mean())
-        _, white, _ = run(series, state.best.terms, state.best.theta, innovations=True)
-        column = white[:, -1] / max(float(white[:, -1].std()), 1e-300)
-        both = shared.common(shared.pair_of(state.whitened, column, state.dt))
+        column = left(state.series, state.best, values - values.mean())[:, 1]
+        both = shared.common(shared.pair_of(state.whitened, column / max(float(column.std()), 1e-300), state.dt))
         if both is not None:
             edge = math.sqrt(-math.log(0.005) / both.bins)
             found.append(Statistic(f"coherence_with_{name}", abs(both.coherence), 0.0, edge, math.exp(-both.net)))

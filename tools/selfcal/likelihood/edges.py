@@ -61,11 +61,16 @@ class Scan:
 
     def peaks(self, count: int, apart: int) -> list[int]:
         """The best places, some way apart."""
-        left, found = self.gain, list[int]()
-        while len(found) < count and left.max() > 0.0:
-            found.append(int(np.argmax(left)))
-            left[max(0, found[-1] - apart) : found[-1] + apart + 1] = 0.0
-        return found
+        return peaks(self.gain, count, apart)
+
+
+def peaks(gain: Array, count: int, apart: int) -> list[int]:
+    """Places of the largest gains [n] above 0, none within so many samples of a larger one."""
+    left, places = gain.copy(), list[int]()
+    while len(places) < count and left.max() > 0.0:
+        places.append(int(np.argmax(left)))
+        left[max(0, places[-1] - apart) : places[-1] + apart + 1] = 0.0
+    return places
 
 
 def scan(series: Series, fit: Fit, held: Array | None = None) -> Scan:
