@@ -491,7 +491,7 @@ def test_several_forms_of_a_channel_have_one_coefficient(tmp_path: Path) -> None
     save(tmp_path / "log.npz", {"gx": ("deg/h", 3600.0 * values), "temp": ("degC", warm)}, 1.0)
     record = of_recording(load(tmp_path / "log.npz"), Model.load(None), 1.0)
     state, members = record.axes["gx"].refit(), []
-    for number, theta in enumerate([(FORMS.index("static"), 0.0), (FORMS.index("play"), 2.5)], 1):
+    for number, theta in enumerate([(FORMS.index("static"), math.nan, 0.0), (FORMS.index("play"), 2.5, 0.0)], 1):
         look = side_at(state, record, "temperature", theta)
         after = state.refit(**look.changes)
         entry = {"estimate": {"coefficient": look.estimate["coefficient"]}}

@@ -69,8 +69,10 @@ def _of_axis(
     if name not in second.columns:
         none = HeldOut(None, f"{second.path} has no axis {name}")
         return [none] * len(findings), none
-    extended: dict[str, Regressor] = {one.name: one for one in Model.of_tree(tree, model.path).regressors}
-    terms = [why_stays(one) or term_of(found[name], one, extended) for one in findings]
+    extended: dict[str, Regressor] = {
+        regressor.name: regressor for regressor in Model.of_tree(tree, model.path).regressors
+    }
+    terms = [why_stays(finding) or term_of(found[name], finding, extended) for finding in findings]
     carried = [term for term in terms if isinstance(term, Term)]
     if not carried:
         return [HeldOut(None, str(term)) for term in terms], HeldOut(None, "no finding is in the bank's model")
@@ -89,7 +91,9 @@ def _of_axis(
             return HeldOut(None, str(error))
 
     each = [
-        HeldOut(None, term) if isinstance(term, str) else gained([one for one in carried if one is not term])
+        HeldOut(None, term)
+        if isinstance(term, str)
+        else gained([term_kept for term_kept in carried if term_kept is not term])
         for term in terms
     ]
     return each, gained([])
@@ -101,20 +105,20 @@ def why_stays(finding: Finding) -> str:
     return cause.score.no_carry(finding.look) or cause.score.once
 
 
-def term_of(one: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> Term | str:
+def term_of(axis: Diagnosed, finding: Finding, extended: Mapping[str, Regressor]) -> Term | str:
     """The finding as a part of the bank's model, or why it is none. `extended`: the model file's regressors."""
     cause = CAUSES[finding.look.cause]
     added = finding.columns
     if added:
-        entries = [CAUSES[column.cause].written.entry(column.entry, finding.look, one.record) for column in added]
+        entries = [CAUSES[column.cause].written.entry(column.entry, finding.look, axis.record) for column in added]
         pairs = zip(entries, added, strict=True)
         keys = dict.fromkeys(entry.get("name", regressor_key(column.name)) for entry, column in pairs)
         if not all(key in extended for key in keys):
             return "the extended model has no room for its column"
-        at = {column.name: k for k, column in enumerate(one.state.regressors)}
+        at = {column.name: k for k, column in enumerate(axis.state.regressors)}
         if not all(column.name in at for column in added):
             return "the final model does not have it"
-        c = tuple(float(one.state.best.c[1 + at[column.name]]) for column in added)
+        c = tuple(float(axis.state.best.c[1 + at[column.name]]) for column in added)
         return Term(finding, tuple(extended[key] for key in keys), c, cause.score.anew)
     if cause.written.extend is not None and not cause.score.no_gain:
         return Term(finding, (), (), False)
@@ -140,7 +144,7 @@ def _evidence(
             values -= (columns_of(term.columns, recording) - about) @ np.array(term.coefficients)
     tables = make_tables(replace(own, regressors=regressors), recording.rate_hz, (name,))
     bank = Bank(tables)
-    prior = {one.name: one.ln_probability for one in tables.hypotheses}
+    prior = {hypothesis.name: hypothesis.ln_probability for hypothesis in tables.hypotheses}
     rows, columns = as_float(values)[:, None], as_float(columns_of(regressors, recording))
     if values.size < LEAST:
         raise UserError(f"the second recording is too short: {values.size} bank samples, and {LEAST} are needed")

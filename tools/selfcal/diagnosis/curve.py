@@ -97,7 +97,7 @@ def _picked(state: State, fit: Fit, terms: Array) -> list[int]:
     """Terms [k, n] one after the other: the one that gains most beside those before it, while it pays its search."""
     parts = np.array_split(terms, math.ceil(len(terms) / ABREAST))
     each = [left_of(state.series, fit, part) for part in parts]
-    u, left = np.concatenate([one[:, 1:] for one in each], axis=1), each[0][:, 0] / fit.sigma
+    u, left = np.concatenate([part[:, 1:] for part in each], axis=1), each[0][:, 0] / fit.sigma
     size = (u**2).sum(axis=0)
     picked: list[int] = []
     while len(picked) < TERMS_MOST:
@@ -133,14 +133,21 @@ def _as_one(
 
 def trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
     """With the heights of a curve as coefficients of their own: those of later values are not known before."""
-    known = {one.name for one in before.regressors}
-    own = next((one for one in after.regressors if one.name not in known and one.entry.get("form") == FREE), None)
+    known = {regressor.name for regressor in before.regressors}
+    own = next(
+        (
+            regressor
+            for regressor in after.regressors
+            if regressor.name not in known and regressor.entry.get("form") == FREE
+        ),
+        None,
+    )
     if own is None:
         return after
     means = smoothed(record.channels[look.cause], max(1, round(float(own.entry.get("window_s", 0.0)) * record.rate_hz)))
     rows = spline(means, [place for place, _ in own.entry["knots"]])
     heights = tuple(replace(own, name=f"{own.name}_{k}", values=row) for k, row in enumerate(rows))
-    return after.refit(regressors=(*(one for one in after.regressors if one is not own), *heights))
+    return after.refit(regressors=(*(regressor for regressor in after.regressors if regressor is not own), *heights))
 
 
 def shape(column: Regressor, means: Array, price: float, unit: str, stated: dict[str, object]) -> Shape:

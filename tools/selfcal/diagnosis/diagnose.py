@@ -52,10 +52,10 @@ def add_carried(
     for name, (each, together) in gains(model, tree, record, found, second).items():
         axis = document["axes"][name]
         pairs = zip(axis["findings"], each, strict=True)
-        for entry, one in [*pairs, *([(axis, together)] if each else [])]:
-            entry["gain_on"] = one.gain
-            if one.gain is None:
-                entry["gain_on_reason"] = one.reason
+        for entry, held_out in [*pairs, *([(axis, together)] if each else [])]:
+            entry["gain_on"] = held_out.gain
+            if held_out.gain is None:
+                entry["gain_on_reason"] = held_out.reason
 
 
 def looked_at(
@@ -90,21 +90,24 @@ def looked_at(
     finally:
         stopped.set()
         pool.shutdown(wait=False)
-    return {name: replace(one, findings=list(one.findings)) for name, one in list(found.items())}
+    return {name: replace(axis, findings=list(axis.findings)) for name, axis in list(found.items())}
 
 
 def shared_by(found: Mapping[str, Diagnosed], model: Model) -> hidden.Hidden | None:
     """What moves several axes and nobody recorded; None: nothing does, or the model file states it."""
     if model.hidden_input is not None:
         return None
-    return next((one.hidden for one in found.values() if one.hidden is not None), None)
+    return next((axis.hidden for axis in found.values() if axis.hidden is not None), None)
 
 
 def entry_of(shared: hidden.Hidden, found: Mapping[str, Diagnosed], recording: Recording) -> dict[str, Any]:
     """The finding of all axes for the document."""
     units = {name: recording.columns[name].unit for name in shared.names}
-    record = next(one.record for one in found.values() if one.hidden is shared)
-    states = {**record.axes, **{name: one.state for name, one in found.items() if one.hidden is shared}}
+    record = next(axis.record for axis in found.values() if axis.hidden is shared)
+    states = {
+        **record.axes,
+        **{name: axis.state for name, axis in found.items() if axis.hidden is shared},
+    }
     return hidden.entry(shared, states, units, record.start_s)
 
 
@@ -115,18 +118,18 @@ def events_of(record: Record) -> dict[str, Array]:
     return {} if seen is None else {name: seen.effect(name) for name in seen.names}
 
 
-def less_stated(one: Diagnosed, model: Model) -> Diagnosed:
+def less_stated(axis: Diagnosed, model: Model) -> Diagnosed:
     """The axis without findings that the model file states already: they are `stated`."""
-    stated = [finding for finding in one.findings if CAUSES[finding.look.cause].written.stated(finding, model)]
-    findings = [finding for finding in one.findings if not any(finding is each for each in stated)]
-    return replace(one, findings=findings, stated=stated, before=one.before if findings else one.after)
+    stated = [finding for finding in axis.findings if CAUSES[finding.look.cause].written.stated(finding, model)]
+    findings = [finding for finding in axis.findings if not any(finding is each for each in stated)]
+    return replace(axis, findings=findings, stated=stated, before=axis.before if findings else axis.after)
 
 
 def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Model) -> None:
     """Axes without a cause must pass the checks of `identify`, whose bank has the whole model."""
-    for name, one in found.items():
+    for name, diagnosed in found.items():
         # Beside a hidden quantity other axes explain one as it does.
-        if one.findings or one.hidden is not None or one.state.below_lattice or model.beyond:
+        if diagnosed.findings or diagnosed.hidden is not None or diagnosed.state.below_lattice or model.beyond:
             continue
         # An axis that follows this one would explain it as well.
         follow = {
@@ -135,9 +138,9 @@ def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Mod
         others = {axis: column for axis, column in recording.columns.items() if axis not in follow}
         beside = replace(recording, columns=others)
         with suppress(UserError):  # no report, no checks
-            look = of_checks(one, identify_axis(beside, name, model, "library", None).judged.checks)
+            look = of_checks(diagnosed, identify_axis(beside, name, model, "library", None).judged.checks)
             if look is not None:
-                one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))
+                diagnosed.findings.append(Finding(look, ROUNDS + 1, diagnosed.state, diagnosed.state))
 
 
 def show_first(recording: Recording, first: Mapping[str, Diagnosed], names: Sequence[str], ending: Held) -> None:

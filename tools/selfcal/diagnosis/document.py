@@ -40,7 +40,7 @@ def to_document(
     """The document, in the units of the recording's columns. `errors`: why an axis has no result. `model`: the extended
     model file's tree. `first`: what a look at means has found, of which causes that `found` has not stay beside it.
     `out`: findings that a bank has no room for."""
-    axes = {name: _axis(one, recording.columns[name].unit, first.get(name), out) for name, one in found.items()}
+    axes = {name: _axis(axis, recording.columns[name].unit, first.get(name), out) for name, axis in found.items()}
     return {
         "schema": SCHEMA,
         "recording": recording_entry(recording),
@@ -49,33 +49,33 @@ def to_document(
     }
 
 
-def _axis(one: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Finding]) -> dict[str, Any]:
-    record = one.record
-    causes = {finding.look.cause for finding in one.findings}
+def _axis(axis: Diagnosed, unit: str, first: Diagnosed | None, out: Sequence[Finding]) -> dict[str, Any]:
+    record = axis.record
+    causes = {finding.look.cause for finding in axis.findings}
     only = [] if first is None else [finding for finding in first.findings if finding.look.cause not in causes]
-    factor = unit_module.factor(one.state.unit, unit)
-    after = {row.name: row for row in one.after}
+    factor = unit_module.factor(axis.state.unit, unit)
+    after = {row.name: row for row in axis.after}
     return {
         "unit": unit,
         "judged_at_hz": record.rate_hz,
-        "verdict": "adequate" if one.adequate else "inadequate",
-        **({"unfinished": one.unfinished} if one.unfinished else {}),
-        **({"stated": [finding.look.cause for finding in one.stated]} if one.stated else {}),
+        "verdict": "adequate" if axis.adequate else "inadequate",
+        **({"unfinished": axis.unfinished} if axis.unfinished else {}),
+        **({"stated": [finding.look.cause for finding in axis.stated]} if axis.stated else {}),
         "findings": [
-            _finding(finding, record, factor, unit, one.state)
+            _finding(finding, record, factor, unit, axis.state)
             | ({"left_out_of_model": NO_ROOM} if any(finding is each for each in out) else {})
-            for finding in one.by_gain
+            for finding in axis.by_gain
         ],
         **(
             {}
             if first is None
-            else {"only_in_means": [_finding(one, first.record, factor, unit, first.state) for one in only]}
+            else {"only_in_means": [_finding(finding, first.record, factor, unit, first.state) for finding in only]}
         ),
-        "not_found": _not_found(one, record, factor, unit),
-        "not_judged": _not_judged(one, record),
+        "not_found": _not_found(axis, record, factor, unit),
+        "not_judged": _not_judged(axis, record),
         "discrepancies": [
             {"statistic": row.name, **_band(row), "after": _band(after[row.name]) if row.name in after else None}
-            for row in one.before
+            for row in axis.before
             if not row.q005 <= row.measured <= row.q995
         ],
     }
@@ -88,7 +88,11 @@ def _band(row: Statistic) -> dict[str, float]:
 
 def _finding(finding: Finding, record: Record, factor: float, unit: str, final: State) -> dict[str, Any]:
     look, cause = finding.look, CAUSES[finding.look.cause]
-    beside = finding.before if finding.record is not None else final.without({one.name for one in finding.columns})
+    beside = (
+        finding.before
+        if finding.record is not None
+        else final.without({regressor.name for regressor in finding.columns})
+    )
     record = finding.record or record
     inner = finding.before.unit
     try:
@@ -154,28 +158,28 @@ def _plausibility(look: Look) -> str:
     return words.plausibility(size * float(coefficient["median"]))
 
 
-def _not_found(one: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
+def _not_found(axis: Diagnosed, record: Record, factor: float, unit: str) -> list[dict[str, Any]]:
     """For every cause that has a size the one from which half of the records with it would have been named."""
-    named = {finding.look.cause for finding in one.findings}
+    named = {finding.look.cause for finding in axis.findings}
     rows = []
     with suppress(Stopped):
         for cause in CAUSES.values():
-            least = cause.least(one.state, record) if cause.least is not None and cause.id not in named else None
+            least = cause.least(axis.state, record) if cause.least is not None and cause.id not in named else None
             sizes = {key: {"value": value, "unit": of} for key, (value, of) in (least or {}).items()}
-            sizes = {key: _in_unit(size, one.state.unit, factor, unit) for key, size in sizes.items()}
+            sizes = {key: _in_unit(size, axis.state.unit, factor, unit) for key, size in sizes.items()}
             if sizes:
                 rows.append({"cause": cause.id, "would_have_been_found": sizes})
     return rows
 
 
-def _not_judged(one: Diagnosed, record: Record) -> list[dict[str, str]]:
+def _not_judged(axis: Diagnosed, record: Record) -> list[dict[str, str]]:
     """Causes that this recording cannot show, with the reason."""
     reasons = {
         cause: f"the recording has no {cause} that changes (column {column})"
         for cause, (column, _) in SIDE_CHANNELS.items()
         if cause not in record.channels
     }
-    if set(record.axes) <= {one.state.axis}:
+    if set(record.axes) <= {axis.state.axis}:
         reasons["cross_axis"] = "the recording has no other axis"
     return [{"cause": cause, "reason": reason} for cause, reason in reasons.items()]
 

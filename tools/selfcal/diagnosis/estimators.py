@@ -119,7 +119,7 @@ def _prediction_error(u: Array, y: Array, *, noise_of_its_own: bool) -> Estimate
             columns = [by_f if noise_of_its_own else by_f + by_d, -lfilter(D, np.convolve(C, F), u)]
             columns += [-lfilter([1.0], C, e)] + ([by_d] if noise_of_its_own else [])
             firsts = (1, 0, 1, 1)
-            each = [_delayed(one, range(first, order + 1)) for first, one in zip(firsts, columns, strict=False)]
+            each = [_delayed(column, range(first, order + 1)) for first, column in zip(firsts, columns, strict=False)]
             return np.hstack(each)
 
         found = least_squares(errors, np.concatenate([start, noise]), slopes, method="lm", max_nfev=20)
@@ -184,7 +184,7 @@ def subspace(u: Array, y: Array) -> Estimate:
     found: dict[int, Tried] = {}
     for rows in (5, 8, 12):
         count = y.size - 2 * rows + 1
-        U, Y = (np.array([one[k : k + count] for k in range(2 * rows)]) for one in (u, y))
+        U, Y = (np.array([signal[k : k + count] for k in range(2 * rows)]) for signal in (u, y))
         (upper,) = qr(np.vstack([U[rows:], U[:rows], Y[:rows], Y[rows:]]).T, mode="r", check_finite=False)
         left, _, _ = svd(upper[rows : 3 * rows, 3 * rows :].T, check_finite=False)
         for order in range(ORDERS + 1):
@@ -219,14 +219,16 @@ def beside(
     y, quiet, raw, *due = white[: count * steps].reshape(count, steps, white.shape[1]).mean(axis=1).T
     noise = float(np.std(y - due[0]))
     random = np.random.default_rng(1)
-    drawn = [one + noise * random.standard_normal(count) for one in due]
+    drawn = [output + noise * random.standard_normal(count) for output in due]
     found = {}
     for name, method in METHODS.items():
         given = raw if name in AS_READ else quiet
         own = method(given, y)
         # Of the order that the record took: another one is another estimate.
-        each = [method(given, one).values for one in drawn]
-        spread = np.array([one[own.order] for one in each if own.order in one] or [(own.gain, own.delay)])
+        each = [method(given, output).values for output in drawn]
+        spread = np.array(
+            [by_order[own.order] for by_order in each if own.order in by_order] or [(own.gain, own.delay)]
+        )
         found[name] = Beside(own, spread.min(axis=0), spread.max(axis=0))
     return found
 

@@ -117,10 +117,10 @@ def add_findings(
     """Put the list of all axes into the document, the id of its event into each finding of an axis, the verdicts, and
     N, K and B before and after. `known`: by the extended model, of each axis; `quantity`: the entry of a hidden one."""
     members = []
-    for name, one in found.items():
-        factor = units.factor(one.state.unit, document["axes"][name]["unit"])
-        for finding, entry in zip(one.by_gain, document["axes"][name]["findings"], strict=True):
-            members.append(Member(name, finding, entry, factor, _plain(one, finding, recording, factor)))
+    for name, diagnosed in found.items():
+        factor = units.factor(diagnosed.state.unit, document["axes"][name]["unit"])
+        for finding, entry in zip(diagnosed.by_gain, document["axes"][name]["findings"], strict=True):
+            members.append(Member(name, finding, entry, factor, _plain(diagnosed, finding, recording, factor)))
     events = grouped(members, quantity)
     for event in events:
         acted = {*(event.entry or {"axes": ()})["axes"], *(member.axis for member in event.members)}
@@ -139,9 +139,9 @@ def add_findings(
     document["findings"] = [_entry(event) for event in events]
     for entry, event in zip(document["findings"], events, strict=True):
         if "frequency_hz" in entry["estimate"] and _add_readings(entry, recording, found):
-            for one in (entry, *(member.entry for member in event.members)):
-                one["record_next"] = words.action(entry)
-    for name, one in found.items():
+            for row in (entry, *(member.entry for member in event.members)):
+                row["record_next"] = words.action(entry)
+    for name, diagnosed in found.items():
         axis = document["axes"][name]
         own = [event for event in events if name in event.changes]
         material = [event for event in own if event.changes[name]["material"]]
@@ -149,7 +149,7 @@ def add_findings(
         axis["verdict"] = "inadequate" if material or UNEXPLAINED in axis["causes"] else "adequate"
         axis["small_findings"] = len(own) - len(material) - axis["causes"].count(UNEXPLAINED)
         of_axis = [member for member in members if member.axis == name]
-        axis["numbers"] = _before_and_after(one, of_axis, axis["unit"], known.get(name))
+        axis["numbers"] = _before_and_after(diagnosed, of_axis, axis["unit"], known.get(name))
 
 
 def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -> list[Event]:
@@ -186,13 +186,13 @@ def _apart(event: Event, member: Member) -> float:
     return 0.0 if one is None or two is None else abs(one[0] - two[0])
 
 
-def _plain(one: Diagnosed, finding: Finding, recording: Recording, factor: float) -> float:
+def _plain(axis: Diagnosed, finding: Finding, recording: Recording, factor: float) -> float:
     """White noise of the readings as they were read over that of those that were kept, by their differences: what was
     left out before any fit cannot be fitted without. 1 where the loop has a model without the finding."""
-    read = one.record.readings.get(one.state.axis)
+    read = axis.record.readings.get(axis.state.axis)
     if finding.before is not finding.after or finding.round or read is None:
         return 1.0
-    raw = recording.columns[one.state.axis].values
+    raw = recording.columns[axis.state.axis].values
     if raw.size == read.moving.size:
         raw = np.where(read.moving, np.nan, raw)
     kept = _differences(read.working) * factor / math.sqrt(read.recording.rate_hz)
@@ -308,7 +308,7 @@ def _entry(event: Event) -> dict[str, Any]:
     on_second = [row.get("gain_on") for row in rows] + [entry.get("gain_on")]
     if any(on_second):
         entry["confirmed_on"] = _confirmed(on_second)
-    changes = {axis: {key: one[key] for key in one if key != "most"} for axis, one in event.changes.items()}
+    changes = {axis: {key: change[key] for key in change if key != "most"} for axis, change in event.changes.items()}
     source = CAUSES[looks[0].cause].source if event.entry is None else "surroundings"
     found = {"id": event.id, **entry, "source": source, "material": event.material, "changes": changes}
     return {**found, "words": entry.get("words") or words.event(found)}
@@ -317,14 +317,14 @@ def _entry(event: Event) -> dict[str, Any]:
 def _worth(members: Sequence[Member]) -> float:
     """Nats net of the searches: of an event that was found on several axes together it is paid for once."""
     together = {member.finding.event: member.finding.look.net for member in members if member.finding.event}
-    return sum(together.values()) + sum(one.finding.look.net for one in members if not one.finding.event)
+    return sum(together.values()) + sum(member.finding.look.net for member in members if not member.finding.event)
 
 
 def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed]) -> bool:
     """What a line in means is in the readings: its frequency there, and its amplitude on each axis. Whether it is
     another one there."""
     told = []
-    for axis, one in entry["axes"].items():
+    for axis, on_axis in entry["axes"].items():
         line, rate_hz = entry["estimate"]["frequency_hz"], found[axis].record.rate_hz
         if rate_hz > 0.5 * recording.rate_hz:
             continue
@@ -332,7 +332,7 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
         if seen is not None and abs(seen[0] / line["median"] - 1.0) > LEAST:
             told.append(seen[0])
             unit = recording.columns[axis].unit
-            one["estimate"] = {"readings_amplitude": {"median": seen[1], "unit": unit}, **one["estimate"]}
+            on_axis["estimate"] = {"readings_amplitude": {"median": seen[1], "unit": unit}, **on_axis["estimate"]}
     if told:
         sd = 1.0 / recording.duration_s
         entry["estimate"]["readings_hz"] = interval(float(np.median(told)), sd, "Hz")
@@ -343,8 +343,8 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
 def _common(estimates: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """What all axes have in common: times and frequencies, by all of them, and whatever has no interval."""
     found: dict[str, Any] = {}
-    for key in dict.fromkeys(key for one in estimates for key in one):
-        values = [one[key] for one in estimates if key in one]
+    for key in dict.fromkeys(key for estimate in estimates for key in estimate):
+        values = [estimate[key] for estimate in estimates if key in estimate]
         if all(isinstance(value, Mapping) for value in values):
             if values[0]["unit"] in OF_ALL:
                 found[key] = _of_all(values)
@@ -386,15 +386,15 @@ def _sum_of_forms(own: Sequence[Member]) -> dict[str, Any]:
     change of the channel does is their sum, beside the model with all of them. Empty where one form has it all."""
     last = max(own, key=lambda member: member.finding.round)
     shapes = [member.finding.look.shape for member in own]
-    keyed = [one for one in shapes if one is not None and [key for key, _ in one.keys].count(COEFFICIENT) == 1]
-    units_of = {unit for one in keyed for key, unit in one.keys if key == COEFFICIENT}
-    there = {one.name for one in last.finding.after.regressors}
-    names = {column.name for one in keyed for column in one.regressors}
+    keyed = [shape for shape in shapes if shape is not None and [key for key, _ in shape.keys].count(COEFFICIENT) == 1]
+    units_of = {unit for shape in keyed for key, unit in shape.keys if key == COEFFICIENT}
+    there = {regressor.name for regressor in last.finding.after.regressors}
+    names = {column.name for shape in keyed for column in shape.regressors}
     if len(keyed) < 2 or len(units_of) > 1 or not names <= there:
         return {}
     # The sum is the coefficient of the first column where the others are differences from it.
-    keys = [key for one in keyed for key, _ in one.keys]
-    rows = np.vstack([one.columns for one in keyed])
+    keys = [key for shape in keyed for key, _ in shape.keys]
+    rows = np.vstack([shape.columns for shape in keyed])
     first, *others = [k for k, key in enumerate(keys) if key == COEFFICIENT]
     rows[others] -= rows[first]
     weight, means, sds = (each[0] for each in last.finding.after.without(names).posterior(rows))
@@ -409,19 +409,19 @@ def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
 
 
 def _before_and_after(
-    one: Diagnosed, members: Sequence[Member], unit: str, known: Identified | None
+    axis: Diagnosed, members: Sequence[Member], unit: str, known: Identified | None
 ) -> dict[str, dict[str, Any]]:
     """N, K and B of an axis: without any finding, and with all, as the extended model has them where that is `known`.
     Both are then in its measure: an axis without findings has one number."""
-    factor = units.factor(one.state.unit, unit)
-    if any("y" in finding.look.changes for finding in one.findings):  # the bank has the readings as they were read
+    factor = units.factor(axis.state.unit, unit)
+    if any("y" in finding.look.changes for finding in axis.findings):  # the bank has the readings as they were read
         known = None
-    old, new = _sides(one.first, one.state, factor, math.prod(member.plain for member in members))
+    old, new = _sides(axis.first, axis.state, factor, math.prod(member.plain for member in members))
     found: dict[str, dict[str, Any]] = {}
     for name, key in SUMMARY.items():
         after: dict[str, Any] = {"median": new[name], "identified": new[name] > 0.0}
         if known is not None and key in known.summary:
-            level = _farthest(one.first, one.state) if name == "N" else 1.0  # the bank has the mean one
+            level = _farthest(axis.first, axis.state) if name == "N" else 1.0  # the bank has the mean one
             number = known.summary[key].estimate.scaled(units.factor(known.group_unit, unit) * level)
             after = {part: getattr(number, part) for part in ("median", "q05", "q95", "identified")}
         measure = after["median"] / new[name] if after["identified"] and new[name] else 1.0
@@ -434,9 +434,9 @@ def parted(findings: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any
     named. Told in any case: what moves several axes and was not recorded, and the time that is left out."""
     told: list[Mapping[str, Any]] = []
     small: list[Mapping[str, Any]] = []
-    for one in findings:
-        in_any_case = one["cause"] in (UNEXPLAINED, hidden.ID) or "intervals" in one["estimate"]
-        (told if one["material"] or in_any_case else small).append(one)
+    for finding in findings:
+        in_any_case = finding["cause"] in (UNEXPLAINED, hidden.ID) or "intervals" in finding["estimate"]
+        (told if finding["material"] or in_any_case else small).append(finding)
     return told, small
 
 

@@ -47,8 +47,8 @@ class Finding:
         before, after = self.before, self.after
         if before is after or after is final:
             return replace(self, ends=(final if before is after else before, final))
-        terms = {one.name: getattr(before.extras, one.name) for one in fields(before.extras)}
-        terms = {name: one for name, one in terms.items() if one != getattr(after.extras, name)}
+        terms = {term.name: getattr(before.extras, term.name) for term in fields(before.extras)}
+        terms = {name: value for name, value in terms.items() if value != getattr(after.extras, name)}
         less = final.without({column.name for column in self.columns}).refit(
             y=np.where(np.isfinite(after.y), final.y + before.y - after.y, before.y),
             r=final.r * (before.r / after.r),
@@ -60,8 +60,8 @@ class Finding:
     @property
     def columns(self) -> tuple[Regressor, ...]:
         """The columns that it added to the model."""
-        known = {one.name for one in self.before.regressors}
-        return tuple(one for one in self.after.regressors if one.name not in known)
+        known = {regressor.name for regressor in self.before.regressors}
+        return tuple(regressor for regressor in self.after.regressors if regressor.name not in known)
 
 
 @dataclass

@@ -23,7 +23,7 @@ from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simu
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
-from selfcal.likelihood.columns import LN_SLOW, Number, Shape, Tried
+from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, Number, Shape, Tried
 from selfcal.likelihood.fit import left
 from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, ln_looks
 from selfcal.likelihood.statemodel import Array
@@ -63,8 +63,6 @@ LN_FORMS = {
     "delay": 0.0,
     "free": 2.0,
 }
-#: Prices of the searches, ln of the number of independent looks: smoothings are nearly the same look.
-LN_SMOOTHINGS = math.log(2.0)
 #: Bands of equal information that must agree on another axis' coefficient.
 BANDS = 16
 #: Drawn records of a channel's own noise, and the share of a coefficient that it leaves at least.
@@ -107,30 +105,33 @@ def side_looks(state: State, record: Record, cause: str) -> list[Look]:
 def side_at(state: State, record: Record, cause: str, theta: Sequence[float]) -> Look:
     """The look at a side channel that is known to act, in the form `theta`: its place in FORMS, and its number or the
     width of its means, s."""
-    form, number = FORMS[int(theta[0])], float(theta[1])
-    shape = shape_of(_side(record, cause), state, form, *((number, 0.0) if form in NUMBER else (math.nan, number)))
+    shape = shape_of(_side(record, cause), state, FORMS[int(theta[0])], *theta[1:])
     found = columns.located(state, cause, shape)
     return replace(found, measure=partial(_noiseless, _side(record, cause), shape))
 
 
 def _side(record: Record, cause: str) -> Channel:
-    values = record.channels[cause]
+    return side_of(cause, record.channel_names[cause], record.channels[cause])
+
+
+def side_of(cause: str, column: str, values: Array) -> Channel:
+    """The temperature or the supply `values` [n] of a column."""
     return Channel(
         cause,
         cause,
-        record.channel_names[cause],
+        column,
         SIDE_CHANNELS[cause][1],
         values,
         reference=float(np.round(values.mean(), 3)),
         widths_s=SMOOTHING_S,
         noisy=True,
-        ln_looks=LN_SMOOTHINGS + LN_SLOW,
+        ln_looks=LN_EITHER + LN_SLOW,
     )
 
 
 def look(state: State, channels: Sequence[Channel]) -> list[Look]:
     """The look of each channel that is worth one nat."""
-    return [one for channel in channels for one in _look(state, channel)]
+    return [look for channel in channels for look in _look(state, channel)]
 
 
 def shape_of(channel: Channel, state: State, form: str, number: float, width_s: float) -> Shape:
@@ -162,7 +163,10 @@ def shape_of(channel: Channel, state: State, form: str, number: float, width_s: 
 
     numbers = {part: {NUMBER[part]: number} if part in NUMBER else {} for part in parts}
     found = tuple(regressor(part, values(part), **numbers[part]) for part in parts)
-    keys = tuple((KEYS.get(form_of(one)[2], "coefficient"), coefficient_unit(state.unit, one.unit)) for one in found)
+    keys = tuple(
+        (KEYS.get(form_of(regressor)[2], "coefficient"), coefficient_unit(state.unit, regressor.unit))
+        for regressor in found
+    )
     rows = np.array([one.values for one in found]).reshape(-1, channel.values.size)
     if form == "first_order":
         value, late = rows
@@ -202,7 +206,7 @@ def form_of(column: Regressor) -> tuple[str, str, str]:
 
 def _known(state: State) -> set[tuple[str, str, str]]:
     """The forms that the model has."""
-    return {form_of(one) for one in state.regressors}
+    return {form_of(regressor) for regressor in state.regressors}
 
 
 def _widths(channel: Channel, state: State) -> list[float]:
@@ -218,6 +222,12 @@ def _windows(channel: Channel, state: State) -> list[int]:
 
 def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
     """Every form over its grid of numbers and smoothing means."""
+    for form, number, width in variants_of(channel, state):
+        yield _delayed(channel, state, width) if form == "delay" else shape_of(channel, state, form, number, width)
+
+
+def variants_of(channel: Channel, state: State) -> Iterator[tuple[str, float, float]]:
+    """Every form that the model has not, with its numbers, NaN where it has none, and the widths of its means, s."""
     n, dt = channel.values.size, state.dt
     widths = _widths(channel, state)
     middle = widths[len(widths) // 2]
@@ -227,19 +237,19 @@ def shapes_of(channel: Channel, state: State) -> Iterator[Shape]:
         if any((channel.column, channel.input, part) in known for part in parts):
             continue
         if form in LATE:
-            yield from (shape_of(channel, state, form, lag, 0.0) for lag in _lags(channel, state))
+            yield from ((form, lag, 0.0) for lag in _lags(channel, state))
         elif form == "delay":
-            yield from (_delayed(channel, state, width) for width in dict.fromkeys((widths[0], middle)))
+            yield from ((form, math.nan, width) for width in dict.fromkeys((widths[0], middle)))
         elif form == "rate":
             windows = [max(window, dt) for window in channel.rate_windows_s if window <= n * dt / 6.0]
-            yield from (shape_of(channel, state, form, window, 0.0) for window in dict.fromkeys(windows))
+            yield from ((form, window, 0.0) for window in dict.fromkeys(windows))
         elif form == "play":
             span = float(np.ptp(smoothed(channel.values, max(1, round(middle / dt)))))
-            yield from (shape_of(channel, state, form, share * span, middle) for share in PLAYS)
+            yield from ((form, share * span, middle) for share in PLAYS)
         elif form == FREE:
-            yield from (shape_of(channel, state, form, k, width) for k in curve.counts(n) for width in widths[:2])
+            yield from ((form, float(k), width) for k in curve.counts(n) for width in widths[:2])
         else:
-            yield from (shape_of(channel, state, form, math.nan, width) for width in widths)
+            yield from ((form, math.nan, width) for width in widths)
 
 
 def _delayed(channel: Channel, state: State, width_s: float) -> Shape:
@@ -284,15 +294,15 @@ def _differs(column: Array, plain: Array, spread: float) -> bool:
 def _look(state: State, channel: Channel) -> list[Look]:
     """The look at the best form, its size that of the channel without noise of its own."""
     found = columns.tried(state, list(shapes_of(channel, state)), slow=channel.slow)
-    if not found or max(one.net for one in found.values()) < 1.0:
+    if not found or max(trial.net for trial in found.values()) < 1.0:
         return []
     alike = columns.alike(found)
     chosen = alike[0]
     if not channel.slow:
-        constant = [one for one in alike if _constant(state, one)]
+        constant = [trial for trial in alike if _constant(state, trial)]
         if not constant:
             # The coefficient depends on the frequency, and no form explains it: no cause, and not nothing either.
-            if max(one.net for one in found.values()) < NET_LEAST:
+            if max(trial.net for trial in found.values()) < NET_LEAST:
                 return []
             estimate = {"statistic": f"dependence on {channel.column}", "measured": _inconstant(state, chosen)}
             return [Look("unexplained", chosen.gain, chosen.net, estimate, {}, shown_by=channel.column)]
@@ -303,9 +313,9 @@ def _look(state: State, channel: Channel) -> list[Look]:
         chosen = replace(chosen, gain=chosen.gain - plain)
         if chosen.net < 1.0:
             return []
-    rivals = tuple(one.shape for one in alike if one.shape.form != chosen.shape.form)
+    rivals = tuple(trial.shape for trial in alike if trial.shape.form != chosen.shape.form)
     chosen = curve.best(state, chosen, chosen.shape.regressors[0].values) if chosen.shape.form == FREE else chosen
-    more = {"form_also_possible": [one.form for one in rivals]} if rivals else {}
+    more = {"form_also_possible": [rival.form for rival in rivals]} if rivals else {}
     shape = replace(chosen.shape, stated={**chosen.shape.stated, **more})
     look = replace(columns.look(state, channel.cause, replace(chosen, shape=shape)), rivals=rivals)
     return [replace(look, measure=partial(_noiseless, channel, shape)) if channel.noisy else look]
@@ -321,14 +331,14 @@ def _noiseless(channel: Channel, shape: Shape, state: State) -> dict[str, Any]:
     return {key: {part: value / kept if part != "unit" else value for part, value in sizes[key].items()}}
 
 
-def _constant(state: State, one: Tried) -> bool:
+def _constant(state: State, trial: Tried) -> bool:
     """Whether each column of a form has one coefficient at all frequencies, as far as the record shows."""
-    return one.net < 3.0 or _inconstant(state, one) < NET_LEAST
+    return trial.net < 3.0 or _inconstant(state, trial) < NET_LEAST
 
 
-def _inconstant(state: State, one: Tried) -> float:
+def _inconstant(state: State, trial: Tried) -> float:
     """Of the column that shows it most: beside a square the plain column may still be a common source's."""
-    rows = one.shape.columns
+    rows = trial.shape.columns
     return max(inconstancy(state, rows[k], np.delete(rows, k, axis=0)) for k in range(len(rows)))
 
 

@@ -18,6 +18,7 @@ from scipy.special import expit
 from selfcal.base import units as unit_module
 from selfcal.base.grid import half_means, regridded
 from selfcal.diagnosis.model_tree import digits
+from selfcal.likelihood.columns import LN_EITHER
 from selfcal.likelihood.fit import best
 from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES, error_entry, in_sd, score_entry, spread
 from selfcal.likelihood.joint import (
@@ -39,8 +40,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: Name of the quantity in the document.
 ID = "hidden_input"
-#: Correlation times that the search begins at.
-LN_LOOKS = math.log(2.0)
 #: Jumps that are named at most.
 JUMPS = 8
 
@@ -80,7 +79,7 @@ class Hidden:
     @property
     def net(self) -> float:
         """`gain` net of the search."""
-        return net(self.gain, len(self.names) + 1, LN_LOOKS)
+        return net(self.gain, len(self.names) + 1, LN_EITHER)
 
     @cached_property
     def course(self) -> Course:
@@ -125,7 +124,7 @@ class Hidden:
             found.append({"time_s": at * self.dt, "size": size / self.step, "evidence_nats": float(gains[at])})
             y = y - np.outer(self.model.loading, np.where(t >= at, size * np.exp(-self.model.rate * (t - at)), 0.0))
             seen = course(self.model, y, smooth=True)
-        return sorted(found, key=lambda one: one["time_s"])
+        return sorted(found, key=lambda jump: jump["time_s"])
 
     def on(self, state: State) -> On:
         """What it does to an axis, by the quantity as the other axes show it."""
@@ -139,12 +138,12 @@ class Hidden:
         # Before the record it acts on an axis as likely as not.
         return On(size, sd, float(expit(gain - math.log1p(abs(size) / sd))), Regressor(ID, ID, column, "1", {}))
 
-    def explains(self, one: str, others: Collection[str], upto_hz: float = 0.0) -> bool:
+    def explains(self, source: str, others: Collection[str], upto_hz: float = 0.0) -> bool:
         """Whether noise that an axis shares with some others below a frequency is the quantity's: beside it their white
         noise does not go together."""
-        if not {one, *others} <= set(self.names) or upto_hz > 0.501 / self.dt:
+        if not {source, *others} <= set(self.names) or upto_hz > 0.501 / self.dt:
             return False
-        at, *places = [self.names.index(name) for name in (one, *others)]
+        at, *places = [self.names.index(name) for name in (source, *others)]
         return without_pairs(self.bins, self.model, at, places) < NET_LEAST
 
     @cached_property
@@ -161,9 +160,9 @@ class Hidden:
         """Spectra of the records."""
         return bins_of(self.y)
 
-    def correlation(self, one: str, two: str) -> float:
+    def correlation(self, first: str, second: str) -> float:
         """Correlation of the white noise of two axes."""
-        at = [self.names.index(name) for name in (one, two)]
+        at = [self.names.index(name) for name in (first, second)]
         return float(self.model.correlation[at[0], at[1]])
 
 
@@ -174,14 +173,14 @@ def weighed(null: Joint, y: Array, dt: float) -> Joint | None:
         return None
     bins = bins_of(y)
     model = fitted(bins, dt, True, null)
-    if net(model.value - null.value, m + 1, LN_LOOKS) < NET_LEAST:
+    if net(model.value - null.value, m + 1, LN_EITHER) < NET_LEAST:
         return None
     # A drift that one axis has beside a walk and a Gauss-Markov process would be taken for the quantity.
     # An axis that the quantity moves shows 3 nats.
     if (without_each(bins, model) > 3.0).sum() < LEAST_AXES:
         return None
     gain = course(model, y).ln_likelihood - course(null, y).ln_likelihood
-    return model if net(gain, m + 1, LN_LOOKS) >= NET_LEAST else None
+    return model if net(gain, m + 1, LN_EITHER) >= NET_LEAST else None
 
 
 def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, Any]:
@@ -189,7 +188,7 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
     bias at each horizon, predicted from the past of all axes."""
     before, after = hidden.halves
     axis, half = hidden.names.index(name), hidden.y.shape[1] // 2
-    scores = np.array([one.scores()[half:, axis] for _, one in (before, after)])
+    scores = np.array([course.scores()[half:, axis] for _, course in (before, after)])
     scores = scores[:, np.isfinite(scores).all(axis=0)]
     sd = spread(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]))
     factor *= float(hidden.scale[axis])
@@ -197,7 +196,9 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
     for horizon in HORIZONS_S:
         steps = max(1, round(horizon / hidden.dt))
         read = hidden.y[axis, half + steps - 1 :]
-        errors = [ahead(model, one, steps)[half : half + read.size, axis] - read for model, one in (before, after)]
+        errors = [
+            ahead(model, course, steps)[half : half + read.size, axis] - read for model, course in (before, after)
+        ]
         row = error_entry(factor * errors[0], factor * errors[1])
         if row is not None:
             rmse[f"{horizon:g}"] = row
@@ -299,10 +300,10 @@ def _own_laws(hidden: Hidden) -> dict[str, dict[str, Any]]:
 
 def _stated(hidden: Hidden) -> dict[str, Any]:
     """The model file's entry, in the units of its groups: law, loadings and the correlation of the white noise."""
-    pairs = [(one, two) for k, one in enumerate(hidden.names) for two in hidden.names[k + 1 :]]
+    pairs = [(first, second) for k, first in enumerate(hidden.names) for second in hidden.names[k + 1 :]]
     alpha = hidden.model.rate / hidden.dt
     return {
         "law": [{"kind": "markov", "deviation": digits(1.0 / hidden.step), "alpha": digits(alpha)}],
         "loadings": {name: digits(hidden.loading(name)) for name in hidden.names},
-        "noise_correlation": {f"{one}-{two}": digits(hidden.correlation(one, two), 3) for one, two in pairs},
+        "noise_correlation": {f"{a}-{b}": digits(hidden.correlation(a, b), 3) for a, b in pairs},
     }

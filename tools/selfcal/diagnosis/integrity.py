@@ -100,9 +100,9 @@ def of_readings(record: Record, axis: str) -> Iterator[Look]:
         nats, rate_hz = min(1e6, readings.held.nats), interval(readings.recording.rate_hz, 0.0, "Hz")
         yield Look("held_samples", nats, nats, {"rate_hz": rate_hz}, {})
     elif readings.slower:
-        surest = max(readings.slower, key=lambda one: one.nats)
+        surest = max(readings.slower, key=lambda stretch: stretch.nats)
         rate_hz = interval(readings.recording.rate_hz / surest.ratio, 0.0, "Hz")
-        nats = min(1e6, sum(one.nats for one in readings.slower))
+        nats = min(1e6, sum(stretch.nats for stretch in readings.slower))
         yield _of_stretches("held_samples", nats, readings.slower_intervals, rate_hz=rate_hz)
     if readings.intervals:
         yield _of_stretches("stuck", readings.stuck_nats, readings.intervals)

@@ -61,7 +61,7 @@ def diagnose_record(
     are `unfinished`. So is an axis whose work is spent (work.py), with what was found until then."""
     found = {} if found is None else found
     advance("fit")
-    handled = {name: one.moved for name, one in record.readings.items() if one.moved is not None}
+    handled = {name: readings.moved for name, readings in record.readings.items() if readings.moved is not None}
     quiet = dict(record.axes)
     if handled:
         quiet = {name: integrity.masked(state, record.moving) for name, state in quiet.items()}
@@ -87,12 +87,12 @@ def diagnose_record(
     walked: dict[str, str] = {}  # and whether the work was spent
 
     def walk(name: str, causes: Sequence[Looks] = ()) -> None:
-        one, spent = found[name], ""
-        one.record = record
+        axis, spent = found[name], ""
+        axis.record = record
         with suppress(Stopped):
             try:
                 with work.within(works[name]):
-                    _rounds(record, one, advance, causes or (QUICK if name in means else LOOKS))
+                    _rounds(record, axis, advance, causes or (QUICK if name in means else LOOKS))
             except work.Spent:
                 spent = SPENT
             walked[name] = spent
@@ -105,7 +105,7 @@ def diagnose_record(
     work.each(walk, found)
     if len(walked) < len(found):
         raise Stopped
-    named = {name: [finding.look for finding in one.findings] for name, one in found.items()}
+    named = {name: [finding.look for finding in axis.findings] for name, axis in found.items()}
     _weed(found)
     for cause in CAUSES.values():
         if cause.grouping.settle is not None:
@@ -113,14 +113,14 @@ def diagnose_record(
 
     def again(name: str) -> None:
         """What a finding that was dropped stood before may be one now."""
-        one = found[name]
-        gone = [look for look in named[name] if not any(look.repeats(kept.look) for kept in one.findings)]
-        one.dropped += gone
+        axis = found[name]
+        gone = [look for look in named[name] if not any(look.repeats(kept.look) for kept in axis.findings)]
+        axis.dropped += gone
         causes = tuple(looks for looks in (QUICK if name in means else LOOKS) if looks in OWN)
         if gone:
             walk(name, causes)
         with suppress(Stopped):
-            _measure(one)
+            _measure(axis)
 
     work.each(again, found)
     tilt.settle(record, found)
@@ -133,12 +133,14 @@ def _stated(state: State) -> bool:
     return state.stated_lsb > 0.0 and abs(state.lsb / state.stated_lsb - 1.0) < 0.02
 
 
-def _end(one: Diagnosed, advance: Callable[[str], None]) -> None:
+def _end(axis: Diagnosed, advance: Callable[[str], None]) -> None:
     """What is left over, each finding beside all others, and the statistics of the model that the loop began with."""
-    advance(f"{one.state.axis}: statistics")
-    _unexplained(one)
-    one.findings = [each if each.record is not None else each.ended(one.state) for each in one.findings]
-    one.before = judged(one.first, seed=1).statistics if one.findings and not one.first.below_lattice else one.after
+    advance(f"{axis.state.axis}: statistics")
+    _unexplained(axis)
+    axis.findings = [each if each.record is not None else each.ended(axis.state) for each in axis.findings]
+    axis.before = (
+        judged(axis.first, seed=1).statistics if axis.findings and not axis.first.below_lattice else axis.after
+    )
 
 
 def _weed(found: Mapping[str, Diagnosed]) -> None:
@@ -146,33 +148,34 @@ def _weed(found: Mapping[str, Diagnosed]) -> None:
     noise with a memory, or a law that the first model had not, looks like events to it, and a leak shows one of another
     axis again."""
     events: dict[int, list[tuple[Diagnosed, Finding]]] = {}
-    for one in found.values():
-        for finding in one.findings:
+    for axis in found.values():
+        for finding in axis.findings:
             if finding.event and finding.record is None:
-                events.setdefault(finding.event, []).append((one, finding))
+                events.setdefault(finding.event, []).append((axis, finding))
     for parts in sorted(events.values(), key=lambda parts: sum(finding.look.gain for _, finding in parts)):
         price = sum(finding.look.gain for _, finding in parts) - max(finding.look.net for _, finding in parts)
-        less = [one.state.without({column.name for column in finding.columns}).refit() for one, finding in parts]
+        less = [axis.state.without({column.name for column in finding.columns}).refit() for axis, finding in parts]
         gains = [
-            one.state.best.ln_likelihood - state.best.ln_likelihood for (one, _), state in zip(parts, less, strict=True)
+            axis.state.best.ln_likelihood - state.best.ln_likelihood
+            for (axis, _), state in zip(parts, less, strict=True)
         ]
         most = [gain > 0.5 * finding.look.gain for gain, (_, finding) in zip(gains, parts, strict=True)]
         kept = [gain for gain, own in zip(gains, most, strict=True) if own]
         least = NET_LEAST if len(kept) == 1 < len(parts) else module.NAMED
         stays = sum(kept) - price >= least
-        for (one, finding), state, own in zip(parts, less, most, strict=True):
+        for (axis, finding), state, own in zip(parts, less, most, strict=True):
             if stays and own:
                 continue
-            one.findings = [each for each in one.findings if each is not finding]
-            one.state = state
+            axis.findings = [each for each in axis.findings if each is not finding]
+            axis.state = state
 
 
-def _measure(one: Diagnosed) -> None:
+def _measure(axis: Diagnosed) -> None:
     """Give each finding its sizes beside all others: a later column may have taken a part of an earlier one."""
-    for k, finding in enumerate(one.findings):
+    for k, finding in enumerate(axis.findings):
         if finding.record is None:
-            beside = one.state.without({column.name for column in finding.columns})
-            one.findings[k] = replace(finding, look=finding.look.measured(beside))
+            beside = axis.state.without({column.name for column in finding.columns})
+            axis.findings[k] = replace(finding, look=finding.look.measured(beside))
 
 
 def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[str, Moved]) -> Record:
@@ -183,16 +186,16 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
         record = replace(record, axes=masked)
     states = dict(record.axes)
     changed = integrity.rate_changes(record)
-    for name, one in found.items():
+    for name, axis in found.items():
         read = (*changed, *integrity.of_readings(record, name))
-        one.findings.extend(Finding(look, 0, one.state, one.state) for look in read)
+        axis.findings.extend(Finding(look, 0, axis.state, axis.state) for look in read)
         for moved in handled[name].events if name in handled else ():  # left out already, and in the first state
             spoilt = (
-                _with_motion(record, one.first, states[name], moved) if len(handled[name].events) > 1 else one.first
+                _with_motion(record, axis.first, states[name], moved) if len(handled[name].events) > 1 else axis.first
             )
-            one.findings.append(Finding(motion.look_of(moved), 0, spoilt, states[name]))
+            axis.findings.append(Finding(motion.look_of(moved), 0, spoilt, states[name]))
         if name in gone:
-            one.findings.append(Finding(gone[name], 0, one.state, states[name]))
+            axis.findings.append(Finding(gone[name], 0, axis.state, states[name]))
     for name in states:
         for test in (integrity.saturation, integrity.quantization):
             told = test(replace(record, axes=states), name)
@@ -263,8 +266,8 @@ def _curves(record: Record, found: Mapping[str, Diagnosed]) -> Record:
 
 def _with(record: Record, found: Mapping[str, Diagnosed], states: Mapping[str, State]) -> Record:
     """The record with new states of its axes, which those in `found` take."""
-    for name, one in found.items():
-        one.state = states[name]
+    for name, axis in found.items():
+        axis.state = states[name]
     return replace(record, axes=states)
 
 
@@ -290,7 +293,7 @@ def _give(
         known = replace(look, net=max(look.net, event.evidence))
         held_out = score.gain(known, own[name], after, record, located=True)
         findings[name] = Finding(known, 0, own[name], after, held_out=held_out, event=number)
-    if harmful([one.held_out for one in findings.values() if one.held_out is not None]):
+    if harmful([finding.held_out for finding in findings.values() if finding.held_out is not None]):
         return
     for name, finding in findings.items():
         states[name] = finding.after
@@ -320,22 +323,22 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
     """Put what means have found of slow causes into the models of every sample."""
 
     def taken_over(name: str) -> State:
-        state, one = record.axes[name], means.get(name)
-        if one is None:
+        state, in_means = record.axes[name], means.get(name)
+        if in_means is None:
             return state
-        kept = [finding for finding in one.findings if CAUSES[finding.look.cause].of_means]
-        known = one.state.extras
+        kept = [finding for finding in in_means.findings if CAUSES[finding.look.cause].of_means]
+        known = in_means.state.extras
         extras = replace(state.extras, flicker=known.flicker, oscillation=known.oscillation)
-        left_out = np.isfinite(one.first.y) & ~np.isfinite(one.state.y)
-        state = _between(state, runs(left_out), 1.0 / one.record.rate_hz)
+        left_out = np.isfinite(in_means.first.y) & ~np.isfinite(in_means.state.y)
+        state = _between(state, runs(left_out), 1.0 / in_means.record.rate_hz)
         columns = [
-            _stretched(column, one.record, state)
-            for column in one.state.regressors
+            _stretched(column, in_means.record, state)
+            for column in in_means.state.regressors
             if column.cause == hidden.ID or any(column.name == own.name for finding in kept for own in finding.columns)
         ]
         if name in found:
-            found[name].hidden = one.hidden
-            found[name].findings += [_sharper(finding, one.record, columns, state) for finding in kept]
+            found[name].hidden = in_means.hidden
+            found[name].findings += [_sharper(finding, in_means.record, columns, state) for finding in kept]
         if not columns and extras == state.extras:
             return state
         return state.refit(regressors=(*state.regressors, *columns), extras=extras)
@@ -367,32 +370,32 @@ def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], stat
     return replace(finding, look=replace(finding.look, estimate=estimate))
 
 
-def _rounds(record: Record, one: Diagnosed, advance: Callable[[str], None], causes: Sequence[Looks]) -> None:
+def _rounds(record: Record, axis: Diagnosed, advance: Callable[[str], None], causes: Sequence[Looks]) -> None:
     """Name what is worth it of some causes until nothing is."""
-    number = 1 + max((finding.round for finding in one.findings), default=0)
+    number = 1 + max((finding.round for finding in axis.findings), default=0)
     worth: dict[Looks, float] = {}
     seen: dict[Looks, list[Look]] = {}  # at this state
-    while number <= ROUNDS and not one.state.below_lattice:
-        advance(f"{one.state.axis}: round {number}")
-        looks = _looked(one, record, causes, worth, seen)
+    while number <= ROUNDS and not axis.state.below_lattice:
+        advance(f"{axis.state.axis}: round {number}")
+        looks = _looked(axis, record, causes, worth, seen)
         if not looks or looks[0].net < NET_LEAST:
             return
         # Of what is as likely a channel that was recorded comes first.
         best = next((look for look in looks if look.cause in record.channels), looks[0])
         best = best if best.net > looks[0].net - ALIKE else looks[0]
-        after = one.state.refit(**best.changes) if best.changes else one.state
-        known = score.gain(best, one.state, after, record)
-        emptied = after.best.sigma < NO_NOISE * one.first.best.sigma
+        after = axis.state.refit(**best.changes) if best.changes else axis.state
+        known = score.gain(best, axis.state, after, record)
+        emptied = after.best.sigma < NO_NOISE * axis.first.best.sigma
         if emptied or _refuted(best, known):
-            (one.dropped if emptied or _free(best) else one.harmful).append(best)
+            (axis.dropped if emptied or _free(best) else axis.harmful).append(best)
             continue
         rivals = tuple(look for look in looks if look.net > best.net - ALIKE and look.cause != best.cause)
         possible = tuple(dict.fromkeys(look.cause for look in rivals))
-        one.findings.append(Finding(best, number, one.state, after, possible, rivals, held_out=known))
+        axis.findings.append(Finding(best, number, axis.state, after, possible, rivals, held_out=known))
         if best.changes:
-            one.state = after
+            axis.state = after
             seen.clear()
-        causes_of = {(finding.round, finding.event, finding.look.cause) for finding in one.findings}  # motion once
+        causes_of = {(finding.round, finding.event, finding.look.cause) for finding in axis.findings}  # motion once
         if len(causes_of) < BUSY:
             worth.clear()
         number += 1
@@ -413,24 +416,28 @@ def _refuted(look: Look, held_out: HeldOut | None) -> bool:
 
 
 def _looked(
-    one: Diagnosed, record: Record, causes: Sequence[Looks], worth: dict[Looks, float], seen: dict[Looks, list[Look]]
+    axis: Diagnosed,
+    record: Record,
+    causes: Sequence[Looks],
+    worth: dict[Looks, float],
+    seen: dict[Looks, list[Look]],
 ) -> list[Look]:
     """The looks of `causes`, the most worth first; what has no name comes after every cause that has one. `seen` are
     those at this state. A cause waits while its `worth`, when it was last looked at, is less than the best has now."""
-    named = Counter(finding.look.cause for finding in one.findings)
+    named = Counter(finding.look.cause for finding in axis.findings)
     waiting = sorted((cause for cause in causes if cause not in seen), key=lambda cause: -worth.get(cause, math.inf))
     while True:
         looks = [
             look
             for look in chain(*seen.values())
             if named[look.cause] < (CAUSES[look.cause].grouping.most or ROUNDS)
-            and not any(map(look.repeats, (*one.harmful, *one.dropped)))
+            and not any(map(look.repeats, (*axis.harmful, *axis.dropped)))
         ]
         best = max(map(_worth, looks), default=-math.inf)
         if not waiting or worth.get(waiting[0], math.inf) < best - ALIKE:
             return sorted(looks, key=lambda look: (_worth(look), look.net), reverse=True)
         cause = waiting.pop(0)
-        seen[cause] = cause(one.state, record)
+        seen[cause] = cause(axis.state, record)
         worth[cause] = max(map(_worth, seen[cause]), default=-math.inf)
 
 
@@ -439,14 +446,14 @@ def _worth(look: Look) -> float:
     return -math.inf if look.cause == "unexplained" or look.net < NET_LEAST else look.net
 
 
-def _unexplained(one: Diagnosed) -> None:
-    if one.state.below_lattice:
+def _unexplained(axis: Diagnosed) -> None:
+    if axis.state.below_lattice:
         return
-    one.after, look = unexplained(one.state, one.record)
-    if look is None and not one.findings:
-        look = _unlasting(one.harmful)
-    if look is not None and all(finding.look.cause != "unexplained" for finding in one.findings):
-        one.findings.append(Finding(look, ROUNDS + 1, one.state, one.state))
+    axis.after, look = unexplained(axis.state, axis.record)
+    if look is None and not axis.findings:
+        look = _unlasting(axis.harmful)
+    if look is not None and all(finding.look.cause != "unexplained" for finding in axis.findings):
+        axis.findings.append(Finding(look, ROUNDS + 1, axis.state, axis.state))
 
 
 def _unlasting(harmful: Sequence[Look]) -> Look | None:

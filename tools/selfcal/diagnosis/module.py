@@ -19,13 +19,14 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import logsumexp, softmax
 
 from selfcal.base.grid import half_means
+from selfcal.diagnosis.alias import WANDERS
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
-from selfcal.diagnosis.forms import FORMS, LN_FORMS, LN_SMOOTHINGS, LONGEST_LAG
+from selfcal.diagnosis.forms import FORMS, LN_FORMS, shape_of, side_of, variants_of
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
-from selfcal.likelihood.columns import LN_SLOW
-from selfcal.likelihood.edges import peaks, scan
+from selfcal.likelihood.columns import LN_EITHER, LN_SLOW
+from selfcal.likelihood.edges import EDGE, peaks, scan
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
     WIDTHS,
@@ -44,7 +45,6 @@ from selfcal.likelihood.joint import (
 )
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, State
 from selfcal.likelihood.statemodel import Array, Mask
-from selfcal.model.forms import formed, slope
 
 #: Chance makes an evidence of T nats and more on this times e^-T of modules on which nothing acts (`make module-null`).
 NULL = 0.05
@@ -72,22 +72,18 @@ PLACES = 4
 FAST_LINES = 6
 #: A line is fitted with the drifts so often at most, or until it moves by less than this many turns in the record.
 LOCKED, HELD = 6, 0.02
-#: Multiples of a line that are looked at with it, if it is no slow one, and ln of the number of kinds of lines.
-MULTIPLES, LN_ALONE = 5, math.log(2.0)
-#: ln of the ways in which the phases of a line on the axes may go together.
-LN_PHASES = math.log(2.0)
+#: Multiples of a line that are looked at with it, if it is no slow one.
+MULTIPLES = 5
 #: Jumps of all levels, the largest ones, of which each two may be the ends of a pulse.
 PAIRED = 30
-#: Samples at each end in which no step is looked for, and of a pulse at least.
-EDGE, SHORTEST = 4, 4
+#: Samples of a pulse at least.
+SHORTEST = 4
 #: Share of the information of a step far from the ends, from which on two of them are taken as there.
 WHOLE = 0.95
 #: Durations of a pulse, a factor apart, and its places in one duration.
 LONGER, PLACES_IN = 1.15, 16
 #: Bins about a frequency that tell its noise.
 BESIDE = 50
-#: A line about one that is left to the axes is its own within this share of the frequency: it wanders.
-WANDERS = 0.02
 #: A jump that one size of the quantity explains to this share is the quantity's own.
 PATTERN = 0.7
 #: Causes of those jumps.
@@ -98,10 +94,8 @@ OF_TIME = (*JUMPS, "ramp", "turn_on")
 CURVES = 4
 #: Logarithm of a factor about a time constant within which others are as possible as their likelihood says.
 NEAR_TAU = 1.5
-#: The shortest lag of a channel, means.
-LAG_LEAST = 20.0
-#: Smoothing of a channel, s, and windows of its rate.
-SMOOTH_S, RATES_S = 30.0, (60.0, 400.0)
+#: Forms of a channel that are looked for on all axes together: those of one column.
+CHANNEL_FORMS = ("static", "lag", "rate", "square")
 
 
 #: Cause, its shape, the column [n] and the price of its search.
@@ -189,7 +183,7 @@ class Seen:
         """Evidence of the best of some slow curves, nats: what wanders goes like one, whatever channel does too."""
         t = (np.arange(self.n) + 0.5) / self.n
         shapes: list[Shape] = [("", (), np.cos(math.pi * half * t), math.log(CURVES)) for half in range(1, CURVES + 1)]
-        return max((one.evidence for one in _weighed(self, shapes, _scored(self, shapes))), default=0.0)
+        return max((candidate.evidence for candidate in _weighed(self, shapes, _scored(self, shapes))), default=0.0)
 
     @cached_property
     def axes(self) -> list[State]:
@@ -226,7 +220,7 @@ def sizes(score: Array, known: Array) -> Array:
 def _best(gain: Array, score: Array, known: Array, apart: int) -> list[int]:
     """The best places of scores [n, m]: of all axes together, by their `gain` [n], and of each alone."""
     alone = 0.5 * score**2 / np.maximum(np.diagonal(known, axis1=-2, axis2=-1), 1e-300)
-    found = [peaks(gain, PLACES, apart), *(peaks(one, 1, apart) for one in alone.T)]
+    found = [peaks(gain, PLACES, apart), *(peaks(row, 1, apart) for row in alone.T)]
     return list(dict.fromkeys(at for each in found for at in each))
 
 
@@ -273,8 +267,8 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
     cross = seen.cross[0] - seen.cross[last - first]
     gain = full(shock[first] - shock[last], cross + np.swapaxes(cross, 1, 2))
     paired = [*zip(gain.tolist(), first.tolist(), last.tolist(), strict=True)]
-    places = [_moved(seen, *one[1:]) for each in (best, paired) for one in sorted(each, reverse=True)[:PLACES]]
-    places = [one for one in dict.fromkeys(places) if one[1] - one[0] >= SHORTEST]
+    places = [_moved(seen, *pair[1:]) for each in (best, paired) for pair in sorted(each, reverse=True)[:PLACES]]
+    places = [place for place in dict.fromkeys(places) if place[1] - place[0] >= SHORTEST]
     t = np.arange(seen.n)
     columns = np.array([(t >= begin) & (t < end) for begin, end, _ in places], dtype=np.float64).reshape(-1, seen.n)
     for (begin, end, alike), column, known in zip(
@@ -340,10 +334,10 @@ def lines(seen: Seen) -> Iterator[Candidate]:
         if most == 1:  # the record ends, and a spectrum does not
             scale = own[place[at]]
             there[0] = information(seen.model, seen.y, waves).mean(axis=0) * np.outer(scale, scale)
-        tried = [(LN_ALONE, f, waves)]
+        tried = [(LN_EITHER, f, waves)]
         if len(multiples) > 1:
             f = _sharpest(_of_multiples(weights, there, multiples), at / padded, 0.5 / padded)
-            waves, kinds = _waves(f, n, multiples), LN_ALONE + math.log(len(multiples) - 1)
+            waves, kinds = _waves(f, n, multiples), LN_EITHER + math.log(len(multiples) - 1)
             tried += [(kinds, f, waves[: 2 * count]) for count in range(2, len(multiples) + 1)]
         found = []
         for kinds, f, parts in tried:
@@ -351,7 +345,7 @@ def lines(seen: Seen) -> Iterator[Candidate]:
             for acts, phases, columns in _phased(parts, parts @ weights, there[: len(parts) // 2]):
                 cost = kinds + phases + float(ln_lines(np.array(f * n), n, np.array(acts.evidence)))
                 found.append(Candidate("periodic", theta, acts, cost, columns))
-        best, every = _ranked(found)[0], float(logsumexp([one.evidence for one in found]))
+        best, every = _ranked(found)[0], float(logsumexp([candidate.evidence for candidate in found]))
         yield replace(best, price=best.act.evidence - every)  # the kinds share the evidence for a line
 
 
@@ -376,7 +370,7 @@ def _combs(V: NDArray[np.complex128], known: Array, usable: Mask) -> Array:
 def _phased(waves: Array, score: Array, known: Array) -> Iterator[tuple[Act, float, Array]]:
     """Cosines and sines `waves` [2 k, n] by their scores [2 k, m] and information [k, m, m]: each with a phase on each
     axis, and of one waveform for all, as a single source has it. Of each what it acts on, its price and its columns."""
-    yield act(score, np.repeat(known, 2, axis=0)), LN_PHASES, waves
+    yield act(score, np.repeat(known, 2, axis=0)), LN_EITHER, waves
     loud = np.sqrt(np.repeat(np.trace(np.linalg.solve(known[0], known), axis1=1, axis2=2), 2) / score.shape[1])
     of_first = score / loud[:, None]
     sizes, ways = np.linalg.eigh(of_first @ np.linalg.solve(known[0], of_first.T))
@@ -388,7 +382,7 @@ def _phased(waves: Array, score: Array, known: Array) -> Iterator[tuple[Act, flo
     # Before the record amplitudes fall like a square wave's: directions of normal ones (Tyler 1987, Biometrika 74).
     price += float(np.log(loud / falling).sum() + half * np.log(((form * falling) ** 2).sum()))
     there = np.tensordot((form**2).reshape(-1, 2).sum(axis=1), known, 1)
-    yield act((form @ score)[None], there), LN_PHASES + max(0.0, price), (form @ waves)[None]
+    yield act((form @ score)[None], there), LN_EITHER + max(0.0, price), (form @ waves)[None]
 
 
 def _waves(f: float, n: int, multiples: Sequence[int]) -> Array:
@@ -436,10 +430,10 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
         wave = np.exp(2j * math.pi * np.mod(turn * np.arange(n), 1.0))
         score = (w @ wave / np.sqrt(own[:, at])) @ inverse
         tried = _phased(np.empty((2, 0)), np.array([score.real, score.imag]), 0.5 * n * inverse[None])
-        one, price = max(((acts, price) for acts, price, _ in tried), key=lambda each: each[0].evidence - each[1])
-        evidence = one.evidence - price - float(ln_lines(np.array(turn * n), n, np.array(one.evidence)))
-        if evidence >= EVIDENT and len(one.axes) > 1:
-            found.append(Event(tuple(names[k] for k in one.axes), "periodic", (turn / dt,), evidence))
+        joint, price = max(((acts, price) for acts, price, _ in tried), key=lambda each: each[0].evidence - each[1])
+        evidence = joint.evidence - price - float(ln_lines(np.array(turn * n), n, np.array(joint.evidence)))
+        if evidence >= EVIDENT and len(joint.axes) > 1:
+            found.append(Event(tuple(names[k] for k in joint.axes), "periodic", (turn / dt,), evidence))
         gain[max(0, at - 8) : at + 9] = 0.0
     return found
 
@@ -494,48 +488,38 @@ def transients(seen: Seen) -> Iterator[Candidate]:
     ln_tau = math.log(FASTEST * seen.dt) + 0.5 * math.log(2.0) * np.arange(2 * int(math.log2(seen.n / FASTEST)) + 1)
     tau = np.exp(ln_tau)
     shapes: list[Shape] = [("ramp", (), t - t.mean(), LN_SLOW)]
-    shapes += [("turn_on", (float(one),), np.exp(-(t + seen.since_s) / one), LN_LOOKS + LN_SLOW) for one in tau]
+    shapes += [
+        ("turn_on", (float(constant),), np.exp(-(t + seen.since_s) / constant), LN_LOOKS + LN_SLOW) for constant in tau
+    ]
     scored = _scored(seen, shapes)
-    for one in _simplest(_weighed(seen, shapes, scored)):
-        yield replace(one, theta=(*one.theta, NEAR_TAU)) if one.theta else one
+    for candidate in _simplest(_weighed(seen, shapes, scored)):
+        yield replace(candidate, theta=(*candidate.theta, NEAR_TAU)) if candidate.theta else candidate
 
 
 def _simplest(found: Iterable[Candidate]) -> list[Candidate]:
     """Of what is as likely as a constant rate that one alone."""
     found = list(found)
-    ramp = max((one.evidence for one in found if one.cause == "ramp"), default=-math.inf)
-    return [one for one in found if one.cause == "ramp" or one.evidence > ramp + ALIKE]
+    ramp = max((candidate.evidence for candidate in found if candidate.cause == "ramp"), default=-math.inf)
+    return [candidate for candidate in found if candidate.cause == "ramp" or candidate.evidence > ramp + ALIKE]
 
 
 def channels(seen: Seen) -> Iterator[Candidate]:
     """Temperature and supply in their forms."""
     for cause, values in seen.channels.items():
-        about = values - values.mean()
-        smooth = uniform_filter1d(about, max(1, round(SMOOTH_S / seen.dt)), mode="nearest")
-        price = LN_SMOOTHINGS + LN_SLOW
-        static = FORMS.index("static")
-        shapes: list[Shape] = [(cause, (static, 1.0), about, price), (cause, (static, SMOOTH_S), smooth, price)]
-        lag = LAG_LEAST * seen.dt
-        while lag < LONGEST_LAG * seen.n * seen.dt:
-            shapes.append(
-                (cause, (FORMS.index("lag"), lag), formed(about, "lag", lag, 0.0, seen.dt), price + LN_FORMS["lag"])
-            )
-            lag *= 2.0
-        shapes += [
-            (cause, (FORMS.index("rate"), window), slope(about, window, seen.dt) * window, price + LN_FORMS["rate"])
-            for window in RATES_S
-            if window < seen.n * seen.dt / 6.0
-        ]
-        shapes.append(
-            (cause, (FORMS.index("square"), SMOOTH_S), smooth**2 - np.mean(smooth**2), price + LN_FORMS["square"])
-        )
-        shapes = [one for one in shapes if np.ptp(one[2]) > 0.0]
+        side = replace(side_of(cause, "", values), forms=CHANNEL_FORMS)
+        shapes: list[Shape] = []
+        for variant in variants_of(side, seen.axes[0]):
+            shape = shape_of(side, seen.axes[0], *variant)
+            column = shape.columns[-1] - shape.columns[-1].mean()
+            if np.ptp(column) > 0.0:
+                price = side.ln_looks + LN_FORMS[shape.form]
+                shapes.append((cause, (FORMS.index(shape.form), *variant[1:]), column, price))
         yield from _weighed(seen, shapes, _scored(seen, shapes))
 
 
 def _scored(seen: Seen, shapes: Sequence[Shape]) -> tuple[Array, Array, Array]:
     """The columns [k, n], their scores [k, m], and the information of each [k, m, m]."""
-    columns = np.array([one[2] / max(float(np.std(one[2])), 1e-300) for one in shapes])
+    columns = np.array([shape[2] / max(float(np.std(shape[2])), 1e-300) for shape in shapes])
     return columns, columns @ seen.course.weights, information(seen.model, seen.y, columns)
 
 
@@ -550,57 +534,61 @@ def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Ar
             return
         cause, theta, _, price = shapes[k]
         plain = Candidate(cause, theta, act(score[k][None], known[k]), price, columns[k][None])
-        yield max(plain, beside(seen, plain), key=lambda one: one.evidence) if seen.model.has_f else apart(seen, plain)
+        yield (
+            max(plain, beside(seen, plain), key=lambda candidate: candidate.evidence)
+            if seen.model.has_f
+            else apart(seen, plain)
+        )
 
 
-def apart(seen: Seen, one: Candidate) -> Candidate:
+def apart(seen: Seen, candidate: Candidate) -> Candidate:
     """A slow candidate over the drifts of each axis that its record leaves possible."""
-    each = [state.bayes(one.columns[0], np.array(WIDTHS)) for state in seen.axes]
-    return replace(one, act=act_apart(*map(np.array, zip(*each, strict=True))), more=0.0)
+    each = [state.bayes(candidate.columns[0], np.array(WIDTHS)) for state in seen.axes]
+    return replace(candidate, act=act_apart(*map(np.array, zip(*each, strict=True))), more=0.0)
 
 
-def beside(seen: Seen, one: Candidate) -> Candidate:
+def beside(seen: Seen, candidate: Candidate) -> Candidate:
     """The candidate with the drifts fitted anew beside its column, which it may have on any axis."""
-    known = information(seen.model, seen.y, one.columns[:1])[0]
-    effect = sizes(one.columns @ seen.course.weights, known).T @ one.columns
+    known = information(seen.model, seen.y, candidate.columns[:1])[0]
+    effect = sizes(candidate.columns @ seen.course.weights, known).T @ candidate.columns
     model = refitted(seen.model, seen.y - effect, seen.dt)
     found = course(model, seen.y, smooth=True)
-    score, known = one.columns @ found.weights, information(model, seen.y, one.columns[:1])[0]
-    return _gained(seen, replace(one, act=act(score, known)), score, model, found)
+    score, known = candidate.columns @ found.weights, information(model, seen.y, candidate.columns[:1])[0]
+    return _gained(seen, replace(candidate, act=act(score, known)), score, model, found)
 
 
-def _gained(seen: Seen, one: Candidate, score: Array, model: Joint, found: Course) -> Candidate:
+def _gained(seen: Seen, candidate: Candidate, score: Array, model: Joint, found: Course) -> Candidate:
     """The candidate, of scores [p, m] at a new `model`, with what the records less its effect gain there. `found`: the
     records at that model, which may suit them better without it too."""
-    gain = course(model, seen.y - one.effect).ln_likelihood - max(seen.course.ln_likelihood, found.ln_likelihood)
-    return replace(one, more=gain - 0.5 * float((one.act.size * score).sum()))
+    gain = course(model, seen.y - candidate.effect).ln_likelihood - max(seen.course.ln_likelihood, found.ln_likelihood)
+    return replace(candidate, more=gain - 0.5 * float((candidate.act.size * score).sum()))
 
 
-def locked(seen: Seen, one: Candidate) -> Candidate:
+def locked(seen: Seen, candidate: Candidate) -> Candidate:
     """A line with the drifts fitted anew beside it, at the frequency that it has there: drifts that were fitted without
     have swallowed the most of a slow one, and what they left lies elsewhere."""
-    n, multiples = seen.n, (1, *map(round, one.theta[1:]))
+    n, multiples = seen.n, (1, *map(round, candidate.theta[1:]))
     for k in range(LOCKED):
-        model = refitted(seen.model, seen.y - one.effect, seen.dt)
-        found, f = course(model, seen.y, smooth=True), one.theta[0] * seen.dt
+        model = refitted(seen.model, seen.y - candidate.effect, seen.dt)
+        found, f = course(model, seen.y, smooth=True), candidate.theta[0] * seen.dt
         sharp = _sharpest(_of_columns(seen.y, model, found.weights, multiples), f, 0.5 ** min(k, 2) / n)
         waves = _waves(sharp, n, multiples)
         known = information(model, seen.y, waves).reshape(len(multiples), 2, *model.correlation.shape).mean(axis=1)
         phased = _phased(waves, waves @ found.weights, known)
-        acts, columns = next((acts, columns) for acts, _, columns in phased if len(columns) == len(one.columns))
-        one = replace(one, theta=(sharp / seen.dt, *one.theta[1:]), act=acts, columns=columns)
-        one = _gained(seen, one, columns @ found.weights, model, found)
+        acts, columns = next((acts, columns) for acts, _, columns in phased if len(columns) == len(candidate.columns))
+        candidate = replace(candidate, theta=(sharp / seen.dt, *candidate.theta[1:]), act=acts, columns=columns)
+        candidate = _gained(seen, candidate, columns @ found.weights, model, found)
         if abs(sharp - f) * n < HELD:
             break
-    return one
+    return candidate
 
 
-def settled(seen: Seen, one: Candidate) -> Candidate:
+def settled(seen: Seen, candidate: Candidate) -> Candidate:
     """A bias that settles with the drifts fitted anew beside it, by the time constants that it may have there: ever
     closer ones, until the record no longer tells them apart."""
-    t, (tau, step) = (np.arange(seen.n) + 0.5) * seen.dt + seen.since_s, one.theta
+    t, (tau, step) = (np.arange(seen.n) + 0.5) * seen.dt + seen.since_s, candidate.theta
     for _ in range(LOCKED):
-        model = refitted(seen.model, seen.y - one.effect, seen.dt)
+        model = refitted(seen.model, seen.y - candidate.effect, seen.dt)
         found, ln_tau = course(model, seen.y, smooth=True), math.log(tau) + step * np.linspace(-1.0, 1.0, 7)
         columns = np.exp(-t / np.exp(ln_tau)[:, None])
         columns /= columns.std(axis=1)[:, None]
@@ -609,20 +597,22 @@ def settled(seen: Seen, one: Candidate) -> Candidate:
         middle, between = float(weight @ ln_tau), step / 3.0
         sd = math.sqrt(float(weight @ (ln_tau - middle) ** 2) + between**2 / 12.0)
         k = int(np.argmax(weight))
-        one = replace(one, theta=(math.exp(middle), sd), act=act(score[k][None], known[k]), columns=columns[k][None])
-        one = _gained(seen, one, score[k][None], model, found)
+        candidate = replace(
+            candidate, theta=(math.exp(middle), sd), act=act(score[k][None], known[k]), columns=columns[k][None]
+        )
+        candidate = _gained(seen, candidate, score[k][None], model, found)
         moved, tau = abs(middle - math.log(tau)), math.exp(middle)
         if sd > between and moved < 0.5 * sd:
             break
         step = between if sd < between and 0 < k < ln_tau.size - 1 else step
-    return one if seen.model.has_f else apart(seen, one)
+    return candidate if seen.model.has_f else apart(seen, candidate)
 
 
-def between_levels(seen: Seen, one: Candidate) -> Candidate:
+def between_levels(seen: Seen, candidate: Candidate) -> Candidate:
     """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one that a
     jump widens takes a half for the whole."""
     passing = []
-    for time in one.theta:
+    for time in candidate.theta:
         at = round(time / seen.dt)
         before, after, about = (
             seen.y[:, max(0, at - high) : max(0, at - low)]
@@ -632,16 +622,16 @@ def between_levels(seen: Seen, one: Candidate) -> Candidate:
             continue
         with np.errstate(invalid="ignore"):
             off = [np.abs(about - np.nanmedian(level, axis=1)[:, None]) > SPIKE / 2.0 for level in (before, after)]
-        places = np.flatnonzero((off[0] & off[1])[one.act.axes].any(axis=0)) + max(0, at - PASSING)
+        places = np.flatnonzero((off[0] & off[1])[candidate.act.axes].any(axis=0)) + max(0, at - PASSING)
         if places.size:
             slow = int(places.size > 1)  # where it begins and ends it is near a level
             passing.append((int(places[0]) - slow, int(places[-1]) + 1 + slow))
     if not passing:
-        return beside(seen, one)
+        return beside(seen, candidate)
     y = seen.y.copy()
     for begin, end in passing:
         y[:, begin:end] = np.nan
-    return replace(beside(replace(seen, y=y), one), passing=tuple(passing))
+    return replace(beside(replace(seen, y=y), candidate), passing=tuple(passing))
 
 
 #: Causes whose shape is looked for once more with the drifts beside them: their family, and that look.
@@ -658,7 +648,7 @@ FAMILIES: dict[str, Callable[[Seen], Iterator[Candidate]]] = {
 
 def _ranked(found: Iterable[Candidate]) -> list[Candidate]:
     """The most evident first."""
-    return sorted(found, key=lambda one: -one.evidence)
+    return sorted(found, key=lambda candidate: -candidate.evidence)
 
 
 def _best_of(found: Iterable[Candidate]) -> Candidate | None:
@@ -701,20 +691,24 @@ class Search:
         turns = MOST - len(self.several) - len(self.single)
         while turns > 0:
             left = {
-                name: [one for one in each if not any(one is other for other in vain)]
+                name: [candidate for candidate in each if not any(candidate is other for other in vain)]
                 for name, each in self.known.items()
             }
-            found = _best_of(one for each in left.values() for one in each)
+            found = _best_of(candidate for each in left.values() for candidate in each)
             last = found is None or found.evidence < least
             if last:
                 jumps = [_ranked(left[name])[:REFITTED] for name in JUMPS]
-                found = _best_of(beside(self.seen, one) for each in jumps for one in each if one.evidence > 0.0)
+                found = _best_of(
+                    beside(self.seen, candidate) for each in jumps for candidate in each if candidate.evidence > 0.0
+                )
             if found is None or found.evidence < least:
                 return
-            if found.cause in FIRMED and not any(found is one for one in firm):
+            if found.cause in FIRMED and not any(found is candidate for candidate in firm):
                 family, firmed = FIRMED[found.cause]
                 firm.append(firmed(self.seen, found))
-                self.known[family] = _simplest(firm[-1] if one is found else one for one in self.known[family])
+                self.known[family] = _simplest(
+                    firm[-1] if candidate is found else candidate for candidate in self.known[family]
+                )
                 continue
             turns -= 1
             own = self._is_own(found)
@@ -737,21 +731,21 @@ class Search:
             self.model = refitted(self.model, self.rest, self.dt)
             self._changed()
 
-    def _is_own(self, one: Candidate) -> bool:
+    def _is_own(self, candidate: Candidate) -> bool:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
-        if one.share_of(self.model.loading) <= PATTERN:
+        if candidate.share_of(self.model.loading) <= PATTERN:
             return False
-        if one.cause not in self.channels:
-            return one.cause in OF_TIME
+        if candidate.cause not in self.channels:
+            return candidate.cause in OF_TIME
         slow = max([self.seen.wandering, *(each.evidence for each in self.known["transient"])])
-        return one.evidence < slow + ALIKE
+        return candidate.evidence < slow + ALIKE
 
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. What goes like it over the axes is its own, or a channel that is looked for
         again beside it: its wandering may go like a channel for a while."""
-        alike = [one for one in self.several if one.share_of(model.loading) > PATTERN]
-        self.rest = self.rest + sum(one.effect for one in alike)
-        self.several = [one for one in self.several if not any(one is each for each in alike)]
+        alike = [candidate for candidate in self.several if candidate.share_of(model.loading) > PATTERN]
+        self.rest = self.rest + sum(candidate.effect for candidate in alike)
+        self.several = [candidate for candidate in self.several if not any(candidate is each for each in alike)]
         self.model = refitted(model, self.rest, self.dt) if alike else model
         self._changed()
 
@@ -779,7 +773,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     search.go(NAMED)
     of = None
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
-        y = np.where(np.isfinite(search.rest), y, np.nan) - sum(one.effect for one in search.several)
+        y = np.where(np.isfinite(search.rest), y, np.nan) - sum(candidate.effect for candidate in search.several)
         model = refitted(search.model, y, span)
         of = Hidden(tuple(found), model, y, scale, span)
     return Module(tuple(found), span, tuple(search.several), of, scale)

@@ -107,8 +107,8 @@ def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str,
     more: dict[str, float] = {}
 
     def beside_others(name: str, apart: Sequence[str] = ()) -> State:
-        columns = [(other, one) for other, block in known.items() if other not in (name, *apart) for one in block]
-        added = [Regressor(f"{other}_{k}", "input", one, "1", {}) for k, (other, one) in enumerate(columns)]
+        columns = [(other, column) for other, block in known.items() if other not in (name, *apart) for column in block]
+        added = [Regressor(f"{other}_{k}", "input", column, "1", {}) for k, (other, column) in enumerate(columns)]
         return state.refit(regressors=(*state.regressors, *added)) if added else state
 
     for _ in range(ROUNDS if len(inputs) > 1 else 0):
@@ -118,22 +118,22 @@ def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str,
 
     def with_it(name: str) -> list[str]:
         """The other inputs that it goes together with."""
-        both = [one for one in alone if one != name and min(alone[one], alone[name]) > NET_LEAST]
-        apart = [one for one in both if min(more[one], more[name]) > NET_LEAST]
-        near = [abs(alone[one] - alone[name]) < ALIKE or _copies(inputs[one][0], inputs[name][0]) for one in both]
-        return [one for one, alike in zip(both, near, strict=True) if alike and one not in apart]
+        both = [rival for rival in alone if rival != name and min(alone[rival], alone[name]) > NET_LEAST]
+        apart = [rival for rival in both if min(more[rival], more[name]) > NET_LEAST]
+        near = [abs(alone[rival] - alone[name]) < ALIKE or _copies(inputs[rival][0], inputs[name][0]) for rival in both]
+        return [rival for rival, alike in zip(both, near, strict=True) if alike and rival not in apart]
 
     found = {}
     for name, each in inputs.items():
         other = with_it(name)
-        said = [f"it goes together with {one}: either explains the record alone" for one in other]
+        said = [f"it goes together with {rival}: either explains the record alone" for rival in other]
         found[name] = answer_of(beside_others(name, other), each, said)
     return found
 
 
-def _copies(one: Input, other: Input) -> bool:
+def _copies(given: Input, other: Input) -> bool:
     """Whether one of two inputs is the other one times a factor, within the noise of its readings."""
-    for a, b in ((one, other), (other, one)):
+    for a, b in ((given, other), (other, given)):
         x, y = a.values - a.values.mean(), b.read - b.read.mean()
         noise = float(y @ (b.read - b.values)) / y.size  # the curve follows a part of it
         if np.var(y - x * (x @ y) / max(float(x @ x), 1e-300)) <= 2.0 * noise:
@@ -143,7 +143,7 @@ def _copies(one: Input, other: Input) -> bool:
 
 def _best(state: State, inputs: Sequence[Input]) -> tuple[float, Array]:
     """The score and the columns of an input's best structure."""
-    best = max(_found(state, inputs)[0], key=lambda one: one.score)
+    best = max(_found(state, inputs)[0], key=lambda answer: answer.score)
     return best.score, best.columns
 
 
@@ -151,7 +151,7 @@ def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
     """Every structure of the input as it acts likeliest, and that input."""
     each = [[transfer.tried(state, Drive(u.values, state.dt), structure) for structure in STRUCTURES] for u in inputs]
     # Of two that explain a record alike, the first is meant.
-    best = [max(one.score for one in tried) for tried in each]
+    best = [max(answer.score for answer in tried) for tried in each]
     place = max(range(len(each)), key=lambda k: best[k] + ALIKE * (k == 0))
     return each[place], inputs[place]
 
@@ -164,18 +164,18 @@ def answer_of(state: State, inputs: Sequence[Input], against: Sequence[str] = ()
     drive = Drive(given.values, dt)
     unit = given.unit
     found = transfer.beside_two_terms(state, found)
-    chosen = max(found, key=lambda one: one.score)
+    chosen = max(found, key=lambda answer: answer.score)
     net = transfer.worth(state, chosen)
     shown = chosen.score > 0.0 and net >= NET_LEAST
-    weight = np.exp(np.array([one.score for one in found]) - max(0.0, chosen.score))
+    weight = np.exp(np.array([answer.score for answer in found]) - max(0.0, chosen.score))
     weight /= weight.sum()
-    poles = np.array([one.structure.poles for one in found])
+    poles = np.array([answer.structure.poles for answer in found])
     orders = {str(order): float(weight[poles == order].sum()) for order in sorted(set(poles.tolist()))}
     likely = sorted(orders, key=lambda order: -orders[order])
     within = likely[: 1 + int(np.searchsorted(np.cumsum([orders[order] for order in likely]), PROBABILITY))]
     rest = bridged(state.y)
-    for one, c in zip(state.regressors, chosen.fit.c[1:], strict=False):
-        rest = rest - c * one.values
+    for regressor, c in zip(state.regressors, chosen.fit.c[1:], strict=False):
+        rest = rest - c * regressor.values
     seen = transfer.empirical(given.values, rest, dt)
     entry: dict[str, Any] = {"influence": shown, "evidence_gain_nats": chosen.gain, "net_nats": net}
     if shown:
@@ -193,7 +193,7 @@ def answer_of(state: State, inputs: Sequence[Input], against: Sequence[str] = ()
         entry |= {
             "structure": chosen.structure.name,
             "order": {"chosen": chosen.structure.poles, "within_90": sorted(map(int, within)), "probability": orders},
-            "structures": {one.structure.name: float(share) for one, share in zip(found, weight, strict=True)},
+            "structures": {answer.structure.name: float(share) for answer, share in zip(found, weight, strict=True)},
             "source": {"verdict": verdict, "reason": reason},
             "held_out": {"nats_per_sample": held_out},
         }
@@ -223,7 +223,7 @@ class Pooled:
 
     def of(self, value: Callable[[Posterior], NDArray[Any]], key: str = "gain") -> NDArray[Any]:
         """Draws of a value, from each structure that has the key by its weight."""
-        chosen = [k for k, one in enumerate(self.each) if key in one.structure.keys]
+        chosen = [k for k, answer in enumerate(self.each) if key in answer.structure.keys]
         share = self.weight[chosen] / self.weight[chosen].sum()
         return np.concatenate(
             [value(self.each[k])[: round(DRAWS * part)] for k, part in zip(chosen, share, strict=True)]
@@ -234,8 +234,10 @@ class Pooled:
         made = []
         places = np.random.default_rng(2).choice(len(self.each), count, p=self.weight / self.weight.sum())
         for k, place in enumerate(places):
-            one = self.each[place]
-            made.append(one.c[k] @ drive.columns(one.structure, tuple(one.shape[k]))[: len(one.structure.keys)])
+            answer = self.each[place]
+            made.append(
+                answer.c[k] @ drive.columns(answer.structure, tuple(answer.shape[k]))[: len(answer.structure.keys)]
+            )
         return np.array(made)
 
 
@@ -263,8 +265,8 @@ def _silent(state: State, given: Input, methods: Mapping[str, Any]) -> dict[str,
     entry: dict[str, Any] = {}
     late_s = 0.0
     if found := methods.get("methods"):
-        gains = [one["gain"] for one in found.values()]
-        late_s = max(abs(one["delay_s"]) for one in found.values())
+        gains = [answer["gain"] for answer in found.values()]
+        late_s = max(abs(answer["delay_s"]) for answer in found.values())
         entry["range"] = {"gain": [min(gains), max(gains)], "unit": coefficient_unit(state.unit, given.unit)}
     span = state.y.size * state.dt
     # From times that show a delay to those that show a static gain.
@@ -280,9 +282,9 @@ def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
     values = dict(zip(structure.keys, drawn.c.T, strict=True)) | dict(zip(structure.shape, drawn.shape.T, strict=True))
     values.pop("window_s", None)
     if "gain" in values and structure.linear:
-        values["gain"] = pooled.of(lambda one: one.c[:, one.structure.keys.index("gain")])
+        values["gain"] = pooled.of(lambda answer: answer.c[:, answer.structure.keys.index("gain")])
         if structure.shape:
-            values["delay_s"] = pooled.of(lambda one: one.delay_s)
+            values["delay_s"] = pooled.of(lambda answer: answer.delay_s)
     if structure.name == "delay":
         del values["pure_delay_s"]
     elif structure.name == "lag":
@@ -321,18 +323,18 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
         "spectra": {"bands": off.size, "hold_answer": int(np.count_nonzero(off <= seen.within[clear]))},
         "methods": {
             name: {
-                "order": one.estimate.order,
-                "evidence_nats": {str(order): nats for order, nats in one.estimate.evidence.items()},
-                "gain": one.estimate.gain,
-                "delay_s": one.estimate.delay * step_s,
+                "order": answer.estimate.order,
+                "evidence_nats": {str(order): nats for order, nats in answer.estimate.evidence.items()},
+                "gain": answer.estimate.gain,
+                "delay_s": answer.estimate.delay * step_s,
                 "if_answer_holds": {
-                    "gain": [float(one.least[0]), float(one.most[0])],
-                    "delay_s": [float(one.least[1] * step_s), float(one.most[1] * step_s)],
+                    "gain": [float(answer.least[0]), float(answer.most[0])],
+                    "delay_s": [float(answer.least[1] * step_s), float(answer.most[1] * step_s)],
                 },
-                "within": dict(zip(("gain", "delay_s"), one.within, strict=True)),
-                "agrees": all(one.within),
+                "within": dict(zip(("gain", "delay_s"), answer.within, strict=True)),
+                "agrees": all(answer.within),
             }
-            for name, one in found.items()
+            for name, answer in found.items()
         },
     }
 
@@ -340,7 +342,7 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
 def _band(pooled: Pooled, n: int, dt: float) -> dict[str, list[float]]:
     """Gain and phase over frequency with their 90 % bands, point by point."""
     frequency = np.geomspace(1.0 / (n * dt), 0.5 / dt, 60)
-    G = pooled.of(lambda one: one.at(frequency), pooled.each[0].structure.keys[0])
+    G = pooled.of(lambda answer: answer.at(frequency), pooled.each[0].structure.keys[0])
     gain = np.quantile(np.abs(G), ENDS, axis=0)
     middle = G.mean(axis=0)
     turn = np.quantile(np.angle(G / middle), ENDS, axis=0)
@@ -393,8 +395,8 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     line(f"evidence {document['evidence_gain_nats']:.1f} nats, {document['net_nats']:.1f} net of the search")
     if "estimate" in document:
         table = table_of(("", "median", "5 %", "95 %", "unit"))
-        for key, one in document["estimate"].items():
-            table.add_row(WORDS[key], *(f"{one[at]:.4g}" for at in ("median", "q05", "q95")), one["unit"])
+        for key, entry in document["estimate"].items():
+            table.add_row(WORDS[key], *(f"{entry[at]:.4g}" for at in ("median", "q05", "q95")), entry["unit"])
         console.print(table)
     if set(document.get("estimate", ())) & set(POWER):
         line(f"gain at {given['reference']:.4g} {given['unit']}, from which the powers count")
@@ -413,12 +415,12 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     line("")
     line(f"other methods, means of {document['methods_step_s']:g} s; in brackets 90 % if the answer holds")
     table = table_of(("", "order", "static gain", "delay, s", "agrees"))
-    for name, one in document["methods"].items():
+    for name, entry in document["methods"].items():
         cells = []
         for key in ("gain", "delay_s"):
-            low, high = one["if_answer_holds"][key]
-            cells.append(f"{one[key]:.3g} ({low:.3g} to {high:.3g})")
-        table.add_row(name, str(one["order"]), *cells, "yes" if one["agrees"] else "no")
+            low, high = entry["if_answer_holds"][key]
+            cells.append(f"{entry[key]:.3g} ({low:.3g} to {high:.3g})")
+        table.add_row(name, str(entry["order"]), *cells, "yes" if entry["agrees"] else "no")
     console.print(table)
     spectra = document["spectra"]
     if spectra["bands"]:
@@ -445,7 +447,7 @@ def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
     for panel, key in ((gain, "gain"), (phase, "phase_deg")):
         for which, color, label in ((clear, "black", "ratio of spectra, 90 %"), (~clear, "0.75", "... by chance")):
             error = [seen[key] - seen[f"{key}_q05"], seen[f"{key}_q95"] - seen[key]]
-            shown = [np.where(which, one, np.nan) for one in (seen[key], *error)]
+            shown = [np.where(which, values, np.nan) for values in (seen[key], *error)]
             panel.errorbar(
                 seen["frequency_hz"], shown[0], shown[1:], color=color, marker="o", markersize=3.5, linestyle="",
                 elinewidth=1, label=label,

@@ -52,8 +52,8 @@ def next_record(look: Look, rivals: Sequence[Look], beside: State, record: Recor
     own = look.shape
     if own is None or not _planned(own):
         return None
-    forms = [(f"{look.cause} ({own.form})", f"{look.cause} ({one.form})", one) for one in look.rivals]
-    causes = [(look.cause, one.cause, one.shape) for one in rivals if one.shape is not None]
+    forms = [(f"{look.cause} ({own.form})", f"{look.cause} ({rival.form})", rival) for rival in look.rivals]
+    causes = [(look.cause, rival.cause, rival.shape) for rival in rivals if rival.shape is not None]
     kept = [[pair for pair in pairs if _planned(pair[2]) and not _nested(own, pair[2])] for pairs in (causes, forms)]
     pairs = kept[0] or kept[1]
     if not pairs:
@@ -61,21 +61,21 @@ def next_record(look: Look, rivals: Sequence[Look], beside: State, record: Recor
     beside = beside.refit()
     found = _known(own, beside)
     plans = [
-        {**_shortest(found, _known(one, beside), beside, record), "between": [name, other]}
-        for name, other, one in pairs
+        {**_shortest(found, _known(shape, beside), beside, record), "between": [name, other]}
+        for name, other, shape in pairs
     ]
     return max(plans, key=lambda plan: plan["duration_s"] or 0.0)
 
 
 def _planned(shape: Shape) -> bool:
     """Whether the values of its columns in a planned record are known."""
-    entries = [one.entry for one in shape.regressors]
-    return all(one.get("kind") in ("time", "turn_on", "column") and "input" not in one for one in entries)
+    entries = [regressor.entry for regressor in shape.regressors]
+    return all(entry.get("kind") in ("time", "turn_on", "column") and "input" not in entry for entry in entries)
 
 
 def _nested(a: Shape, b: Shape) -> bool:
     """Whether one is a case of the other: no record is evidence against a coefficient that may be 0."""
-    names = [{one.name for one in shape.regressors} for shape in (a, b)]
+    names = [{regressor.name for regressor in shape.regressors} for shape in (a, b)]
     return names[0] < names[1] or names[1] < names[0]
 
 
@@ -83,24 +83,31 @@ def _known(shape: Shape, state: State) -> Rival:
     """A shape by the first record."""
     points, _ = possible(state, shape)
     shapes = shape.near(np.exp(points[:: 1 + len(points) // NODES])) if shape.numbers else [shape]
-    blocks = [np.array([column.values for column in one.regressors]) for one in shapes]
+    blocks = [np.array([column.values for column in shape.regressors]) for shape in shapes]
     drifts = [state.best.shrunk(-size) for size in SIZES]
-    sums = [list(state.beside(one.terms, one.theta, blocks)) for one in drifts]
-    mean = np.array([[one.coefficients()[0] for one in each] for each in sums])
-    G = np.array([[one.G[1:, 1:] * one.n / one.coefficients()[2] for one in each] for each in sums])
+    sums = [list(state.beside(drift.terms, drift.theta, blocks)) for drift in drifts]
+    mean = np.array([[sums_of.coefficients()[0] for sums_of in each] for each in sums])
+    G = np.array([[sums_of.G[1:, 1:] * sums_of.n / sums_of.coefficients()[2] for sums_of in each] for each in sums])
     known = np.all(np.diagonal(G, axis1=2, axis2=3) > 0.0, axis=2)  # else the model has the column
     unit = np.eye(mean.shape[-1])
     information = np.where(np.expand_dims(known, (2, 3)), G * (1.0 + 1e-9 * unit), unit)
-    ln_weight = np.array([[ln_likelihood(one) for one in each] for each in sums])
+    ln_weight = np.array([[ln_likelihood(sums_of) for sums_of in each] for each in sums])
     ln_weight = np.where(known, ln_weight - 0.5 * np.linalg.slogdet(information)[1], -math.inf)
-    return Rival(tuple(one.regressors for one in shapes), mean, information, np.exp(ln_weight - logsumexp(ln_weight)))
+    return Rival(
+        tuple(shape.regressors for shape in shapes), mean, information, np.exp(ln_weight - logsumexp(ln_weight))
+    )
 
 
 def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any]:
     """The shortest record that tells two rivals apart, with the smallest cycle that suffices in the time of the first
     record. A cycle takes a quarter of that time or more: of faster changes the first record says little."""
     causes = {name: cause for cause, name in record.channel_names.items()}
-    taken = {str(one.entry["column"]) for rival in (a, b) for one in rival.columns[0] if "column" in one.entry}
+    taken = {
+        str(regressor.entry["column"])
+        for rival in (a, b)
+        for regressor in rival.columns[0]
+        if "column" in regressor.entry
+    }
     drives = [name for name in causes if name in taken] if taken <= set(causes) else []
     span = record.present.size / record.rate_hz
     plan: dict[str, Any] = {"drive": None, "amplitude": None, "unit": None, "period_s": None, "duration_s": None}
@@ -143,14 +150,17 @@ def _drawn(
     passed = (np.arange(n) + 0.5) * dt
     random = np.random.default_rng(1)
     held = {name: record.channels[cause] for cause, name in record.channel_names.items()}
-    values = {name: np.full(n, 0.5 * (one.min() + one.max())) for name, one in held.items()}
+    values = {name: np.full(n, 0.5 * (values.min() + values.max())) for name, values in held.items()}
     if drive:
         values[drive] -= 0.5 * swing * np.cos(2.0 * math.pi * passed / period_s)
     for name, other in record.axes.items():  # an axis at rest is its own noise
         steps = random.standard_normal((2, n)) * [[other.best.N / math.sqrt(dt)], [other.best.K * math.sqrt(dt)]]
         values[name] = steps[0] + steps[1].cumsum()
     t = np.asarray(passed + (record.since_power_on_s + record.start_s + span), np.float64)
-    rows = [np.array([[_column(one, values, t, dt) for one in each] for each in rival.columns]) for rival in (a, b)]
+    rows = [
+        np.array([[_column(regressor, values, t, dt) for regressor in each] for each in rival.columns])
+        for rival in (a, b)
+    ]
     drifts = [_drift(state.best.shrunk(-size), dt) for size in SIZES]
     readings = []
     for rival, columns in zip((a, b), rows, strict=True):
@@ -161,7 +171,7 @@ def _drawn(
             c = rival.mean[d, place] + spread @ random.standard_normal(len(spread))
             readings.append(c @ columns[place] + _noise(drifts[d], dt, n, random))
     series = Series(
-        np.zeros(n), dt, np.ones(n), np.vstack([np.ones(n), *(one.reshape(-1, n) for one in rows), *readings])
+        np.zeros(n), dt, np.ones(n), np.vstack([np.ones(n), *(block.reshape(-1, n) for block in rows), *readings])
     )
     passes = [(run(series, terms, theta, innovations=True), sigma) for terms, theta, sigma in drifts]
     white = np.array([white[:, 1:] / sigma for (_, white, _), sigma in passes])

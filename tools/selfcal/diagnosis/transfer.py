@@ -149,15 +149,15 @@ def behind(u: Array, dt: float, number: Mapping[str, float]) -> tuple[Array, lis
     T = np.array(lags_of(number)) * np.linspace(1.0, 1.001, len(lags_of(number)))
     if not T.size:
         return u, before
-    share = [one ** (T.size - 1) / np.prod(one - np.delete(T, k)) for k, one in enumerate(T)]
+    share = [constant ** (T.size - 1) / np.prod(constant - np.delete(T, k)) for k, constant in enumerate(T)]
 
     def through(x: Array) -> Array:
-        return np.asarray(sum((w * late(x, one, dt)).real for w, one in zip(share, T, strict=True)))
+        return np.asarray(sum((w * late(x, constant, dt)).real for w, constant in zip(share, T, strict=True)))
 
-    decays = [np.exp(-time / one) for one in T]
+    decays = [np.exp(-time / constant) for constant in T]
     if np.iscomplexobj(T):
         decays = [decays[0].real, decays[0].imag]
-    return through(u), [through(one) for one in before] + decays
+    return through(u), [through(values) for values in before] + decays
 
 
 @dataclass(frozen=True)
@@ -201,7 +201,7 @@ class Drive:
                 return (self.u - v) / number["lag_s"] if late else slope(self.u, number["window_s"], self.dt)
             return self.u - v if key == "direct" else v ** {"gain": 1, **POWER}[key]
 
-        more = [one * v for one in before] if "square" in structure.keys else []
+        more = [values * v for values in before] if "square" in structure.keys else []
         return np.array([*map(of, structure.keys), *before, *more])
 
     def each(self, structure: Structure, points: Iterable[Sequence[float] | Array]) -> list[Array]:
@@ -321,35 +321,35 @@ def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
     A drift of one term that follows quick errors of a structure leaves slow columns some nats of their own."""
     if state.extras.flicker:
         return list(found)
-    best = max(found, key=lambda one: one.score)
+    best = max(found, key=lambda trial: trial.score)
     base = max(state.rich.ln_likelihood, state.best.ln_likelihood)
 
-    def refitted(one: Tried) -> tuple[Fit, float]:
-        fit = refit(state.series.beside(one.columns), state.rich)
-        clearly = fit.ln_likelihood > one.fit.ln_likelihood + ALIKE
-        return fit if clearly else one.fit, fit.ln_likelihood - base - one.gain
+    def refitted(trial: Tried) -> tuple[Fit, float]:
+        fit = refit(state.series.beside(trial.columns), state.rich)
+        clearly = fit.ln_likelihood > trial.fit.ln_likelihood + ALIKE
+        return fit if clearly else trial.fit, fit.ln_likelihood - base - trial.gain
 
     of_best = refitted(best)[1]
-    near = [refitted(one) if one.score > best.score - NEAR else (one.fit, of_best) for one in found]
-    return [replace(one, score=one.score + more, fit=fit) for one, (fit, more) in zip(found, near, strict=True)]
+    near = [refitted(trial) if trial.score > best.score - NEAR else (trial.fit, of_best) for trial in found]
+    return [replace(trial, score=trial.score + more, fit=fit) for trial, (fit, more) in zip(found, near, strict=True)]
 
 
-def worth(state: State, one: Tried) -> float:
+def worth(state: State, trial: Tried) -> float:
     """Evidence of an influence, -ln p: net of the search, and of an input's decay that any drift might have."""
-    own = len(one.structure.keys)
-    start = max(0.0, state.with_columns(one.columns[own:])[0]) if own < len(one.columns) else 0.0
-    gain = min(one.gain, state.average_gain(one.columns)) - start
-    return net(gain, own + len(one.structure.shape), LN_STRUCTURES + own * LN_SLOW)
+    own = len(trial.structure.keys)
+    start = max(0.0, state.with_columns(trial.columns[own:])[0]) if own < len(trial.columns) else 0.0
+    gain = min(trial.gain, state.average_gain(trial.columns)) - start
+    return net(gain, own + len(trial.structure.shape), LN_STRUCTURES + own * LN_SLOW)
 
 
-def posterior(state: State, drive: Drive, one: Tried) -> Posterior:
+def posterior(state: State, drive: Drive, trial: Tried) -> Posterior:
     """Draws over coefficients, the filter's numbers, and the drift: every near one, and its parameters."""
-    structure = one.structure
+    structure = trial.structure
     drifts = [
-        (fit, theta, ln_share + _flat(fit, theta)) for fit, theta, ln_share in state.possible(one.columns, rich=True)
+        (fit, theta, ln_share + _flat(fit, theta)) for fit, theta, ln_share in state.possible(trial.columns, rich=True)
     ]
     likely = [
-        ln_share + _ln_weight(next(state.sums(fit.terms, theta, [one.columns]))) for fit, theta, ln_share in drifts
+        ln_share + _ln_weight(next(state.sums(fit.terms, theta, [trial.columns]))) for fit, theta, ln_share in drifts
     ]
     far = [drifts[int(np.argmax(likely))], max(drifts, key=lambda node: node[2])]
 
@@ -358,9 +358,9 @@ def posterior(state: State, drive: Drive, one: Tried) -> Posterior:
         return np.array([state.scores(each, replace(fit, theta=theta)) for fit, theta, _ in far])
 
     # At the likeliest drift, and at the largest, which leaves most possible.
-    points, steps = nodes(scores, one.point, drive.limits(structure))
+    points, steps = nodes(scores, trial.point, drive.limits(structure))
     blocks = drive.each(structure, np.exp(points))
-    k = len(one.columns)
+    k = len(trial.columns)
     ln_weight, means, roots, places = [], [], [], []
     for fit, theta, ln_share in drifts:
         for place, sums in enumerate(state.sums(fit.terms, theta, blocks)):
@@ -395,7 +395,7 @@ def _ln_weight(sums: Sums) -> float:
     return ln_likelihood(sums) + 0.5 * ln_det(rss / sums.n * inverse)
 
 
-def held_out(state: State, one: Tried) -> float:
+def held_out(state: State, trial: Tried) -> float:
     """What the influence gains on the last third, nats a sample. The drift and the size of the noise are of the part
     before; so are the coefficients, with what that part leaves open of them."""
     n = state.y.size
@@ -403,7 +403,7 @@ def held_out(state: State, one: Tried) -> float:
     before = replace(state, y=np.where(np.arange(n) < mark, state.y, np.nan))
 
     def rest(columns: Array) -> float:
-        learnt = refit(before.series.beside(columns), one.fit)
+        learnt = refit(before.series.beside(columns), trial.fit)
         values = []
         for sums in run(state.series.beside(columns), learnt.terms, learnt.theta, (mark, n))[0]:
             _, inverse, rss = sums.coefficients()
@@ -411,23 +411,23 @@ def held_out(state: State, one: Tried) -> float:
             values.append(0.5 * (ln_det(learnt.sigma**2 * inverse) - fit))
         return values[1] - values[0]
 
-    return (rest(one.columns) - rest(np.empty((0, n)))) / max(1, int(np.isfinite(state.y[mark:]).sum()))
+    return (rest(trial.columns) - rest(np.empty((0, n)))) / max(1, int(np.isfinite(state.y[mark:]).sum()))
 
 
-def left_over(state: State, drive: Drive, one: Tried) -> float:
+def left_over(state: State, drive: Drive, trial: Tried) -> float:
     """-ln p of residuals that still go with the input, net of the number of looks.
 
     At any frequency in any phase, so whatever the lag, and with one coefficient: with each column of the structure, the
     input itself, powers of what the filter makes of it, a coefficient that changes with time, and a filter that is
     quicker up than down."""
-    number = one.structure.named(one.point)
+    number = trial.structure.named(trial.point)
     v = behind(drive.u, drive.dt, number)[0]
     uneven = behind(np.abs(drive.u - v), drive.dt, number)[0]
-    own = one.columns[: len(one.structure.keys)]
+    own = trial.columns[: len(trial.structure.keys)]
     foreign = np.array([drive.u, v**2, v**3, own[0] * np.linspace(-1.0, 1.0, v.size), uneven])
-    w, *others = left(state.series.beside(one.columns), one.fit, foreign).T
+    w, *others = left(state.series.beside(trial.columns), trial.fit, foreign).T
     found = []
-    for u in (*left(state.series, one.fit, own).T[1:], *others):
+    for u in (*left(state.series, trial.fit, own).T[1:], *others):
         if float(u @ u) > 0.0:
             chi, bands = agreement(u, w, any_phase=True)
             found += [net(0.5 * chi, 2 * bands), net(0.5 * float(u @ w) ** 2 / float(u @ u) / float(np.var(w)))]
@@ -435,7 +435,7 @@ def left_over(state: State, drive: Drive, one: Tried) -> float:
 
 
 def source(
-    state: State, drive: Drive, one: Tried, drawn: Posterior, misfits: Sequence[str], *, acts_back: bool
+    state: State, drive: Drive, trial: Tried, drawn: Posterior, misfits: Sequence[str], *, acts_back: bool
 ) -> tuple[str, str]:
     """Whether the record tells that the input acts: "input first", "cannot tell" or "no structure", and the reason in
     words. `misfits`: what contradicts the structure. `acts_back`: the output may act on the input. No axis acts on a
@@ -445,22 +445,22 @@ def source(
     feedback = "feedback, or a common cause" if acts_back else "a common cause"
     lags = state.dt * 2.0 ** np.arange(1 + int(math.log2(max(LONGEST_LAG * drive.u.size, 1.0))))
     ahead = [late(drive.u[::-1], float(lag), state.dt)[::-1] for lag in lags]
-    both = state.scores([np.vstack([one.columns, column]) for column in ahead], one.fit)
-    back = net(float(both.max()) - one.gain, 1, LN_STRUCTURES) >= NET_LEAST
+    both = state.scores([np.vstack([trial.columns, column]) for column in ahead], trial.fit)
+    back = net(float(both.max()) - trial.gain, 1, LN_STRUCTURES) >= NET_LEAST
     if misfits and not (back and acts_back):
         return "no structure", "; ".join(misfits)
     if back:
         return "cannot tell", f"the input's later values explain the output as well: {feedback}"
-    if not one.structure.late:
+    if not trial.structure.late:
         either = "either may act on the other" if acts_back else "the input may act"
         return "cannot tell", f"both move at once: {either}, or a common cause on both"
-    own = dict(zip(one.structure.keys, np.abs(drawn.c.T), strict=False))
+    own = dict(zip(trial.structure.keys, np.abs(drawn.c.T), strict=False))
     slower = np.mean(own.get("direct", 0.0) < own["gain"]) if "gain" in own else 0.0
     if slower < 0.5 + PROBABILITY / 2.0:
         return "cannot tell", f"the output moves before the input: {feedback}"
     if "direct" in own:
         return "cannot tell", "a part comes at once, the rest late: two ways, or a common cause that both answer late"
-    if one.gain - state.with_columns(ahead[int(np.argmax(state.scores(ahead, one.fit)))])[0] < ALIKE:
+    if trial.gain - state.with_columns(ahead[int(np.argmax(state.scores(ahead, trial.fit)))])[0] < ALIKE:
         other = "the input the output" if acts_back else "both a common cause"
         return "cannot tell", f"the output may follow the input, or {other}"
     return "input first", "the output follows the input; a common cause that reaches the input first looks the same"
@@ -482,10 +482,10 @@ def empirical(u: Array, y: Array, dt: float) -> Empirical:
     """The empirical transfer function of an input u [n] and an output y [n] without missing samples."""
     tapers = windows.dpss(u.size, HALF_WIDTH, TAPERS)
     pole = math.exp(-2.0 * math.pi * CORNER / u.size)
-    U, Y = (np.fft.rfft(tapers * lfilter([1.0, -1.0], [1.0, -pole], detrend(one))) for one in (u, y))
+    U, Y = (np.fft.rfft(tapers * lfilter([1.0, -1.0], [1.0, -pole], detrend(signal))) for signal in (u, y))
     low, high = math.ceil(HALF_WIDTH), U.shape[1] - 1
     edges = np.unique(np.geomspace(low, high, max(2, round(BANDS_OF_A_DECADE * math.log10(high / low)))).astype(int))
-    Suu, Syy = (np.add.reduceat((np.abs(one) ** 2).sum(axis=0), edges[:-1]) for one in (U, Y))
+    Suu, Syy = (np.add.reduceat((np.abs(spectrum) ** 2).sum(axis=0), edges[:-1]) for spectrum in (U, Y))
     Suy = np.add.reduceat((np.conj(U) * Y).sum(axis=0), edges[:-1])
     # reduceat's last band runs on to the end.
     width = np.diff(np.append(edges[:-1], U.shape[1]))

@@ -39,10 +39,10 @@ def unexplained(state: State, record: Record) -> tuple[list[Statistic], Look | N
     if P_CERTAIN < found.p < P_SCREEN:
         found = judged(state, seed=2, count=AGAIN)
     coherences = coherence(state, record)
-    statistics = sorted([*found.statistics, *coherences], key=lambda one: one.p)
+    statistics = sorted([*found.statistics, *coherences], key=lambda statistic: statistic.p)
     if found.p < P_FAMILY:
         return statistics, look_of(found.statistics[0], found.p)
-    worst = min(coherences, key=lambda one: one.p, default=None)
+    worst = min(coherences, key=lambda statistic: statistic.p, default=None)
     if worst is not None and worst.p * len(coherences) < P_COHERENCE:
         return statistics, look_of(worst, worst.p * len(coherences))
     return statistics, None
@@ -55,7 +55,7 @@ def look_of(statistic: Statistic, p: float) -> Look:
     return Look("unexplained", nats, nats, estimate, {}, shown_by=statistic.name)
 
 
-def of_checks(one: Diagnosed, checks: Mapping[str, Mapping[str, Any]]) -> Look | None:
+def of_checks(axis: Diagnosed, checks: Mapping[str, Mapping[str, Any]]) -> Look | None:
     """What the checks of `identify` hold against an axis in which no cause was found."""
     for name, deviations in against(checks).items():
         told = float(checks[name]["value"])
@@ -69,8 +69,8 @@ def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted:
 
     Every sample has the causes, if that look ended or has any. Where it shows none, the means of 1 s have them, at the
     price of two looks. None: neither look has a result."""
-    looks = [one for one in (every_sample, means) if one and (one.findings or not one.unfinished)]
-    looks.sort(key=lambda one: one.unfinished == interrupted)
+    looks = [look for look in (every_sample, means) if look and (look.findings or not look.unfinished)]
+    looks.sort(key=lambda look: look.unfinished == interrupted)
     if not looks:
         return None
     if looks[0] is not every_sample:
@@ -78,7 +78,7 @@ def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted:
         return replace(looks[0], unfinished=f"every sample: {reason}")
     if means is None or looks[0].findings or not means.findings:
         return looks[0]
-    strongest = max(means.findings, key=lambda one: one.look.net)
+    strongest = max(means.findings, key=lambda finding: finding.look.net)
     if not strongest.look.changes and moves_within(looks[0].state, means.state.dt):
         return looks[0]
     least = NET_LEAST if strongest.look.changes else -math.log(P_FAMILY)

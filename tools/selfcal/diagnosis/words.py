@@ -141,9 +141,9 @@ def _size(key: str, value: Any) -> str:
         case "form":
             return FORMS.get(value, "")
         case "form_also_possible":
-            return f"not to be told from {', '.join(FORM_NAMES.get(one, str(one)) for one in value)}"
+            return f"not to be told from {', '.join(FORM_NAMES.get(item, str(item)) for item in value)}"
         case "jumps" if not isinstance(value, int):
-            times = ", ".join(f"{one['time_s']:.0f}" for one in value)
+            times = ", ".join(f"{item['time_s']:.0f}" for item in value)
             return f"jumps at {times} s" if times else ""
         case "statistic":
             return statistic(str(value))
@@ -154,7 +154,7 @@ def _size(key: str, value: Any) -> str:
         case "input" | "measured" | "law" | "knots":
             return ""
     if isinstance(value, list | tuple):
-        return f"{label} {', '.join(str(one) for one in value)}"
+        return f"{label} {', '.join(str(item) for item in value)}"
     return f"{label} {value:.3g}" if isinstance(value, float) else f"{label} {value}"
 
 
@@ -175,7 +175,9 @@ def _begin(cause: str, estimate: Mapping[str, Any]) -> str:
 
 def event(finding: Mapping[str, Any]) -> str:
     """A finding of all axes in a sentence: the cause, what the axes have in common, and its size on each."""
-    each = "; ".join(f"{axis}: {sizes(one['estimate'])}" for axis, one in finding["axes"].items() if one["estimate"])
+    each = "; ".join(
+        f"{axis}: {sizes(on_axis['estimate'])}" for axis, on_axis in finding["axes"].items() if on_axis["estimate"]
+    )
     told = ". ".join(part[:1].upper() + part[1:] for part in (sizes(finding["estimate"]), each) if part)
     return f"{_begin(finding['cause'], finding['estimate'])} {told or 'On ' + ', '.join(finding['axes'])}."
 
@@ -201,10 +203,10 @@ def what(finding: Mapping[str, Any]) -> str:
 def how_much(finding: Mapping[str, Any]) -> str:
     """Its leading size on each axis; one without a unit by its name."""
     found = []
-    for axis, one in finding["axes"].items():
-        key, value = next(((k, v) for k, v in one["estimate"].items() if isinstance(v, Mapping)), ("", None))
-        if "share" in one["estimate"] and not isinstance(one["estimate"]["share"], Mapping):
-            found.append((axis, one["estimate"]["share"], "of the drift"))
+    for axis, on_axis in finding["axes"].items():
+        key, value = next(((k, v) for k, v in on_axis["estimate"].items() if isinstance(v, Mapping)), ("", None))
+        if "share" in on_axis["estimate"] and not isinstance(on_axis["estimate"]["share"], Mapping):
+            found.append((axis, on_axis["estimate"]["share"], "of the drift"))
         elif value is not None and value["median"] is not None:
             label = named(key) if key == "ratio" else f"({named(key)})"
             found.append((axis, value["median"], value["unit"] if value["unit"] != "1" else label))
@@ -249,14 +251,16 @@ def effects(finding: Mapping[str, Any]) -> str:
     changes = finding["changes"]
     for name in ("N", "K", "B"):
         # B follows from N and K: where these move it says no more.
-        own = [one for one in changes.values() if name in one["material"]]
-        own = [one for one in own if name != "B" or "K" not in one["material"]]
-        factors = [math.inf if one[name] is None else one[name] for one in own]
+        own = [change for change in changes.values() if name in change["material"]]
+        own = [change for change in own if name != "B" or "K" not in change["material"]]
+        factors = [math.inf if change[name] is None else change[name] for change in own]
         told += [f"{name} {off}"] if (off := _off(factors)) else []
-    moved = [(axis, abs(one["bias"]), one["unit"]) for axis, one in changes.items() if "bias" in one["material"]]
+    moved = [
+        (axis, abs(change["bias"]), change["unit"]) for axis, change in changes.items() if "bias" in change["material"]
+    ]
     if moved:
         told.append(f"bias off by {_by_unit(moved)}")
-    rows = [one["bias_error"] for one in changes.values() if "bias_error" in one["material"]]
+    rows = [change["bias_error"] for change in changes.values() if "bias_error" in change["material"]]
     more = [(row["before"] / row["after"], horizon) for one in rows for horizon, row in one.items()]
     if more:
         most, horizon = max(more)
@@ -278,7 +282,7 @@ def action(finding: Mapping[str, Any]) -> str:
     if finding.get("next_record") and finding.get("confirmed_on") is not None:
         seen = "Apply it: the second recording shows it too. --write-model states it."
         return seen if finding["confirmed_on"] else "Leave it out of the model: the second recording does not show it."
-    sure = [axis for axis, one in finding["axes"].items() if _sure(one["estimate"].get("coefficient"))]
+    sure = [axis for axis, on_axis in finding["axes"].items() if _sure(on_axis["estimate"].get("coefficient"))]
     if finding.get("next_record") or "source" in finding["estimate"] or not sure:
         return str(finding["record_next"])
     applied = f"known to {100.0 * APPLIED:.0f} %. --write-model states it."
@@ -317,8 +321,8 @@ def small(findings: Sequence[Mapping[str, Any]]) -> str:
     several = len(findings) > 1
     count = f"{len(findings)} small findings" if several else "1 small finding"
     causes: dict[str, list[str]] = {}
-    for one in findings:
-        causes.setdefault(named(one["cause"]), []).extend(one["axes"])
+    for finding in findings:
+        causes.setdefault(named(finding["cause"]), []).extend(finding["axes"])
     each = "; ".join(f"{cause} on {' '.join(dict.fromkeys(axes))}" for cause, axes in causes.items())
     none = "none moves" if several else "it moves none of"
     return f"{count} ({each}): {none} N, K, B or the bias by more than half of its interval"

@@ -36,6 +36,8 @@ from selfcal.likelihood.statemodel import Array
 #: 7 showed 7 nats of a supply or a temperature and 2 of a ramp at a price of 0.8, where 4 and 2 were due; the tail ran
 #: on to 10.2. With 1.8 two show 7.6 of any.
 LN_SLOW = 1.8
+#: ln of the number of looks of a choice of two.
+LN_EITHER = math.log(2.0)
 #: Drifts at which shapes are ranked beside the fitted one: its size over e to these. The last is for slow shapes alone.
 SMALLER = (1.5, 3.0)
 #: Forms of a family that are fitted: those that rank best. After the first one only forms whose score is within so many
@@ -109,7 +111,7 @@ class Shape:
 
     @property
     def theta(self) -> tuple[float, ...]:
-        return tuple(one.value for one in self.numbers)
+        return tuple(number.value for number in self.numbers)
 
     def worth(self, gain: float) -> float:
         """A gain net of the search."""
@@ -117,13 +119,13 @@ class Shape:
 
     def told(self, thetas: Array) -> dict[str, Array]:
         """What the estimate says of the numbers [..., m], by key."""
-        values = {one.key: thetas[..., k] for k, one in enumerate(self.numbers)}
-        return {one.key: values[one.key] * values.get(one.of, 1.0) for one in self.numbers}
+        values = {number.key: thetas[..., k] for k, number in enumerate(self.numbers)}
+        return {number.key: values[number.key] * values.get(number.of, 1.0) for number in self.numbers}
 
     @property
     def limits(self) -> Array:
         """Least and most [m, 2] of the numbers."""
-        return np.array([(one.low, one.high) for one in self.numbers])
+        return np.array([(number.low, number.high) for number in self.numbers])
 
     def near(self, thetas: Iterable[Array]) -> list[Shape]:
         """The shapes at other numbers [g, m], within their limits."""
@@ -154,28 +156,28 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
     and its gain must hold over the drifts that the record leaves possible."""
     means, block = state.slow if slow else (state, 1)
     if block > 1:
-        found = tried(means, [one.in_means(block) for one in shapes], slow=slow, least=least)
-        return {form: replace(one, shape=one.shape.whole or one.shape) for form, one in found.items()}
-    shapes = [one for one in shapes if all(np.ptp(column) > 0.0 for column in one.columns)]
+        found = tried(means, [shape.in_means(block) for shape in shapes], slow=slow, least=least)
+        return {form: replace(trial, shape=trial.shape.whole or trial.shape) for form, trial in found.items()}
+    shapes = [shape for shape in shapes if all(np.ptp(column) > 0.0 for column in shape.columns)]
     if not shapes:
         return {}
-    blocks = [one.columns for one in shapes]
+    blocks = [shape.columns for shape in shapes]
     drifts = [state.best, *(drift for by in SMALLER[: 1 + slow] for drift in state.stiffer(by))]
     gains = np.max([state.scores(blocks, drift) for drift in drifts], axis=0)
     if gains.max() < least:
         return {}
     done: dict[str, Tried] = {}
     for _ in range(FITTED):
-        left = [k for k, one in enumerate(shapes) if one.form not in done]
+        left = [k for k, shape in enumerate(shapes) if shape.form not in done]
         if not left:
             break
         k = max(left, key=lambda k: shapes[k].worth(gains[k]))
-        most = max((one.net for one in done.values()), default=-math.inf)
+        most = max((trial.net for trial in done.values()), default=-math.inf)
         if done and shapes[k].worth(gains[k]) < max(most - ALIKE, NET_LEAST) - FIT_ADDS - COARSE * most:
             break
         best = fitted(state, shapes[k])
         gains = np.maximum(gains, state.scores(blocks, best.fit))
-        better = max((j for j, one in enumerate(shapes) if one.form == best.shape.form), key=lambda j: gains[j])
+        better = max((j for j, shape in enumerate(shapes) if shape.form == best.shape.form), key=lambda j: gains[j])
         if better != k and gains[better] > best.gain:
             best = fitted(state, shapes[better])
         best = between(state, best)
@@ -183,7 +185,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
             best = replace(best, gain=min(best.gain, state.average_gain(best.shape.columns)))
         done[best.shape.form] = best
     # A form whose score alone is known is fitted by who takes it: only a finding needs that.
-    return {form: done[form] for form in dict.fromkeys(one.form for one in shapes) if form in done}
+    return {form: done[form] for form in dict.fromkeys(shape.form for shape in shapes) if form in done}
 
 
 def between(state: State, best: Tried) -> Tried:
@@ -197,7 +199,7 @@ def between(state: State, best: Tried) -> Tried:
         return best
 
     def score(thetas: Array) -> Array:
-        return state.scores([one.columns for one in best.shape.near(thetas)], best.fit)
+        return state.scores([other.columns for other in best.shape.near(thetas)], best.fit)
 
     moved = fitted(state, *best.shape.near([top(score, best.shape.theta, best.shape.limits)]))
     if best.shape.free == len(best.shape.columns):
@@ -224,9 +226,9 @@ def top(score: Callable[[Array], Array], start: Sequence[float], limits: Array) 
 def alike(found: Mapping[str, Tried]) -> list[Tried]:
     """The forms that are as likely as the best, the simplest first. Those come last whose numbers are near their upper
     limit: any slower change looks like the longest lag, or settling."""
-    best = max(one.net for one in found.values())
-    near = [one for one in found.values() if one.net > best - ALIKE]
-    return sorted(near, key=lambda one: any(n.value > 0.5 * n.high and not n.of for n in one.shape.numbers))
+    best = max(trial.net for trial in found.values())
+    near = [trial for trial in found.values() if trial.net > best - ALIKE]
+    return sorted(near, key=lambda trial: any(n.value > 0.5 * n.high and not n.of for n in trial.shape.numbers))
 
 
 def looks(
@@ -235,7 +237,7 @@ def looks(
     """The look at a family, where it is worth one nat. `dearer`: forms that are tried where a first one may be
     named."""
     found = tried(state, shapes, slow=slow)
-    if any(one.net > NEARLY for one in found.values()):
+    if any(trial.net > NEARLY for trial in found.values()):
         found |= tried(state, list(dearer), slow=slow)
     chosen = alike(found)[0] if found else None
     return [look(state, cause, chosen)] if chosen is not None and chosen.net >= 1.0 else []
@@ -265,18 +267,18 @@ def _estimate(chosen: Tried) -> dict[str, Any]:
     c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
     found = {key: interval(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
     values = shape.told(np.array(shape.theta))
-    numbers = {one.key: interval(float(values[one.key]), 0.0, one.unit) for one in shape.numbers}
+    numbers = {number.key: interval(float(values[number.key]), 0.0, number.unit) for number in shape.numbers}
     return {**shape.where(fit), **found, **numbers, **shape.stated}
 
 
 def _sizes(shape: Shape, c: Array, sd: Array) -> tuple[Array, Array]:
     """Coefficients [..., columns] and their deviations as the keys have them."""
-    one = len(shape.keys) - 1
-    if one + 1 == len(shape.columns):
+    last = len(shape.keys) - 1
+    if last + 1 == len(shape.columns):
         return c, sd
-    own = slice(one, one + 2)
+    own = slice(last, last + 2)
     norm, mean = np.linalg.norm(c[..., own], axis=-1, keepdims=True), sd[..., own].mean(axis=-1, keepdims=True)
-    return np.concatenate([c[..., :one], norm], axis=-1), np.concatenate([sd[..., :one], mean], axis=-1)
+    return np.concatenate([c[..., :last], norm], axis=-1), np.concatenate([sd[..., :last], mean], axis=-1)
 
 
 def measured(shape: Shape, state: State) -> dict[str, Any]:
@@ -284,7 +286,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
     The prior of a number is flat in its logarithm, that of a coefficient is flat."""
     points, steps = possible(state, shape)
     shapes = [shape, *(shape.near(np.exp(points)) if shape.numbers else [])]
-    weight, means, sds = state.posterior(*(one.columns for one in shapes))
+    weight, means, sds = state.posterior(*(shape.columns for shape in shapes))
     if shape.numbers:  # the first one is on the lattice as well
         weight, means, sds = weight[1:], means[1:], sds[1:]
     means, sds = _sizes(shape, means, sds)
@@ -306,7 +308,7 @@ def possible(state: State, shape: Shape) -> tuple[Array, Array]:
     fit = fitted(state, shape).fit
 
     def scores(thetas: Array) -> Array:
-        return state.scores([one.columns for one in shape.near(thetas)], fit)[None]
+        return state.scores([other.columns for other in shape.near(thetas)], fit)[None]
 
     return nodes(scores, shape.theta, shape.limits)
 
@@ -348,4 +350,4 @@ def least(state: State, shape: Shape, key: str) -> dict[str, tuple[float, str]]:
     (_, unit), size = shape.keys[0], state.least(shape.columns[0])
     found = {key: (size * math.sqrt(gain_for(shape.worth)), unit)}
     values = shape.told(np.array(shape.theta))
-    return {**found, **{one.key: (float(values[one.key]), one.unit) for one in shape.numbers}}
+    return {**found, **{number.key: (float(values[number.key]), number.unit) for number in shape.numbers}}

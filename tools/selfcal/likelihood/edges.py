@@ -179,12 +179,12 @@ def posterior(places: tuple[int, ...], state: State) -> dict[str, Any]:
     column = raised(state.y.size, *places)
     fit = state.with_columns(column)[1]
     values, m, rows = np.array(places), len(places), []
-    for one, theta, ln_share in state.possible(column, rich=False):
-        at = replace(one, theta=theta, sigma=fit.sigma)
+    for drift, theta, ln_share in state.possible(column, rich=False):
+        at = replace(drift, theta=theta, sigma=fit.sigma)
         scans = [edge(state, at, places, k) for k in range(m)]
-        if not all(one.A[place] > 0.0 for one, place in zip(scans, places, strict=True)):
+        if not all(found.A[place] > 0.0 for found, place in zip(scans, places, strict=True)):
             continue  # this drift forgets too fast to know
-        likely = [_likely(one, place, m) for one, place in zip(scans, places, strict=True)]
+        likely = [_likely(found, place, m) for found, place in zip(scans, places, strict=True)]
         each = [axis.ravel() for axis in np.meshgrid(*likely, indexing="ij")]
         gain, size, ln_information = np.zeros((3, each[0].size))
         for found, where in zip(scans, each, strict=True):

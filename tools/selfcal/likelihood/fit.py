@@ -245,8 +245,8 @@ def passed(
 
     (G, D, n, x, white, s), *more = [of(part) for part in parts]
     if more:
-        x = np.concatenate([x, *(one[3][:, 1:] for one in more)], axis=1)
-        white = np.concatenate([white, *(one[4][:, 1:] for one in more)], axis=1)
+        x = np.concatenate([x, *(part[3][:, 1:] for part in more)], axis=1)
+        white = np.concatenate([white, *(part[4][:, 1:] for part in more)], axis=1)
         pieces = np.split(np.nan_to_num(white), at)[: len(at)]
         G = np.cumsum([_products(piece) for piece in pieces], axis=0)
     return G, D, n, x, white, s
@@ -297,7 +297,7 @@ def shifts(series: Series, terms: Terms, theta: Array) -> Shifts:
     G, D, A, B, impulse = each[0]
     if len(parts) > 1:
         G = run(series, terms, theta)[0][0].G
-        B = np.concatenate([B, *(one[3][:, 1:] for one in each[1:])], axis=1)
+        B = np.concatenate([B, *(part[3][:, 1:] for part in each[1:])], axis=1)
     return Shifts(Sums(G, float(D), float(series.n), np.empty((len(G), 0))), A, B, impulse)
 
 
@@ -337,7 +337,7 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
     pairs = [[j, j + 1][: k - j] for j in range(0, k, 2)]
     rss, n, rss_by, D_by, innovations, spread = 0.0, 0.0, *np.empty((2, k)), *np.empty((2, k, k))
     for part in [[*range(k)]] if k <= TOGETHER else [a + b for a, b in combinations(pairs, 2)]:
-        F, Q, h, P0, R, lost = (one[part] for one in by)
+        F, Q, h, P0, R, lost = (each[part] for each in by)
         rss, _, n, rss_by[part], D_by[part], innovations[np.ix_(part, part)], spread[np.ix_(part, part)] = (
             _likelihood.slopes(whole, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, F, Q, h, P0, R, lost, m.driver)
         )
@@ -358,7 +358,7 @@ def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
     and a Gauss-Markov drift may have gone there with the wrong rate."""
     low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
     starts = [start] if start is not None else _starts(terms, np.array([low, high]).T)
-    found = _climbed(series, best([finish(series, terms, np.clip(one, low, high)) for one in starts]))
+    found = _climbed(series, best([finish(series, terms, np.clip(start, low, high)) for start in starts]))
     promised: list[tuple[float, Fit]] = []
     for place in _larger(terms, found.theta):
         at = finish(series, terms, place)
@@ -368,7 +368,7 @@ def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
             promised.append((at.ln_likelihood + 0.5 * float(slope[k] ** 2 / information[k, k]), at))
     if not promised:
         return found
-    return best([found, _climbed(series, max(promised, key=lambda one: one[0])[1])])
+    return best([found, _climbed(series, max(promised, key=lambda promise: promise[0])[1])])
 
 
 def _larger(terms: Terms, theta: Array) -> list[Array]:
@@ -487,7 +487,7 @@ def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
     steps = [np.array(NODES) if j in wide else np.zeros(1) for j in range(k)]
     for j in wide[length[wide] > HARDLY]:
         steps[j] = _possible(series, found, spread[:, j] / length[j], limits) / length[j]
-    apart = [float(np.diff(one).mean()) if one.size > 1 else 1.0 for one in steps]
+    apart = [float(np.diff(ladder).mean()) if ladder.size > 1 else 1.0 for ladder in steps]
     volume = float(np.log(length * apart).sum() - np.log(limits[:, 1] - limits[:, 0]).sum())
     places = [found.theta + spread @ np.array(z) for z in product(*steps)]
     inside = [theta for theta in places if np.all((theta >= limits[:, 0]) & (theta <= limits[:, 1]))]
@@ -550,7 +550,7 @@ def _starts(terms: Terms, limits: Array) -> list[Array]:
 
 def best(fits: Sequence[Fit]) -> Fit:
     """The likeliest."""
-    return max(fits, key=lambda one: one.ln_likelihood)
+    return max(fits, key=lambda fitted: fitted.ln_likelihood)
 
 
 def moved(fit_: Fit, terms: Terms, own: Mapping[str, float] = MappingProxyType({})) -> Array:

@@ -56,12 +56,12 @@ def error_entry(before: Array, after: Array) -> dict[str, float] | None:
 
 def harmful(parts: Sequence[HeldOut]) -> bool:
     """Whether what was found on some axes predicts the rest of the record clearly worse, all axes together."""
-    gains = [one.gain for one in parts if one.gain is not None]
+    gains = [part.gain for part in parts if part.gain is not None]
     return bool(gains) and in_sd(gains) < -HARM_SD
 
 
 def in_sd(gains: Sequence[Mapping[str, Any]]) -> float:
     """How much some axes gain together, standard deviations."""
     scores = [gain["log_score_per_sample"] for gain in gains]
-    more = sum(one["samples"] * (one["after"] - one["before"]) for one in scores)
-    return float(more) / max(math.hypot(*(one["samples"] * one["sd"] for one in scores)), 1e-300)
+    more = sum(score["samples"] * (score["after"] - score["before"]) for score in scores)
+    return float(more) / max(math.hypot(*(score["samples"] * score["sd"] for score in scores)), 1e-300)

@@ -291,7 +291,7 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     elif f:
         vector = _together(bins, own)
         tries = [np.concatenate([head, vector, [np.clip(math.log(dt / tau), *bounds[-1])]]) for tau in STARTS_S]
-    value, x = min((_least(cost, one, np.array(bounds)) for one in tries), key=lambda end: end[0])
+    value, x = min((_least(cost, start, np.array(bounds)) for start in tries), key=lambda end: end[0])
     own, root, _, loading, ln_rate = cost.parts(x)
     return Joint(own, root @ root.T, loading * np.exp(own[:, 0]), math.exp(ln_rate), -value)
 
@@ -321,14 +321,14 @@ def without_each(bins: Bins, model: Joint) -> Array:
     """What ln likelihood loses [m] where f does not move an axis."""
     every = range(model.loading.size)
     none = [replace(model, loading=np.where(np.arange(len(every)) == k, 0.0, model.loading)) for k in every]
-    return _value(bins, model) - np.array([_value(bins, one) for one in none])
+    return _value(bins, model) - np.array([_value(bins, model_without) for model_without in none])
 
 
-def without_pairs(bins: Bins, model: Joint, one: int, others: Sequence[int]) -> float:
+def without_pairs(bins: Bins, model: Joint, source: int, others: Sequence[int]) -> float:
     """The same where the white noise of an axis does not go together with some others'; infinite where the rest need it
     to."""
     correlation = model.correlation.copy()
-    correlation[one, others] = correlation[others, one] = 0.0
+    correlation[source, others] = correlation[others, source] = 0.0
     if float(np.linalg.eigvalsh(correlation)[0]) < 1e-6:
         return math.inf
     return _value(bins, model) - _value(bins, replace(model, correlation=correlation))
@@ -484,9 +484,9 @@ def _over_sets(m: int, ln_bf: Callable[[NDArray[np.intp]], Array]) -> tuple[floa
         sets = np.array(list(combinations(range(m), count)))
         values.append(ln_bf(sets))
         priors.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
-        one = np.zeros((len(sets), m))
-        np.put_along_axis(one, sets, 1.0, axis=1)
-        members.append(one)
+        inside = np.zeros((len(sets), m))
+        np.put_along_axis(inside, sets, 1.0, axis=1)
+        members.append(inside)
     worth, member = np.concatenate(values), np.vstack(members)
     total = float(logsumexp(worth + np.concatenate(priors)))
     return total, np.asarray(softmax(worth + LN_ODDS * member.sum(axis=1)) @ member)

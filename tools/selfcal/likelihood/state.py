@@ -87,7 +87,7 @@ class State:
 
     @property
     def series(self) -> Series:
-        columns = np.vstack([np.ones(self.y.size), *(one.values for one in self.regressors)])
+        columns = np.vstack([np.ones(self.y.size), *(regressor.values for regressor in self.regressors)])
         return Series(self.y, self.dt, self.r, np.ascontiguousarray(columns), self.ftol, self.block)
 
     def means(self, longest_s: float = math.inf) -> tuple[Series, int]:
@@ -114,7 +114,7 @@ class State:
     def near(self) -> tuple[Terms, ...]:
         """Those that a candidate may make the best."""
         least = self.best.ln_likelihood - FAR
-        far = {one.terms for one in self.fits if one.ln_likelihood < least}
+        far = {drift.terms for drift in self.fits if drift.ln_likelihood < least}
         return tuple(terms for terms in self.bases() if terms not in far)
 
     def refit(self, **changes: Any) -> State:
@@ -134,11 +134,13 @@ class State:
 
     def without(self, names: Collection[str]) -> State:
         """The state less some columns. Its fits are still those with them, from which a fit beside it starts."""
-        return replace(self, regressors=tuple(one for one in self.regressors if one.name not in names))
+        return replace(
+            self, regressors=tuple(regressor for regressor in self.regressors if regressor.name not in names)
+        )
 
     def first(self, samples: int) -> State:
         """The state of the first samples alone, fitted by itself."""
-        cut = tuple(replace(one, values=one.values[:samples]) for one in self.regressors)
+        cut = tuple(replace(regressor, values=regressor.values[:samples]) for regressor in self.regressors)
         return replace(self, y=self.y[:samples], r=self.r[:samples], regressors=cut, fits=()).refit()
 
     def stiffer(self, by: float) -> list[Fit]:
@@ -154,9 +156,9 @@ class State:
         """Gain of ln likelihood by further terms of the noise, and the fit of every near drift with them: from the
         parameters `own` on, and from a drift smaller by exp(-less)."""
         near, fits = self.near(), []
-        for one in (one for one in self.fits if one.terms in near):
-            more = replace(one.terms, **terms)
-            fits.append(fit(self.series, more, moved(one.shrunk(less), more, own)))
+        for drift in (drift for drift in self.fits if drift.terms in near):
+            more = replace(drift.terms, **terms)
+            fits.append(fit(self.series, more, moved(drift.shrunk(less), more, own)))
         return best(fits).ln_likelihood - self.best.ln_likelihood, tuple(fits)
 
     def fitted_with(self, terms: Terms, more: Array) -> Fit:
@@ -180,19 +182,19 @@ class State:
         fits = [self.fitted_with(terms, more) for terms in self.near()]
         if rich and not self.extras.flicker:
             fits.append(refit(series, self.rich))
-        for one in fits:
-            for theta, ln_share in nodes(series, one):
-                yield one, theta, ln_share
+        for drift in fits:
+            for theta, ln_share in nodes(series, drift):
+                yield drift, theta, ln_share
 
     def posterior(self, *alternatives: Array) -> tuple[Array, Array, Array]:
         """Coefficients of further columns [k, n] over every near drift, one of two terms, and their parameters: weights
         [a, m], means [a, m, k] and standard deviations [a, m, k] of the normals that they are the sum of. Each of the
         `alternatives`, the likeliest first, is one set of columns; before the record they are equally likely."""
-        blocks = [np.atleast_2d(one) for one in alternatives]
+        blocks = [np.atleast_2d(block) for block in alternatives]
         found: list[tuple[Array, Array, Array]] = []
-        for one, theta, ln_share in self.possible(blocks[0], rich=True):
+        for drift, theta, ln_share in self.possible(blocks[0], rich=True):
             ln_weight, means, sds = [], [], []
-            for sums in self.beside(one.terms, theta, blocks):
+            for sums in self.beside(drift.terms, theta, blocks):
                 c, inverse, rss = sums.coefficients()
                 sd = math.sqrt(rss / sums.n) * np.sqrt(np.maximum(np.diag(inverse), 1e-300))
                 ln_weight.append(ln_share + ln_likelihood(sums) + float(np.log(sd).sum()))
@@ -209,7 +211,9 @@ class State:
         series, block = self.means(SLOW_S)
         if block == 1:
             return self, 1
-        columns = [replace(one, values=mean) for one, mean in zip(self.regressors, series.columns[1:], strict=True)]
+        columns = [
+            replace(regressor, values=mean) for regressor, mean in zip(self.regressors, series.columns[1:], strict=True)
+        ]
         bands = [  # sizes are relative to the white noise; faster ones average out
             (period, damping, ln_size + 0.5 * math.log(block))
             for period, damping, ln_size in self.extras.bands
@@ -222,8 +226,8 @@ class State:
     def ln_marginal(self) -> float:
         """ln likelihood of the record over every near drift, one of two terms, and their parameters."""
         each = [
-            ln_share + _ln_marginal(next(self.sums(one.terms, theta, [self.none])))
-            for one, theta, ln_share in self.possible(self.none, rich=True)
+            ln_share + _ln_marginal(next(self.sums(drift.terms, theta, [self.none])))
+            for drift, theta, ln_share in self.possible(self.none, rich=True)
         ]
         return float(logsumexp(each))
 
@@ -232,8 +236,8 @@ class State:
         parameters; ln of the share of the record's likelihood without them that each stands for; and the last column's
         coefficients and variances there [a, 2]."""
         gains, shares, sizes = [], [], []
-        for one, theta, ln_share in self.possible(more, rich=True):
-            less, sums = self.sums(one.terms, theta, [self.none, more])
+        for drift, theta, ln_share in self.possible(more, rich=True):
+            less, sums = self.sums(drift.terms, theta, [self.none, more])
             c, inverse, rss = sums.coefficients()
             gains.append(max(0.0, ln_likelihood(sums) - ln_likelihood(less)))
             shares.append(ln_share + _ln_marginal(less))
@@ -291,7 +295,7 @@ class State:
         """Gain [b] of each block [k, n] of further columns with the drift of a fit, by default of the best: a bound
         from below for what they gain with it refitted. One pass for many of them."""
         at = self.best if at is None else at
-        each = self.beside(at.terms, at.theta, [np.atleast_2d(one) for one in blocks])
+        each = self.beside(at.terms, at.theta, [np.atleast_2d(block) for block in blocks])
         found = [ln_likelihood(sums) for sums in each]
         return np.array(found) - self.best.ln_likelihood
 
@@ -316,11 +320,11 @@ def gain_for(worth: Callable[[float], float]) -> float:
 
 
 def _fit_from(series: Series, terms: Terms, known: Sequence[Fit]) -> Fit:
-    same = [one for one in known if one.terms == terms]
+    same = [drift for drift in known if drift.terms == terms]
     if same:
         again = refit(series, same[0])
         return best([again, fit(series, terms)]) if again.drowned else again
-    near = [one for one in known if one.terms.walk == terms.walk and one.terms.markov == terms.markov]
+    near = [drift for drift in known if drift.terms.walk == terms.walk and drift.terms.markov == terms.markov]
     if near:
         return fit(series, terms, moved(near[0], terms))
     return fit(series, terms)
@@ -369,7 +373,7 @@ class Look:
 
     def repeats(self, other: Look) -> bool:
         """Whether both are the same cause of the same channel."""
-        channels = [(one.cause, one.estimate.get("other"), one.estimate.get("channel")) for one in (self, other)]
+        channels = [(look.cause, look.estimate.get("other"), look.estimate.get("channel")) for look in (self, other)]
         return channels[0] == channels[1]
 
     def measured(self, beside: State) -> Look:

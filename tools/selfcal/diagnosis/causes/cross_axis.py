@@ -73,36 +73,36 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
         if abs(ahead) < ALIKE:
             ahead = partners[name] - partners[other]
         if ahead == 0.0:
-            sizes = [abs(float(one.look.estimate["coefficient"]["median"])) for one in (finding, back)]
+            sizes = [abs(float(side.look.estimate["coefficient"]["median"])) for side in (finding, back)]
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
             _drop(found[name], finding, without(found[name].state, other))
     arms: dict[str, set[str]] = {}
     for name, other, _ in leaks(found):
         arms.setdefault(other, set()).add(name)
-    for name, one in found.items():
+    for name, axis in found.items():
         of_other: dict[str, list[int]] = {}
-        for k, finding in enumerate(one.findings):
+        for k, finding in enumerate(axis.findings):
             if finding.look.cause == "cross_axis":
                 of_other.setdefault(str(finding.look.estimate["other"]), []).append(k)
         for other, places in of_other.items():
             unsure = ""
-            if one.hidden is not None and one.hidden.explains(other, arms[other]):
+            if axis.hidden is not None and axis.hidden.explains(other, arms[other]):
                 unsure = hidden.ID
-            elif not _source_shown(record, found, name, other, [one.findings[k] for k in places]):
+            elif not _source_shown(record, found, name, other, [axis.findings[k] for k in places]):
                 unsure = "not shown"
             for k in places if unsure else ():
-                look = one.findings[k].look
+                look = axis.findings[k].look
                 look = replace(look, estimate={**look.estimate, "source": unsure})
-                one.findings[k] = replace(one.findings[k], look=look)
+                axis.findings[k] = replace(axis.findings[k], look=look)
 
 
 def leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
     """Of each leak the axis that follows, the other one, and the finding."""
     return [
         (name, str(finding.look.estimate["other"]), finding)
-        for name, one in found.items()
-        for finding in one.findings
+        for name, axis in found.items()
+        for finding in axis.findings
         if finding.look.cause == "cross_axis"
     ]
 
@@ -113,23 +113,23 @@ def _partners(found: Mapping[str, Diagnosed]) -> Counter[str]:
     return Counter(name for pair in pairs for name in pair)
 
 
-def _drop(one: Diagnosed, finding: Finding, free: State) -> None:
-    one.findings.remove(finding)
-    one.state = free
+def _drop(axis: Diagnosed, finding: Finding, free: State) -> None:
+    axis.findings.remove(finding)
+    axis.state = free
 
 
 def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Give the source that all axes together show best to each axis that it leaks into: none need show it alone. Beside
     a quantity the white noise of the axes must show it too."""
     gains = dict.fromkeys(found, 0.0)
-    for name, one in found.items():
+    for name, axis in found.items():
         others = {other: values for other, values in record.other_axes(name).items() if other in found}
-        for other, gain in zip(others, one.state.scores([*others.values()]) if others else (), strict=True):
+        for other, gain in zip(others, axis.state.scores([*others.values()]) if others else (), strict=True):
             gains[other] += float(gain)
     for _, other, finding in leaks(found):
         gains[other] = gains.get(other, 0.0) + finding.look.gain
     source = max(gains, key=lambda name: gains[name], default="")
-    free = {name: without(one.state, source) for name, one in found.items() if name != source}
+    free = {name: without(axis.state, source) for name, axis in found.items() if name != source}
     if len(free) < 2 or gains[source] < NET_LEAST:
         return
     columns = {name: record.other_axes(name)[source] for name in free}
@@ -168,12 +168,12 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
     for name, other, finding in leaks(found):
         if partners[name] <= partners[other] or other not in found:
             continue
-        one, source = found[name], found[other]
-        free = without(one.state, other)
+        axis, source = found[name], found[other]
+        free = without(axis.state, other)
         back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
-        lost = one.state.best.ln_likelihood - free.best.ln_likelihood
+        lost = axis.state.best.ln_likelihood - free.best.ln_likelihood
         if back and back[0].gain > lost - ALIKE:  # of the pair that is shown already, the likelier source
-            _drop(one, finding, free)
+            _drop(axis, finding, free)
             after = source.state.refit(**back[0].changes)
             source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
             source.state = after
@@ -195,14 +195,14 @@ def _source_shown(
     source = without(found[other].state if other in found else record.axes[other], name)
     back = source.with_columns(record.other_axes(other)[name])[0]
     lagged = [finding for finding in findings if "lag_s" in finding.look.estimate]
-    return ahead - back > ALIKE and all(_is_late(final, one, record.other_axes(name)[other]) for one in lagged)
+    return ahead - back > ALIKE and all(_is_late(final, finding, record.other_axes(name)[other]) for finding in lagged)
 
 
 def _is_late(final: State, finding: Finding, values: Array) -> bool:
     """Whether the past of the other axis `values` [n] explains a lag, and its future neither instead nor beside it."""
     lag_s = float(finding.look.estimate["lag_s"]["median"])
     early = formed(values[::-1], "lag", lag_s, 0.0, final.dt)[::-1]
-    beside = final.without({one.name for one in finding.columns if form_of(one)[2] == "lag"})
+    beside = final.without({regressor.name for regressor in finding.columns if form_of(regressor)[2] == "lag"})
     instead = beside.fitted_with(final.best.terms, early).ln_likelihood
     both = final.fitted_with(final.best.terms, early).ln_likelihood
     return final.best.ln_likelihood - instead > ALIKE and both - final.best.ln_likelihood < ALIKE
@@ -210,7 +210,11 @@ def _is_late(final: State, finding: Finding, values: Array) -> bool:
 
 def without(state: State, other: str) -> State:
     """The state without the columns of another axis."""
-    kept = tuple(one for one in state.regressors if one.cause != "cross_axis" or one.entry["column"] != other)
+    kept = tuple(
+        regressor
+        for regressor in state.regressors
+        if regressor.cause != "cross_axis" or regressor.entry["column"] != other
+    )
     return state if len(kept) == len(state.regressors) else state.refit(regressors=kept)
 
 

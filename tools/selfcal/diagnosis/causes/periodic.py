@@ -97,7 +97,7 @@ def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Se
     n, half = state.y.size, 0.5 * record.rate_hz
 
     def waves(f: float) -> Array:
-        return np.array([one for k in (1, *multiples) for one in pair(k * f, record).values()])
+        return np.array([wave for k in (1, *multiples) for wave in pair(k * f, record).values()])
 
     def spread(fit: Fit) -> float:
         c, of = (values[len(values) - len(known) :][:2] for values in (fit.c, fit.sd))
@@ -116,9 +116,9 @@ def shape(state: State, record: Record, f: float, sd: float = 0.0, multiples: Se
 
     known = waves(f)
     added = tuple(
-        Regressor(f"line_{k * f:.6g}Hz{end}", "periodic", one, "1", {"kind": "periodic", "frequency_hz": k * f})
+        Regressor(f"line_{k * f:.6g}Hz{end}", "periodic", wave, "1", {"kind": "periodic", "frequency_hz": k * f})
         for k in (1, *multiples)
-        for end, one in pair(k * f, record).items()
+        for end, wave in pair(k * f, record).items()
     )
     return Shape(
         f"{len(known)}",
@@ -150,7 +150,7 @@ def _line(state: State, record: Record) -> list[Look]:
         return []
     for move in 0.25 ** np.arange(1.0, 5.0):
         near = np.minimum(f + move * width * np.linspace(-1.0, 1.0, 9), half)
-        f = float(near[int(np.argmax([_power(one, t, w, there) for one in near]))])
+        f = float(near[int(np.argmax([_power(frequency, t, w, there) for frequency in near]))])
     # A line at half the rate also fits beside it, with a column and a frequency more than it needs.
     tried = [*([shape(state, record, half)] if f > half - TURNS_LEAST * width else []), shape(state, record, f)]
     return columns.looks(state, "periodic", tried, slow=f < SLOW_TURNS * width)
@@ -167,42 +167,42 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Lines that axes have in common have one frequency, that of the axis that shows it best."""
     lines = [
         (name, finding)
-        for name, one in found.items()
-        for finding in one.findings
+        for name, axis in found.items()
+        for finding in axis.findings
         if finding.look.cause == "periodic" and finding.columns and finding.record is None
     ]
     first: list[tuple[str, float]] = []
     for name, finding in sorted(lines, key=lambda line: -line[1].look.gain):
-        one, hz = found[name], _hz(finding.look)
+        diagnosed, hz = found[name], _hz(finding.look)
         common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME), hz)
         if common == hz:
             first.append((name, hz))
             continue
         theta = (common, *finding.look.estimate.get("harmonics", []))
-        free = one.state.without({column.name for column in finding.columns})
+        free = diagnosed.state.without({column.name for column in finding.columns})
         look = at(free, record, theta)
         after = free.refit(**look.changes)
-        if after.best.ln_likelihood < one.state.best.ln_likelihood - ALIKE:
+        if after.best.ln_likelihood < diagnosed.state.best.ln_likelihood - ALIKE:
             first.append((name, hz))
             continue
         look = replace(look, gain=finding.look.gain, net=finding.look.net)
         own = finding.before.refit(**at(finding.before, record, theta).changes)
-        one.findings[one.findings.index(finding)] = replace(finding, look=look, after=own)
-        one.state = after
-    for one in found.values():
-        _harmonics(one)
+        diagnosed.findings[diagnosed.findings.index(finding)] = replace(finding, look=look, after=own)
+        diagnosed.state = after
+    for diagnosed in found.values():
+        _harmonics(diagnosed)
 
 
 def _hz(look: Look) -> float:
     return float(look.estimate["frequency_hz"]["median"])
 
 
-def _harmonics(one: Diagnosed) -> None:
+def _harmonics(axis: Diagnosed) -> None:
     """Lines at multiples of a slower one's frequency are one finding with it: their gains are added."""
-    found = (f for f in one.findings if f.look.cause == "periodic")
+    found = (f for f in axis.findings if f.look.cause == "periodic")
     lines = sorted(found, key=lambda f: _hz(f.look))
     for base in lines:
-        if base not in one.findings:
+        if base not in axis.findings:
             continue
         f = base.look.estimate["frequency_hz"]
         harmonics: list[int] = []
@@ -210,17 +210,17 @@ def _harmonics(one: Diagnosed) -> None:
         for other in lines:
             g = other.look.estimate["frequency_hz"]
             k = round(g["median"] / f["median"])
-            if other is base or other not in one.findings or k < 2:
+            if other is base or other not in axis.findings or k < 2:
                 continue
             apart = k * _breadth(base.look) + _breadth(other.look)
             if apart < HARMONIC_MOST * f["median"] and abs(g["median"] - k * f["median"]) < apart:
                 harmonics.append(k)
                 gain, worth = gain + other.look.gain, worth + other.look.net
-                one.findings.remove(other)
+                axis.findings.remove(other)
         if harmonics:
             harmonics += base.look.estimate.get("harmonics", [])
             estimate = {**base.look.estimate, "harmonics": sorted(set(harmonics))}
-            one.findings[one.findings.index(base)] = replace(
+            axis.findings[axis.findings.index(base)] = replace(
                 base, look=replace(base.look, gain=gain, net=worth, estimate=estimate)
             )
 
@@ -241,13 +241,16 @@ def _trained(look: Look, before: State, after: State, record: Record, split: int
     if not found:
         return after
     f, own = _hz(found[0]), _hz(look)
-    known = {one.name for one in before.regressors}
+    known = {regressor.name for regressor in before.regressors}
 
-    def at_f(one: Regressor) -> Regressor:
-        multiple = max(1, round(float(one.entry["frequency_hz"]) / own))
-        return replace(one, values=pair(multiple * f, record).get(one.name[-4:], np.zeros(before.y.size)))
+    def at_f(regressor: Regressor) -> Regressor:
+        multiple = max(1, round(float(regressor.entry["frequency_hz"]) / own))
+        return replace(regressor, values=pair(multiple * f, record).get(regressor.name[-4:], np.zeros(before.y.size)))
 
-    return replace(after, regressors=tuple(one if one.name in known else at_f(one) for one in after.regressors))
+    return replace(
+        after,
+        regressors=tuple(regressor if regressor.name in known else at_f(regressor) for regressor in after.regressors),
+    )
 
 
 def _alike(a: Look, b: Look) -> bool:

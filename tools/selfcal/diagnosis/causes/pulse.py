@@ -70,7 +70,7 @@ def _coarse(state: State) -> list[tuple[Fit, tuple[int, int]]]:
     found: list[tuple[Fit, tuple[int, int]]] = []
     while len(found) < TRIED and np.isfinite(value.max()):
         i, j = divmod(int(value.argmax()), places.size)
-        fit, less = drifts[int(np.argmax([one[i, j] for one in values]))]
+        fit, less = drifts[int(np.argmax([table[i, j] for table in values]))]
         found.append((fit.shrunk(less), (int(places[i]) * block, int(places[j]) * block)))
         value[max(0, i - APART) : i + APART + 1, max(0, j - APART) : j + APART + 1] = -math.inf
     return found

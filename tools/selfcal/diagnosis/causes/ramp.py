@@ -14,7 +14,7 @@ from selfcal.model.regressors import coefficient_unit
 
 def looks(state: State, record: Record) -> list[Look]:
     """One look while the model has no ramp."""
-    known = any(one.name == "time" for one in state.regressors)
+    known = any(regressor.name == "time" for regressor in state.regressors)
     return [] if known else columns.looks(state, "ramp", [_shape(state, record)])
 
 

@@ -22,6 +22,7 @@ from selfcal.diagnosis.cause import Cause, Grouping, Scored, shown
 from selfcal.diagnosis.causes.cross_axis import leaks, without
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
+from selfcal.likelihood.columns import LN_EITHER
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, interval, net
 from selfcal.likelihood.statemodel import Array
 
@@ -33,8 +34,6 @@ CLIP = 4.0
 LINE_LEAST, LINE_HALF = 4.0, 2
 #: Pieces of the record at most, over which the correlation must be steady.
 PIECES = 64
-#: ln of the number of forms, white and in a band.
-LN_FORMS = math.log(2.0)
 #: A band of noise has half a width of this share of its frequency at least, and of so many bins of the spectrum. A
 #: narrower one is a disturbance of that frequency.
 BROAD, BROAD_BINS = 0.02, 4.0
@@ -62,8 +61,8 @@ class Pair:
         if self.u.size % 2 == 0:
             kept[-1] = False
         line = math.log(kept.size) + LINE_LEAST
-        for one in both:
-            power = np.abs(one) ** 2
+        for spectrum in both:
+            power = np.abs(spectrum) ** 2
             for low, high in pairwise(self.edges):
                 level = float(np.median(power[low:high])) / math.log(2.0)
                 for at in low + np.flatnonzero(power[low:high] > line * level):
@@ -73,12 +72,14 @@ class Pair:
     @cached_property
     def spectra(self) -> tuple[Spectrum, Spectrum]:
         """The same with a mean power of 1 in each band: a slope that a model leaves counts for nothing."""
-        U, V = (one / np.append(1.0, np.repeat(self._level(one), np.diff(self.edges))) for one in self.raw)
+        U, V = (
+            spectrum / np.append(1.0, np.repeat(self._level(spectrum), np.diff(self.edges))) for spectrum in self.raw
+        )
         return U, V
 
-    def _level(self, one: Spectrum) -> Array:
+    def _level(self, spectrum: Spectrum) -> Array:
         """Root mean square of each band's bins that are not left out."""
-        power = np.abs(one) ** 2
+        power = np.abs(spectrum) ** 2
         total, count = (np.add.reduceat(row, self.edges[:-1]) for row in (power, (power > 0.0).astype(float)))
         return np.sqrt(np.maximum(total, 1e-300) / np.maximum(count, 1.0))
 
@@ -150,7 +151,7 @@ def common(pair: Pair, ln_pairs: float = 0.0) -> Common | None:
         # Few loud bins are no evidence for many: the scatter of the products decides.
         sure = min(gain * (1.0 - 1.0 / float(free[at])), float(loud[at]) * abs(coherence / gamma[at]) ** 2)
         band = None if freedom == 1 else (int(edges[low[at]]), int(edges[high[at]]))
-        price = ln_pairs + LN_FORMS + ln_looks
+        price = ln_pairs + LN_EITHER + ln_looks
         return Common(coherence, float(free[at]), gain, net(sure, freedom, price), net(gain, freedom, price), band)
 
     loud = np.abs(gamma) ** 2 * many * free / scatter
@@ -176,7 +177,7 @@ def _steadiness(pair: Pair, found: Common) -> float:
     inside = np.zeros(U.size, bool)
     inside[first:end] = True
     turn = found.coherence / max(abs(found.coherence), 1e-300)
-    u, v = (irfft(np.where(inside, one, 0.0), pair.u.size) for one in (U, V * turn))
+    u, v = (irfft(np.where(inside, spectrum, 0.0), pair.u.size) for spectrum in (U, V * turn))
     count = min(PIECES, int(found.bins))
     parts = np.array([float(part.sum()) for part in np.array_split(u * v, count)])
     scatter = max(float(parts.std(ddof=1)) * math.sqrt(count), 1e-300)
@@ -190,7 +191,7 @@ def look(pair: Pair, found: Common, other: str) -> Look:
     share, share_sd = abs(size), sd
     estimate: dict[str, Any] = {"other": other, "correlation": interval(size, sd, "1")}
     if found.band is not None:
-        U, V = (np.abs(one) ** 2 for one in pair.raw)
+        U, V = (np.abs(spectrum) ** 2 for spectrum in pair.raw)
         first, end = found.band
         inside = math.sqrt(float(U[first:end].sum() / U.sum()) * float(V[first:end].sum() / V.sum()))
         share, share_sd = share * inside, share_sd * inside
@@ -214,11 +215,11 @@ def carried_over(u: Array, v: Array, dt: float, split: int, estimate: Mapping[st
         hz = 1.0 / (pair.u.size * dt)
         return slice(max(1, round(band[0] / hz)), max(2, round(band[1] / hz)))
 
-    U, V = (one[bins(before)] for one in before.spectra)
+    U, V = (spectrum[bins(before)] for spectrum in before.spectra)
     gamma = complex(np.vdot(V, U)) / max(float(np.linalg.norm(U) * np.linalg.norm(V)), 1e-300)
     gamma = gamma if band is not None else complex(gamma.real)
     square = float(min(abs(gamma) ** 2, 1.0 - 1e-12))
-    U, V = (one[bins(after)] for one in after.spectra)
+    U, V = (spectrum[bins(after)] for spectrum in after.spectra)
     power = np.abs(U) ** 2 + np.abs(V) ** 2
     scores = -math.log1p(-square) - (square * power - 2.0 * (np.conj(gamma) * np.conj(V) * U).real) / (1.0 - square)
     scores = scores[power > 0.0] / after.u.size
@@ -237,7 +238,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Noise that two axes share, on both, with the evidence of the pair.
 
     An axis that is not in `found` has the model that it was fitted with at first."""
-    states = {**record.axes, **{name: one.state for name, one in found.items()}}
+    states = {**record.axes, **{name: axis.state for name, axis in found.items()}}
     states = {name: state for name, state in states.items() if state.whitened.size and not state.below_lattice}
     pairs = [pair for pair in combinations(states, 2) if any(name in found for name in pair)]
     ln_pairs = math.log(max(1, len(pairs)))
@@ -259,12 +260,12 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
         for name, other in (names, names[::-1]):
             if name in found:
                 findings = found[name].findings
-                last = max((one.round for one in findings if one.look.changes), default=0)
+                last = max((finding.round for finding in findings if finding.look.changes), default=0)
                 state, partner = states[name], states[other]
                 seen = look(pair, both, other)
-                own = [one for one in findings if _of_band(one.look, seen, pair)]
-                seen = replace(seen, gain=seen.gain + sum(one.look.gain for one in own))
-                seen = replace(seen, net=seen.net + sum(one.look.net for one in own))
+                own = [finding for finding in findings if _of_band(finding.look, seen, pair)]
+                seen = replace(seen, gain=seen.gain + sum(finding.look.gain for finding in own))
+                seen = replace(seen, net=seen.net + sum(finding.look.net for finding in own))
                 findings.append(Finding(seen, last, state, state, partner=partner))
     for name, each in found.items():
         _accounted(name, each, found)
@@ -281,39 +282,39 @@ def _of_band(band: Look, shared: Look, pair: Pair) -> bool:
     return bool(low < centre < high and half > BROAD * centre and bins > BROAD_BINS)
 
 
-def _accounted(name: str, one: Diagnosed, found: Mapping[str, Diagnosed]) -> None:
+def _accounted(name: str, axis: Diagnosed, found: Mapping[str, Diagnosed]) -> None:
     """Drop a dependence on another axis that no form explains where that axis leaks or shares a source. Seen from the
     axis that leaks, its coefficient differs from one frequency to the next."""
-    known = {str(finding.look.estimate["other"]) for finding in one.findings if "other" in finding.look.estimate}
+    known = {str(finding.look.estimate["other"]) for finding in axis.findings if "other" in finding.look.estimate}
     for other, two in found.items():
         if any(finding.look.estimate.get("other") == name for finding in two.findings):
             known.add(other)
-    one.findings[:] = [each for each in one.findings if each.look.changes or each.look.shown_by not in known]
+    axis.findings[:] = [each for each in axis.findings if each.look.changes or each.look.shown_by not in known]
 
 
-def _leaks(one: Diagnosed, states: Mapping[str, State], sources: Mapping[str, int], ln_pairs: float) -> None:
+def _leaks(axis: Diagnosed, states: Mapping[str, State], sources: Mapping[str, int], ln_pairs: float) -> None:
     """Judge whether an axis that follows another shares a source with it instead.
 
     A leak has one coefficient at all frequencies, the drift's included. A common source is in the noise alone. The one
     that explains more stays, net of the searches: the best of many bands gains more than one coefficient does, and a
     source that leaks into another axis as well is no longer looked for."""
-    for finding in [finding for finding in one.findings if finding.look.cause == "cross_axis"]:
+    for finding in [finding for finding in axis.findings if finding.look.cause == "cross_axis"]:
         other = str(finding.look.estimate["other"])
         if other not in states:
             continue
-        free = without(one.state, other)
+        free = without(axis.state, other)
         both = common(pair_of(free.whitened, states[other].whitened, free.dt), ln_pairs)
         if both is None or both.net < NET_LEAST:
             continue
         search = max(0.0, finding.look.gain - finding.look.net)
         search -= math.log(len(states) - 1) if sources[other] > 1 else 0.0
-        ahead = both.searched - (one.state.best.ln_likelihood - free.best.ln_likelihood - search)
+        ahead = both.searched - (axis.state.best.ln_likelihood - free.best.ln_likelihood - search)
         if ahead > ALIKE:
-            one.findings.remove(finding)
-            one.state = free
+            axis.findings.remove(finding)
+            axis.state = free
         elif ahead > -max(ALIKE, LOST * both.gain):
             possible = tuple(dict.fromkeys((*finding.also_possible, "shared")))
-            one.findings[one.findings.index(finding)] = replace(finding, also_possible=possible)
+            axis.findings[axis.findings.index(finding)] = replace(finding, also_possible=possible)
 
 
 def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
@@ -321,7 +322,7 @@ def _least(state: State, record: Record) -> dict[str, tuple[float, str]] | None:
     pairs = len(record.axes) * (len(record.axes) - 1) // 2
     if not pairs:
         return None
-    gain = NET_LEAST * gain_for(lambda gain: net(gain, 1, LN_FORMS + math.log(pairs)))
+    gain = NET_LEAST * gain_for(lambda gain: net(gain, 1, LN_EITHER + math.log(pairs)))
     return {"correlation": (math.sqrt(-math.expm1(-2.0 * gain / state.best.n)), "1")}
 
 

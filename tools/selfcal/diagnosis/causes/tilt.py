@@ -21,8 +21,8 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, Look, State, interval
 from selfcal.likelihood.statemodel import Array
 
-#: Standard gravity, m/s^2, and how far off the specific force at rest may be, as a share of it.
-GRAVITY, NEAR = 9.80665, 0.1
+#: Share by which the specific force at rest may differ from standard gravity.
+NEAR = 0.1
 #: Share of the step's information that two angles explain, at least.
 EXPLAINED = 0.9
 #: Time about the event over which the gyroscopes' rates are summed up, s, and standard deviations beyond which their
@@ -33,10 +33,10 @@ ABOUT_S, SURE = 3.0, 3.0
 def settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Name the steps of one event a turn of the sensor, where their sizes beside all other findings are one. A step of
     one accelerometer may be a turn about one axis: gravity moves on the others by its square alone."""
-    states = {**record.axes, **{name: one.state for name, one in found.items()}}
+    states = {**record.axes, **{name: axis.state for name, axis in found.items()}}
     events: dict[int | str, dict[str, int]] = {}
-    for name, one in found.items():
-        for k, finding in enumerate(one.findings):
+    for name, axis in found.items():
+        for k, finding in enumerate(axis.findings):
             if finding.look.cause == step.CAUSE.id and finding.record is None:
                 events.setdefault(finding.event or f"{name} {k}", {})[name] = k
     for event in events.values():
@@ -98,7 +98,7 @@ def _specific_force(states: Mapping[str, State]) -> dict[str, tuple[float, float
             continue
         found[name] = ((state.level + float(state.best.c[0])) * factor, factor)
     size = math.sqrt(sum(level**2 for level, _ in found.values()))
-    return found if len(found) == 3 and abs(size / GRAVITY - 1.0) < NEAR else None
+    return found if len(found) == 3 and abs(size / units.STANDARD_GRAVITY - 1.0) < NEAR else None
 
 
 def _turned(states: Mapping[str, State], names: list[str], time_s: float) -> tuple[Array, Array] | None:

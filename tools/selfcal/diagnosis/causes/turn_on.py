@@ -20,8 +20,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: The fastest time constant looked for, samples.
 FASTEST = 5.0
-#: Time constants of the grid, per octave; neighbours a factor 2 apart correlate by 0.94.
-PER_OCTAVE = 1.0
 #: Two time constants of one transient lie this factor apart at least.
 APART = 4.0
 #: Price of the search over a time constant beside its degree of freedom.
@@ -32,7 +30,7 @@ def looks(state: State, record: Record) -> list[Look]:
     """The best time constant, or the best two where a single one shows settling and both are clearly more likely."""
     tau = _grid(record)
     pairs = (_shape(state, record, two) for two in combinations(tau, 2) if two[1] > 0.999 * APART * two[0])
-    return columns.looks(state, "turn_on", [_shape(state, record, [one]) for one in tau], pairs)
+    return columns.looks(state, "turn_on", [_shape(state, record, [constant]) for constant in tau], pairs)
 
 
 def at(state: State, record: Record, theta: Sequence[float]) -> Look:
@@ -57,8 +55,10 @@ def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
         f"{len(tau)}",
         rows,
         tuple(
-            Regressor(f"turn_on_{one:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(one))})
-            for one, row in zip(tau, rows, strict=True)
+            Regressor(
+                f"turn_on_{constant:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(constant))}
+            )
+            for constant, row in zip(tau, rows, strict=True)
         ),
         tuple((f"amplitude{end}", state.unit) for end in ends),
         price=len(tau) * LN_LOOKS + LN_SLOW,
@@ -69,10 +69,9 @@ def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
 
 
 def _grid(record: Record) -> Array:
-    """Time constants looked for, s: from some samples to the record's length."""
+    """Time constants looked for, s, up to the record's length. Two a factor 2 apart correlate by 0.94."""
     low, high = _range(record)
-    octaves = math.log2(high / low)
-    return low * np.exp2(np.linspace(0.0, octaves, max(2, 1 + math.ceil(PER_OCTAVE * octaves))))
+    return np.geomspace(low, high, 1 + math.ceil(math.log2(high / low)))
 
 
 def _range(record: Record) -> tuple[float, float]:
@@ -101,14 +100,14 @@ def _alike(a: Look, b: Look) -> bool:
 def _trained(look: Look, before: State, after: State, record: Record, split: int) -> State:
     """With the time constants that the first samples alone show. What their scored successors gain is the noise model
     that is left of the first ones: the transient itself is mostly over."""
-    known = {one.name for one in before.regressors}
+    known = {regressor.name for regressor in before.regressors}
     half = before.first(split)
     own_record = replace(record, present=record.present[:split])
-    single = [_shape(half, own_record, [one]) for one in _grid(own_record)]
+    single = [_shape(half, own_record, [constant]) for constant in _grid(own_record)]
     found = columns.alike(columns.tried(half, single, slow=False, least=-math.inf))[0]
     times = np.array(found.shape.theta)
-    kept = tuple(one for one in after.regressors if one.name in known)
-    own = next(one for one in after.regressors if one.name not in known)
+    kept = tuple(regressor for regressor in after.regressors if regressor.name in known)
+    own = next(regressor for regressor in after.regressors if regressor.name not in known)
     added = tuple(replace(own, name=f"turn_on_{k}", values=row) for k, row in enumerate(_decays(_time(record), times)))
     whole = (*kept, *added)
     # The first samples may show one time constant where the whole record shows two.
@@ -125,7 +124,7 @@ def _entry(entry: Mapping[str, Any], look: Look | None, record: Record) -> dict[
     """Of the two time constants of a look the nearer one."""
     known = {} if look is None else medians(look)
     times = [known[key] for key in ("tau_s", "tau_2_s") if key in known] or [float(entry["tau_s"])]
-    return {**entry, "tau_s": digits(min(times, key=lambda one: abs(math.log(one / float(entry["tau_s"])))))}
+    return {**entry, "tau_s": digits(min(times, key=lambda time: abs(math.log(time / float(entry["tau_s"])))))}
 
 
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:

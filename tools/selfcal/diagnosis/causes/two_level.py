@@ -153,14 +153,14 @@ def _shaken(state: State, record: Record, levels: Array) -> bool:
             louder.add(name)
     if not louder:
         return False
-    known = {str(one.entry["column"]) for one in state.regressors if one.cause == "vibration"}
+    known = {str(regressor.entry["column"]) for regressor in state.regressors if regressor.cause == "vibration"}
     known |= {str(look.estimate["other"]) for look in vibration.looks(state, record) if look.net >= NET_LEAST}
     return bool(louder & known)
 
 
 def _without(ln_rho: float, ln_sigma: float) -> Array:
     """Walks beside one level [g, 5], for the same filter."""
-    walks, whites = (one.ravel() for one in np.meshgrid(WALKS, WHITES))
+    walks, whites = (axis.ravel() for axis in np.meshgrid(WALKS, WHITES))
     none, dwell = np.full(walks.size, math.log(LEAST) + ln_sigma), np.full(walks.size, math.log(100.0))
     return np.column_stack([none, dwell, dwell, ln_rho + walks, ln_sigma + whites])
 
@@ -207,7 +207,7 @@ def _dwell(time: float, count: float, dt: float) -> dict[str, Any]:
 
 def _smoothed(y: Array, theta: Array) -> Array:
     """[n]: probability of the upper level given the whole record, by a pass backwards over the filter's."""
-    up, down = (-math.expm1(-math.exp(-float(one))) for one in theta[1:3])
+    up, down = (-math.expm1(-math.exp(-float(rate))) for rate in theta[1:3])
     filtered = switching(y, theta[None, :])[1][:, 0]
     smooth = filtered.copy()
     for k in range(y.size - 2, -1, -1):

@@ -27,10 +27,10 @@ from selfcal.diagnosis.cause import (
 )
 from selfcal.diagnosis.causes import vibration
 from selfcal.diagnosis.causes.step import ONE_EVENT_S
-from selfcal.diagnosis.forms import LN_SMOOTHINGS, SMOOTHING_S
+from selfcal.diagnosis.forms import SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.likelihood.columns import NEARLY
+from selfcal.likelihood.columns import LN_EITHER, NEARLY
 from selfcal.likelihood.edges import raised
 from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array
@@ -134,9 +134,9 @@ def _places(state: State, record: Record, square: Array) -> Iterator[Level]:
 def levels(state: State, record: Record) -> Iterator[Level]:
     """Every channel over the widths of its means that the record is long enough for, s."""
     n, dt = state.y.size, state.dt
-    sides = {record.channel_names[name]: (SIDE_CHANNELS[name][1], one) for name, one in record.channels.items()}
+    sides = {record.channel_names[name]: (SIDE_CHANNELS[name][1], values) for name, values in record.channels.items()}
     others = record.variances(state.axis)
-    price = LN_SMOOTHINGS + math.log(max(1, len(sides) + len(others)))
+    price = LN_EITHER + math.log(max(1, len(sides) + len(others)))
 
     def level(name: str, unit: str, values: Array, by: str) -> Level:
         span = float(np.diff(np.quantile(values[np.isfinite(state.whitened)], ENDS))[0])
