@@ -246,6 +246,8 @@ def _changes(event: Event, axis: str, unit: str, known: Identified | None) -> di
         found["bias_error"] = ahead
     if any(_better(row) for row in ahead.values()):
         material.append("bias_error")
+    if any(member.finding.look.estimate.get("undone") is False for member in own):
+        material.append("readings")
     return {**found, "unit": unit, "material": material, "most": most}
 
 

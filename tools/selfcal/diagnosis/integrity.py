@@ -95,7 +95,8 @@ def of_readings(record: Record, axis: str) -> Iterator[Look]:
     n, time_s = readings.values.size, readings.recording.time_s
     if (changed := readings.misread) is not None:  # by a map of the firmware or the logger
         fraction = interval(changed.share, math.sqrt(changed.share / n), "1")
-        yield Look("misread", changed.nats, changed.nats, {"kind": changed.kind, "fraction": fraction}, {})
+        estimate = {"kind": changed.kind, "fraction": fraction, "undone": changed.undone is not None}
+        yield Look("misread", changed.nats, changed.nats, estimate, {})
     if readings.held is not None:  # the logger asks oftener than the part measures, always or in stretches
         nats, rate_hz = min(1e6, readings.held.nats), interval(readings.recording.rate_hz, 0.0, "Hz")
         yield Look("held_samples", nats, nats, {"rate_hz": rate_hz}, {})
@@ -110,11 +111,12 @@ def of_readings(record: Record, axis: str) -> Iterator[Look]:
         mask, share = common.mask, common.share
         times = time_s[mask if mask.any() else readings.values == common.value]
         when = (float(times[0]), float(times[-1]))
-        estimate = {
+        lost: dict[str, Any] = {
             "fraction": interval(share, math.sqrt(share / mask.size), "1"),
             "time_s": interval(when[0], 0.0, "s"),
+            "undone": bool(mask.any()),
         }
-        yield Look("outliers", common.nats, common.nats, estimate, {}, when=when)
+        yield Look("outliers", common.nats, common.nats, lost, {}, when=when)
 
 
 def _of_stretches(cause: str, nats: float, intervals: Sequence[Sequence[float]], **more: Any) -> Look:

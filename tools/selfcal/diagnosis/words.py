@@ -149,6 +149,8 @@ def _size(key: str, value: Any) -> str:
             return statistic(str(value))
         case "share":
             return f"share of the drift {value:.2g}"
+        case "undone":
+            return "" if value else "still in the readings"
         case "source":
             return f"the source is {value}"
         case "input" | "measured" | "law" | "knots":
@@ -185,7 +187,8 @@ def event(finding: Mapping[str, Any]) -> str:
 def named(cause: str) -> str:
     """A cause by its name, or the id of one of several."""
     of_several, _, number = cause.replace(" ", "_").rpartition("_")
-    return f"{named(of_several)} {number}" if number.isdecimal() else LABELS.get(cause, cause.replace("_", " "))
+    label = LABELS.get(cause, cause.replace("_", " ")) if cause != "misread" else cause  # the label is of a size
+    return f"{named(of_several)} {number}" if number.isdecimal() else label
 
 
 def quantity(key: str) -> str:

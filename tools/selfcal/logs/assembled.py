@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
+from selfcal.base.grid import runs
 from selfcal.base.limits import LONGEST_S, MOST_CLOCKS
 from selfcal.logs import written
 from selfcal.logs.headers import Header, number_in
@@ -24,7 +25,7 @@ from selfcal.logs.order import few, in_order
 from selfcal.logs.recorded import SIDE_UNITS, Column, Recording, bridged, bridged_at
 from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
 
-#: Readings of a side channel for each wild one on either side.
+#: Readings of a side channel for each one of a run of wild ones.
 WILD = 1000
 
 Floats = NDArray[np.float64]
@@ -73,20 +74,24 @@ def assembled(rows: Rows, header: Header) -> Recording:
 
 
 def _tame(column: Column, header: Header) -> Column:
-    """The channel without its wild readings: those farther from nearly all others than these are from each other, as a
-    thermometer's error values are."""
-    there = np.sort(column.values[np.isfinite(column.values)])
-    few_wild = max(1, there.size // WILD)
-    if there.size < 2 * few_wild + 1:
+    """The channel without its wild readings, as a thermometer's error values are: farther from all others than these
+    are from each other, and never for long."""
+    known = np.flatnonzero(np.isfinite(column.values))
+    values = column.values[known]
+    off = np.abs(values - np.median(values)) if known.size else values
+    near = np.sort(off)[known.size // 2 :]
+    gaps = np.flatnonzero((near[:-1] > 0.0) & (near[1:] > 3.0 * near[:-1]))
+    if not gaps.size:
         return column
-    low, high = there[few_wild], there[-1 - few_wild]
-    with np.errstate(over="ignore"):
-        wild = (column.values < 2.0 * low - high) | (column.values > 2.0 * high - low)
-    if not high > low or not wild.any():
+    wild = [known[a:b] for a, b in runs(off > near[gaps[0]]) if b - a <= max(1, known.size // WILD)]
+    if not wild:
         return column
-    said = f"{wild.sum()} of {there.size} readings are far from all others, the first {column.values[wild][0]:.6g}"
+    rows = np.concatenate(wild)
+    said = f"{rows.size} of {known.size} readings are far from all others, the first {column.values[rows[0]]:.6g}"
     header.notes.append(f"{column.name}: {said}: left out")
-    return replace(column, values=np.where(wild, np.nan, column.values))
+    left = column.values.copy()
+    left[rows] = np.nan
+    return replace(column, values=left)
 
 
 def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header) -> tuple[_Stamps, Places]:

@@ -328,7 +328,7 @@ def _not_adequate(axes: Mapping[str, Any]) -> list[str]:
     for checks, names in alike.items():
         said = [_range_of(test, [axes[name]["checks"][test] for name in names]) for test in checks if test != "allan"]
         off = [each for name in names for each in _off(axes[name])]
-        each = off if len(names) == 1 else [min(off), max(off)]  # allan_16s model -9 %, 128s +22 %
+        each = [min(off), max(off)] if off and len(names) > 1 else off  # allan_16s model -9 %, 128s +22 %
         said += (
             [f"allan_{', '.join(f'{tau} {most:+.0f} %' for most, tau in each).replace(' ', ' model ', 1)}"]
             if off

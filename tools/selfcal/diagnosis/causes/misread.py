@@ -8,6 +8,7 @@ CAUSE = Cause(
     "misread",
     "The readings are not as the part made them: the firmware or the logger changes them.",
     "Log the raw words beside the values.",
+    source="read-out",
     pictures=shown("histogram"),
     grouping=Grouping(alike=lambda a, b: bool(a.estimate["kind"] == b.estimate["kind"])),
     score=Scored(no_gain="readings that were changed are scored by no density", once="it is a fault of this log"),
