@@ -418,12 +418,15 @@ def _before_and_after(
     factor = units.factor(axis.state.unit, unit)
     if any("y" in finding.look.changes for finding in axis.findings):  # the bank has the readings as they were read
         known = None
-    old, new = _sides(axis.first, axis.state, factor, math.prod(member.plain for member in members))
+    state = axis.state
+    if known is not None and any(regressor.name == hidden.ID for regressor in state.regressors):
+        state = state.without({hidden.ID}).refit()  # no bank has the quantity
+    old, new = _sides(axis.first, state, factor, math.prod(member.plain for member in members))
     found: dict[str, dict[str, Any]] = {}
     for name, key in SUMMARY.items():
         after: dict[str, Any] = {"median": new[name], "identified": new[name] > 0.0}
         if known is not None and key in known.summary:
-            level = _farthest(axis.first, axis.state) if name == "N" else 1.0  # the bank has the mean one
+            level = _farthest(axis.first, state) if name == "N" else 1.0  # the bank has the mean one
             number = known.summary[key].estimate.scaled(units.factor(known.group_unit, unit) * level)
             after = {part: getattr(number, part) for part in ("median", "q05", "q95", "identified")}
         measure = after["median"] / new[name] if after["identified"] and new[name] else 1.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -137,6 +137,19 @@ class Hidden:
         gain = fit.ln_likelihood - best(free).ln_likelihood
         # Before the record it acts on an axis as likely as not.
         return On(size, sd, float(expit(gain - math.log1p(abs(size) / sd))), Regressor(ID, ID, column, "1", {}))
+
+    def put(self, state: State) -> State:
+        """The state with it, if it acts on that axis."""
+        on = self.on(state)
+        return state.refit(regressors=(*state.regressors, on.column)) if on.probability >= 0.5 else state
+
+    def beside(self, states: Mapping[str, State]) -> Hidden | None:
+        """The quantity beside what the models of its axes have by now; None: there is none."""
+        y = np.array([half_means(state.rest, max(1, round(self.dt / state.dt)))[0] for state in states.values()])
+        n = min(y.shape[1], self.y.shape[1])
+        y = np.where(np.isfinite(self.y[:, :n]), y[:, :n] / self.scale[:, None], np.nan)
+        model = weighed(fitted(bins_of(y), self.dt, False), y, self.dt)
+        return None if model is None else replace(self, model=model, y=y)
 
     def explains(self, source: str, others: Collection[str], upto_hz: float = 0.0) -> bool:
         """Whether noise that an axis shares with some others below a frequency is the quantity's: beside it their white

@@ -226,11 +226,9 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
         return record
     if seen.hidden is not None:
         for name in seen.hidden.names:
-            on = seen.hidden.on(states[name])
+            states[name] = seen.hidden.put(states[name])
             if name in found:
                 found[name].hidden = seen.hidden
-            if on.probability >= 0.5:
-                states[name] = states[name].refit(regressors=(*states[name].regressors, on.column))
     for number, candidate in enumerate(seen.events, 1):
         event = candidate.of(seen.names)
         if event.cause in module.JUMPS:

@@ -84,9 +84,10 @@ class Record:
         return np.arange(self.present.size) / self.rate_hz
 
     def other_axes(self, axis: str) -> dict[str, Array]:
-        """The other axes about their level, bridged where missing."""
+        """The other axes about their level, bridged where missing, less what the model lets this one leak into them."""
         return {
-            name: bridged(state.y) - float(np.nanmedian(state.y)) for name, state in self.axes.items() if name != axis
+            name: bridged(y) - float(np.nanmedian(y))
+            for name, y in ((name, state.less_of(axis)) for name, state in self.axes.items() if name != axis)
         }
 
     def variances(self, axis: str) -> dict[str, Array]:

@@ -293,6 +293,7 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
         tries = [np.concatenate([head, vector, [np.clip(math.log(dt / tau), *bounds[-1])]]) for tau in STARTS_S]
     value, x = min((_least(cost, start, np.array(bounds)) for start in tries), key=lambda end: end[0])
     own, root, _, loading, ln_rate = cost.parts(x)
+    loading = loading * math.copysign(1.0, float(loading.sum()))
     return Joint(own, root @ root.T, loading * np.exp(own[:, 0]), math.exp(ln_rate), -value)
 
 

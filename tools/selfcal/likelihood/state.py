@@ -107,6 +107,11 @@ class State:
         """The record [n] less its level and the columns of the fitted model."""
         return np.asarray(self.y - self.best.c @ self.series.columns)
 
+    def less_of(self, channel: str) -> Array:
+        """The record [n] less the columns that the model has of a channel, in a fit with them."""
+        own = [k for k, regressor in enumerate(self.regressors, 1) if regressor.entry.get("column") == channel]
+        return self.y - self.best.c[own] @ self.series.columns[own] if own and self.fits else self.y
+
     def bases(self) -> tuple[Terms, ...]:
         """The drifts that the model may have, with its extras: the paper's laws; walk includes the constant."""
         return (replace(self.extras, walk=True), replace(self.extras, markov=True))

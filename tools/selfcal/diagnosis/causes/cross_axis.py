@@ -67,7 +67,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
             source = found[other].state if other in found else record.axes[other]
             known = source.best.ln_likelihood - without(source, name).best.ln_likelihood
             if known > finding.look.gain - ALIKE:
-                _drop(found[name], finding, without(found[name].state, other))
+                _drop(found[name], other, without(found[name].state, other))
             continue
         ahead: float = back.look.gain - finding.look.gain
         if abs(ahead) < ALIKE:
@@ -76,7 +76,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
             sizes = [abs(float(side.look.estimate["coefficient"]["median"])) for side in (finding, back)]
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
-            _drop(found[name], finding, without(found[name].state, other))
+            _drop(found[name], other, without(found[name].state, other))
     arms: dict[str, set[str]] = {}
     for name, other, _ in leaks(found):
         arms.setdefault(other, set()).add(name)
@@ -95,6 +95,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
                 look = axis.findings[k].look
                 look = replace(look, estimate={**look.estimate, "source": unsure})
                 axis.findings[k] = replace(axis.findings[k], look=look)
+    _weigh_anew(found)
 
 
 def leaks(found: Mapping[str, Diagnosed]) -> list[tuple[str, str, Finding]]:
@@ -113,8 +114,13 @@ def _partners(found: Mapping[str, Diagnosed]) -> Counter[str]:
     return Counter(name for pair in pairs for name in pair)
 
 
-def _drop(axis: Diagnosed, finding: Finding, free: State) -> None:
-    axis.findings.remove(finding)
+def _drop(axis: Diagnosed, other: str, free: State) -> None:
+    """Take every form of another axis out."""
+    axis.findings = [
+        finding
+        for finding in axis.findings
+        if finding.look.cause != "cross_axis" or finding.look.estimate["other"] != other
+    ]
     axis.state = free
 
 
@@ -151,14 +157,26 @@ def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
 def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> None:
     """Drop an axis that shows in another by nothing but what its own model explains: a step or a ramp, of which both
     may have their own."""
-    for name, other, finding in leaks(found):
+    for name, other, _ in leaks(found):
         source = found[other].state if other in found else record.axes[other]
         if all(column.cause == "cross_axis" for column in source.regressors):
             continue
         source, free = without(source, name), without(found[name].state, other)
         rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
         if not any(look.net >= NET_LEAST for look in rest):
-            _drop(found[name], finding, free)
+            _drop(found[name], other, free)
+
+
+def _weigh_anew(found: Mapping[str, Diagnosed]) -> None:
+    """Weigh a quantity beside the leaks: without them it takes the drift of a source for itself."""
+    quantity = next((axis.hidden for axis in found.values() if axis.hidden is not None), None)
+    own = any(finding.look.estimate.get("source") != hidden.ID for _, _, finding in leaks(found))
+    if quantity is None or not own or not {*quantity.names} <= found.keys():
+        return
+    states = {name: found[name].state.without({hidden.ID}).refit() for name in quantity.names}
+    again = quantity.beside(states)
+    for name, state in states.items():
+        found[name].hidden, found[name].state = again, state if again is None else again.put(state)
 
 
 def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
@@ -173,7 +191,7 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
         back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
         lost = axis.state.best.ln_likelihood - free.best.ln_likelihood
         if back and back[0].gain > lost - ALIKE:  # of the pair that is shown already, the likelier source
-            _drop(axis, finding, free)
+            _drop(axis, other, free)
             after = source.state.refit(**back[0].changes)
             source.findings.append(replace(finding, look=back[0], before=source.state, after=after, held_out=None))
             source.state = after
