@@ -331,7 +331,7 @@ def with_regressor(folder: Path, **entry: Any) -> Path:
         ({"form": "square", "knots": [[1, 2], [2, 3]]}, "goes with form: free"),
         ({"form": "free", "knots": [[1, 2], [1, 3]]}, "must rise"),
         ({"form": "free", "knots": [[1, 2], 3]}, "must be a pair"),
-        ({"form": "free", "knots": [[1, 2]]}, "must be a list of 2 to"),
+        ({"form": "free", "knots": [[1, 2]]}, "must be a list of two pairs"),
         ({"form": "rate"}, "'window_s' is missing"),
         ({"lag_s": 10}, "lag_s: goes with form: lag alone"),
         ({"form": "lag", "lag_s": 0}, "lag_s: must be a finite number above 0"),

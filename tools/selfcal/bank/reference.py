@@ -31,8 +31,8 @@ _DEPTH = 16.0
 _STEP = 0.75
 #: Fewest steps of a direction between its limits.
 _FEWEST = 24
-#: Most nodes of a hypothesis: a larger posterior is out of this engine's reach.
-_MOST = 1_000_000
+#: Most nodes of a hypothesis, and of a direction: a larger posterior is out of this engine's reach.
+_MOST = 2**20
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -121,7 +121,7 @@ def _posterior(
     z, sd = (None, None) if columns is None else columns
     of = group.laws[law]
     means = len(of.read) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
-    beside = means + of.noise_states
+    beside = means + 2 * of.coloured_noise
     columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
     constant = np.concatenate([np.zeros(beside), [1.0], columns_now])
     own_from = max(len(of.read), 1) + beside + 1
@@ -184,14 +184,6 @@ def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Fl
     taken = [weight for weights, _ in terms for weight in weights]
     gained = sum((variance for _, variance in terms), np.zeros(drift.size))
     return np.column_stack(taken or [np.ones(drift.size)]), gained
-
-
-def _prior_sd(prior: Prior) -> float:
-    """Standard deviation of ln(parameter) under its prior."""
-    if prior.law != "uniform":
-        return prior.ln_sd
-    share = prior.min / prior.max
-    return math.sqrt(1.0 - share * (math.log(share) / (1.0 - share)) ** 2)
 
 
 # ------------------------------------------------------------------------------------------------- finding the modes
@@ -277,7 +269,7 @@ class _Lattice:
     ) -> None:
         self.filtered, self.low, self.high = filtered, low, high
         steps = np.maximum(np.ceil((high - low) / (_STEP * widths)), _FEWEST)
-        self.count: _Indices = (2 * np.ceil(np.minimum(steps, 2**20) / 2)).astype(np.int64)
+        self.count: _Indices = (2 * np.ceil(np.minimum(steps, _MOST) / 2)).astype(np.int64)
         self.index: _Indices = np.empty((0, len(low)), np.int64)
         self.value = np.empty(0)
         self.mean, self.var = np.empty((0, moments)), np.empty((0, moments))
@@ -321,7 +313,7 @@ class _Lattice:
                 # ln evidence may change by 4e-4, which moves a probability by 1e-4, and a moment by 5e-3 posterior sd.
                 excess.append(max(abs(half[0] - full[0]) / 4e-4, float(moments.max()) / 5e-3))
             worst = int(np.argmax(excess))
-            if excess[worst] <= 1.0 or self.count[worst] >= 2**20:
+            if excess[worst] <= 1.0 or self.count[worst] >= _MOST:
                 return
             self.index[:, worst] *= 2
             self.count[worst] *= 2
@@ -404,5 +396,5 @@ def _estimate(lattice: _Lattice, d: int, prior: Prior) -> Estimate:
     edge = 0.02 * (math.log(prior.max) - math.log(prior.min))
     at_min = float(np.interp(math.log(prior.min) + edge, fine, cumulative, left=0.0, right=1.0))
     at_max = 1.0 - float(np.interp(math.log(prior.max) - edge, fine, cumulative, left=0.0, right=1.0))
-    identified = sd_ln < 0.5 * _prior_sd(prior) and max(at_min, at_max) < 0.05
+    identified = sd_ln < 0.5 * prior.ln_sd and max(at_min, at_max) < 0.05
     return Estimate(mean, float(median), sd, float(q05), float(q95), identified)
