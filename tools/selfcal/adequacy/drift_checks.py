@@ -141,8 +141,6 @@ def _forms(means: Array, state: State, side: bool) -> Iterator[tuple[str, Array]
 
 def _means(values: Array, recording: Recording, begin: int, block: int, count: int) -> Array:
     """Means [count] of a column over whole blocks of the even grid from the place `begin` on, NaN where it has none."""
-    if not recording.missing_before.any():
-        return block_means(values[begin : begin + count * block], block)
     place = recording.clock.place - recording.missing_before[0] - begin
     index = np.floor_divide(place, block)
     kept = (index >= 0) & (index < count)

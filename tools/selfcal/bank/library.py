@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from importlib import import_module
 from typing import Any
 
@@ -41,7 +42,7 @@ def arguments(tables: Tables) -> tuple[Any, ...]:
         tables.id,
         _regressors(tables),
         tables.half_life_s,
-        tables.handling.as_tuple,
+        astuple(tables.handling),
     )
 
 

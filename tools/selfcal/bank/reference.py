@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import generate_binary_structure, maximum_filter
 
 from selfcal import _reference
 from selfcal.bank.result import AxisResult, Estimate
@@ -81,16 +82,14 @@ def identify_axis(
     offset = float(np.nanmean(y))
     centred = np.ascontiguousarray(y - offset, np.float64)
     factors = None if r is None else np.ascontiguousarray(r, np.float64)
-    columns = None if z is None else (np.ascontiguousarray(z, np.float64), np.array(coefficient_sd, np.float64))
+    columns = None if z is None else np.ascontiguousarray(z, np.float64)
+    sd = None if z is None else np.array(coefficient_sd, np.float64)
     posteriors = {
-        name: _posterior(centred, dt, offset, group, name, factors, columns, block, ahead_s) for name in hypotheses
+        name: _posterior(centred, dt, offset, group, name, factors, columns, sd, block, ahead_s) for name in hypotheses
     }
-    ln_weight = {
-        name: math.log(hypotheses[name]) + posteriors[name].ln_evidence for name in posteriors if hypotheses[name] > 0.0
-    }
-    top = max(ln_weight.values())
-    total = sum(math.exp(value - top) for value in ln_weight.values())
-    probability = {name: math.exp(ln_weight[name] - top) / total if name in ln_weight else 0.0 for name in posteriors}
+    ln_weight = np.array([math.log(hypotheses[name]) + p.ln_evidence for name, p in posteriors.items()])
+    weight = np.exp(ln_weight - ln_weight.max())
+    probability = dict(zip(posteriors, (weight / weight.sum()).tolist(), strict=True))
     bias_mean = sum(probability[name] * p.mean[0] for name, p in posteriors.items())
     spread = sum(probability[name] * (p.var[0] + (p.mean[0] - bias_mean) ** 2) for name, p in posteriors.items())
     return AxisResult(
@@ -114,11 +113,11 @@ def _posterior(
     group: Group,
     law: str,
     r: _Floats | None,
-    columns: tuple[_Floats, _Floats] | None,
+    z: _Floats | None,
+    sd: _Floats | None,
     block: int,
     ahead_s: float,
 ) -> _Posterior:
-    z, sd = (None, None) if columns is None else columns
     of = group.laws[law]
     means = len(of.read) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
     beside = means + 2 * of.coloured_noise
@@ -211,14 +210,10 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
         rows = np.arange(len(rest))
         best, profile = ln_n[rows, top], values[rows, top]
         left, right = ln_n[rows, np.maximum(top - 1, 0)], ln_n[rows, np.minimum(top + 1, count - 1)]
-    grid = np.pad(profile.reshape(points), 1, constant_values=-np.inf)
-    inner = tuple(slice(1, -1) for _ in points)
-    peak = np.ones(points, bool)
-    for d in range(len(points)):
-        for shift in (-1, 1):
-            peak &= grid[inner] >= np.roll(grid, shift, axis=d)[inner]
-    starts = np.column_stack([best, rest])[peak.ravel()]
-    starts = starts[np.argsort(-profile[peak.ravel()])][:4]
+    grid = profile.reshape(points or 1)
+    peak = (grid == maximum_filter(grid, footprint=generate_binary_structure(grid.ndim, 1), mode="nearest")).ravel()
+    starts = np.column_stack([best, rest])[peak]
+    starts = starts[np.argsort(-profile[peak])][:4]
     step = (high - low) / (2.0 * np.array([500, *points]))
     polished: list[tuple[float, _Floats]] = []
     for start in starts:

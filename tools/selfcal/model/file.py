@@ -226,10 +226,6 @@ class Handling:
     steps: bool = False
     variance_changes: bool = False
 
-    @property
-    def as_tuple(self) -> tuple[float, bool, bool]:
-        return self.outlier_sd, self.steps, self.variance_changes
-
 
 #: Handling of a model that states none.
 NOT_HANDLED = Handling()

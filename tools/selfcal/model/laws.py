@@ -228,11 +228,8 @@ class Law:
 
     def with_time(self, correlation_time_s: float) -> Law:
         """The law with a correlation time for the term whose stated bandwidth is left open (NaN)."""
-        open_terms = (t.stated and math.isnan(t.bandwidth) for t in self.terms)
-        terms = (
-            replace(t, bandwidth=1.0 / correlation_time_s) if is_open else t
-            for t, is_open in zip(self.terms, open_terms, strict=True)
-        )
+        bandwidth = 1.0 / correlation_time_s
+        terms = (replace(t, bandwidth=bandwidth) if math.isnan(t.bandwidth) else t for t in self.terms)
         return replace(self, terms=tuple(terms))
 
 

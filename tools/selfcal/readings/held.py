@@ -105,6 +105,14 @@ def slower(values: Array) -> list[Slower]:
     return stretches
 
 
+def repeats_of(stretches: Sequence[Slower], n: int) -> Mask:
+    """Which of n rows repeat in stretches of a lower rate."""
+    repeats = np.zeros(n, bool)
+    for stretch in stretches:
+        repeats[stretch.rows] = True
+    return repeats
+
+
 def equal_by_chance(values: Array) -> float:
     """Share of readings [n] that equal one two to four before: by chance alone, on a lattice of several steps too."""
     return sum(float(np.count_nonzero(values[k:] == values[:-k])) for k in (2, 3, 4)) / (3.0 * values.size)

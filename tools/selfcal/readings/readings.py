@@ -6,7 +6,7 @@ None of it needs a fit. `identify` and `diagnose` look at it once, at the record
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -17,12 +17,12 @@ from scipy.ndimage import uniform_filter1d
 from scipy.special import kl_div, log_ndtr, ndtr, ndtri_exp
 
 from selfcal.base.grid import Array, Mask, Rows, block_means, equal_runs, noise_of, runs
-from selfcal.logs.recording import Column, Recording
+from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import CHANGED_LEAST, ELSEWHERE, PIECE, PIECES, UNEVEN, Cells, Misread
-from selfcal.readings.held import Held, Slower, held, slower
+from selfcal.readings.held import Held, Slower, held, repeats_of, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import MOST, Recurring, is_limit, recurring_of
 from selfcal.readings.misread import misread_of, spans_of
@@ -213,9 +213,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if stuck.any():
         sound = np.where(stuck, np.nan, sound)
     stretches = tuple(slower(sound))
-    repeats = (
-        np.isin(np.arange(values.size), np.concatenate([stretch.rows for stretch in stretches])) if stretches else none
-    )
+    repeats = repeats_of(stretches, values.size)
     left_out = lost | stuck | repeats
     values = np.where(left_out, np.nan, values) if left_out.any() else values
     moved, moving, time = moves_of(recording).get(axis), none.copy(), recording.time_s
@@ -299,27 +297,31 @@ def _regridded(recording: Recording, time: Array, rows: Sequence[int], intervals
     size = np.concatenate(sizes)
     used = np.bincount(index, minlength=first)
     whole = np.flatnonzero(used == size)
-    columns = {
-        name: column
-        if column.clock is not None
-        else Column(name, column.unit, np.bincount(index, column.values, minlength=first)[whole] / used[whole])
-        for name, column in recording.columns.items()
-    }
     missing = np.diff(whole, prepend=-1) - 1
     missing[0] = 0
-    rate = float(f"{1.0 / cell_s:.10g}")
-    moved = _with_moving(recording, np.searchsorted(index, whole), missing, time.size / first)
-    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
+
+    def means(values: Array) -> Array:
+        return np.asarray(np.bincount(index, values, minlength=first)[whole] / used[whole])
+
+    rate_hz = float(f"{1.0 / cell_s:.10g}")
+    return _fewer(recording, rate_hz, means, np.searchsorted(index, whole), missing, time.size / first)
 
 
-def _with_moving(recording: Recording, rows: Rows, missing: Rows, ratio: float) -> dict[str, Any]:
-    """The samples left out for motion of a recording of fewer rows: these `rows` [m] of it, each of `ratio` of its own,
-    and `missing` [m] before each."""
-    if recording.moving_before is None:
-        return {}
-    total = np.cumsum(recording.moving_before)[rows]
-    moved = np.rint(np.diff(total, prepend=total[:1]) / ratio).astype(np.int64)
-    return {"moving_before": np.minimum(moved, missing), "moving": round(recording.moving / ratio)}
+def _fewer(
+    recording: Recording, rate_hz: float, made: Callable[[Array], Array], rows: Rows, missing: Rows, ratio: float
+) -> Recording:
+    """The recording of fewer rows, each `made` of `ratio` of its own from these `rows` [m] on, `missing` [m] before
+    each."""
+    columns = {
+        name: column if column.clock is not None else replace(column, values=made(column.values))
+        for name, column in recording.columns.items()
+    }
+    moved = recording.moving_before
+    if moved is not None:
+        total = np.cumsum(moved)[rows]
+        moved = np.minimum(np.rint(np.diff(total, prepend=total[:1]) / ratio).astype(np.int64), missing)
+    fewer = replace(recording, rate_hz=rate_hz, columns=columns, missing_before=missing, off_grid_s=None)
+    return replace(fewer, moving_before=moved, moving=round(recording.moving / ratio))
 
 
 def _common(intervals: Sequence[float]) -> tuple[int, ...]:
@@ -344,13 +346,8 @@ def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, Hel
     together = each[0] if len(axes) == 1 else _held(recording, axes)
     if together is None or max(ratios) > 1.01 * min(ratios):
         return recording, None
-    columns = {
-        name: column if column.clock is not None else Column(name, column.unit, column.values[together.rows])
-        for name, column in recording.columns.items()
-    }
-    rate, missing = recording.rate_hz / together.ratio, together.missing
-    moved = _with_moving(recording, together.rows, missing, together.ratio)
-    own = replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
+    rows, ratio = together.rows, together.ratio
+    own = _fewer(recording, recording.rate_hz / ratio, lambda values: values[rows], rows, together.missing, ratio)
     return own, together
 
 
@@ -501,21 +498,26 @@ def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tupl
     half = 0.5 * lattice.step if lattice is not None else 0.0
     # A limit at or below the middle of the readings is a lower one.
     middle = 0.5 * (float(y.max()) + float(y.min()))
-    upper = [limit for limit in clipped.limits if limit > middle]
-    lower = [limit for limit in clipped.limits if limit <= middle]
-    at_upper = clipped.limits[upper[0]][rows] if upper else np.zeros(y.size, bool)
-    at_lower = clipped.limits[lower[0]][rows] if lower else np.zeros(y.size, bool)
-    high = upper[0] - half if upper else math.inf
-    low = lower[0] + half if lower else -math.inf
+    at_upper, at_lower, high, low = *np.zeros((2, y.size), bool), math.inf, -math.inf
+    for limit, mask in clipped.limits.items():
+        if limit > middle:
+            at_upper, high = mask[rows], limit - half
+        else:
+            at_lower, low = mask[rows], limit + half
     window = _quiet_window(y)
-    level = np.full(y.size, float(y.mean())) if window >= y.size else uniform_filter1d(y, window, mode="nearest")
+    level = _smooth(y, window)
     sigma = float((y - level).std())
     score, information = y, y
     for _ in range(ITERATIONS):
         # Where there is no limit, one beyond all normal readings has no part in the sums.
         up = np.clip((high - level) / sigma, -4.0, 37.0)
         down = np.clip((low - level) / sigma, -37.0, 4.0)
-        score, second, information = _tobit((y - level) / sigma, up, down, at_upper, at_lower)
+        # About the level, in the noise: the score of the level, the expected square and the expected information.
+        u, p, q = ((y - level) / sigma, *(np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi) for z in (up, down)))
+        above, below = p / ndtr(-up), q / ndtr(down)
+        score = np.where(at_upper, above, np.where(at_lower, -below, u))
+        second = np.where(at_upper, 1.0 + up * above, np.where(at_lower, 1.0 - down * below, u * u))
+        information = ndtr(up) - ndtr(down) - up * p + down * q + p * above + q * below
         known = np.maximum(_smooth(information, window), INFORMATION_LEAST)
         level = _smooth(information * level + sigma * score, window) / known
         level = np.clip(level, low - 4.0 * sigma, high + 4.0 * sigma)
@@ -536,18 +538,6 @@ def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tupl
         ln_p = log_ndtr(-least) + np.log(1.0 - random.random(int(mask.sum())))
         drawn[rows[mask]] = level[mask] - sign * sigma * ndtri_exp(ln_p)
     return working, drawn
-
-
-def _tobit(u: Array, up: Array, down: Array, at_upper: Mask, at_lower: Mask) -> tuple[Array, Array, Array]:
-    """Of readings `u` about their level in units of the noise, with limits `up` and `down`: the score of the level, the
-    expected square, and the expected information of a reading; [n] each."""
-
-    p, q = (np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi) for z in (up, down))
-    above, below = p / ndtr(-up), q / ndtr(down)
-    score = np.where(at_upper, above, np.where(at_lower, -below, u))
-    second = np.where(at_upper, 1.0 + up * above, np.where(at_lower, 1.0 - down * below, u * u))
-    information = ndtr(up) - ndtr(down) - up * p + down * q + p * above + q * below
-    return score, second, information
 
 
 def _smooth(values: Array, window: int) -> Array:

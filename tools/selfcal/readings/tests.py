@@ -6,10 +6,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
 from selfcal.base.grid import Mask
 from selfcal.readings.codes import Misread
+from selfcal.readings.held import repeats_of
 from selfcal.readings.lost_words import Recurring
 from selfcal.readings.readings import Clipped, Readings
 
@@ -28,10 +27,7 @@ def _repeats(readings: Readings) -> Mask | float:
     """Rows of stretches of a lower rate, else the share that repeats throughout."""
     if readings.held is not None:
         return 1.0 - 1.0 / readings.held.ratio
-    repeats = np.zeros(readings.values.size, bool)
-    for stretch in readings.slower:
-        repeats[stretch.rows] = True
-    return repeats
+    return repeats_of(readings.slower, readings.values.size)
 
 
 def _nats(finding: Misread | Recurring | Clipped | None) -> float:
