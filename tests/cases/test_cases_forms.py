@@ -26,7 +26,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, State
 from selfcal.logs.recording import load
 from selfcal.model.file import DEFAULT, Model
-from selfcal.model.forms import curved, formed, slope, variance_of
+from selfcal.model.forms import curved, delayed, formed, made, slope, source_of, variance_of
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -270,14 +270,16 @@ def test_columns_are_as_defined(gaps: bool) -> None:
     rows = np.flatnonzero(keep)
     missing = np.diff(rows, prepend=-1) - 1
     whole = np.interp(np.arange(n), rows, values[rows])
-    assert formed(values[rows], "lag", 9.0, 0.0, dt, missing) == pytest.approx(late(whole, 9.0, dt)[rows], abs=2e-5)
+    first, window = float(values[0]), 32
+    sources = [source_of("lag", 0, 9.0, 0.0, 0.0), source_of("rate", 0, window * dt, 0.0, 0.0)]
+    lagged, rate = made(sources, dt, (values[rows] - first)[:, None], missing).T
+    assert lagged + first == pytest.approx(late(whole, 9.0, dt)[rows], abs=2e-5)
     assert formed(values[rows], "square", about=20.0) == pytest.approx((values[rows] - 20.0) ** 2, rel=1e-6)
     before = np.interp(rows - 12.3 / dt, np.arange(n), whole)
-    assert formed(values[rows], "delay", 12.3, 0.0, dt, missing) == pytest.approx(before)
+    assert delayed(values[rows], 12.3 / dt, missing) == pytest.approx(before)
     assert formed(values[rows], "play", 2.5) == pytest.approx(play(values[rows], 2.5))
-    window = 32
     slope = [np.polyfit(dt * np.arange(window), whole[i - window + 1 : i + 1], 1)[0] for i in rows[rows >= window]]
-    assert formed(values[rows], "rate", window * dt, 0.0, dt, missing)[rows >= window] == pytest.approx(slope, abs=2e-5)
+    assert rate[rows >= window] == pytest.approx(slope, abs=2e-5)
 
 
 @pytest.mark.parametrize(("window_s", "dt"), [(40.0, 1.0), (9.0, 0.3), (0.5, 1.0)])
@@ -331,7 +333,7 @@ def with_regressor(folder: Path, **entry: Any) -> Path:
         ({"form": "square", "knots": [[1, 2], [2, 3]]}, "goes with form: free"),
         ({"form": "free", "knots": [[1, 2], [1, 3]]}, "must rise"),
         ({"form": "free", "knots": [[1, 2], 3]}, "must be a pair"),
-        ({"form": "free", "knots": [[1, 2]]}, "must be a list of 2 to"),
+        ({"form": "free", "knots": [[1, 2]]}, "must be a list of two pairs"),
         ({"form": "rate"}, "'window_s' is missing"),
         ({"lag_s": 10}, "lag_s: goes with form: lag alone"),
         ({"form": "lag", "lag_s": 0}, "lag_s: must be a finite number above 0"),

@@ -453,7 +453,7 @@ def test_held_readings_are_taken_once(ratio: float) -> None:
         asked = (np.arange(count) + random.uniform() + 0.1 * random.uniform(-0.5, 0.5, count)) / ratio
         recording = a_recording(y[np.clip(asked.astype(np.int64), 0, y.size - 1)], 100.0 * ratio)
         inadequate += bool(held.add(recording, float(bias[-1]), math.sqrt(0.04**2 + 1e-4 / 12.0 / 100.0), 4e-3))
-        assert look(recording, "gx", GYRO).held_hz == pytest.approx(100.0, rel=1e-3)
+        assert look(recording, "gx", GYRO).recording.rate_hz == pytest.approx(100.0, rel=1e-3)
     assert inadequate <= case_records(3, 120) // 50
     held.check()
 
@@ -483,7 +483,7 @@ def test_a_logger_a_little_faster_than_the_part(
         recording = a_recording(y[row[kept]], 100.0 * ratio, time - time[0] if stamped else None)
         inadequate += bool(held.add(recording, float(bias[row[-1]]), math.sqrt(0.04**2 + q * q / 12.0 / 100.0), 4e-3))
         found = look(recording, "gx", GYRO)
-        assert found.held_hz == pytest.approx(100.0, rel=2e-3)
+        assert found.recording.rate_hz == pytest.approx(100.0, rel=2e-3)
         # The polls that were lost are one reading each, or a repeat; late polls that miss a reading are fewer.
         assert found.recording.missing_before.sum() <= (lost + 0.1 * jitter + 0.001) * y.size
         if seed == 0:
@@ -506,8 +506,7 @@ def test_repeats_at_no_beat_are_not_adequate_without_a_word(ratio: float) -> Non
         row = (np.cumsum(random.gamma(4.0, 0.25, round(y.size * ratio * 0.9))) / ratio).astype(np.int64)
         recording = a_recording(y[row], 100.0 * ratio)
         assert "held_samples" in Held().add(recording, 0.0, 0.04, 4e-3)
-        found = look(recording, "gx", GYRO).held_hz
-        assert found is not None and found < 100.0
+        assert look(recording, "gx", GYRO).recording.rate_hz < 100.0
 
 
 @pytest.mark.parametrize("kind", ["white", "slow noise", "line", "dead band", "walk", "stuck", "means"])
@@ -547,7 +546,7 @@ def test_one_slow_axis_leaves_the_others_at_their_rate() -> None:
     found = diagnose_record(record, ["gx", "gy"])
     assert not found["gx"].findings
     assert [one.look.cause for one in found["gy"].findings] == ["held_samples"]
-    assert record.readings["gy"].held_hz == pytest.approx(25.0)
+    assert record.readings["gy"].recording.rate_hz == pytest.approx(25.0)
     for one in found.values():
         assert one.state.best.sigma * math.sqrt(0.01) == pytest.approx(0.04 if one is found["gx"] else 0.02, rel=0.1)
 
@@ -701,7 +700,7 @@ def test_clean_records_show_none_of_it() -> None:
             y, time = y[kept], np.round(time[kept] - time[0], 6)
         recording = a_recording(y, rate, time)
         one = look(recording, "gx", GYRO)
-        found += bool(one.intervals) + (one.clipped is not None) + (one.held_hz is not None) + bool(one.changes)
+        found += bool(one.intervals) + (one.clipped is not None) + (one.held is not None) + bool(one.changes)
     assert found <= records // 100
 
 

@@ -570,7 +570,7 @@ def test_a_first_look_that_is_broken_off_says_so(
     save(tmp_path / "log.npz", quiet(16, 10.0, 2100.0, ("gx", "gy")), 10.0)
 
     def stopped_in_the_fit(*_: Any, **__: Any) -> None:
-        ending._state.came, ending._state.came_at = signal.SIGINT, time.monotonic()
+        ending.Held.came, ending.Held.came_at = signal.SIGINT, time.monotonic()
         raise ending.Stopped
 
     for module, name in ((loop.work, "each"), (loop, "_rounds")):

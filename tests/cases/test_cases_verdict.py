@@ -13,7 +13,7 @@ import pytest
 from drifts import fitted, of_one
 from scipy.stats import binom, kurtosistest, norm
 
-from selfcal.adequacy.checks import CHECK_LIMIT, against, kurtosis_at
+from selfcal.adequacy.checks import against, kurtosis_at
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
@@ -23,7 +23,7 @@ from selfcal.diagnosis.verdict import coherence, joined, look_of
 from selfcal.likelihood.state import NET_LEAST, Look, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import LARGEST, SMALLEST, Model
-from selfcal.readings.budget import OF_MODULES, SHARES
+from selfcal.readings.budget import CHECK_LIMIT, OF_MODULES, SHARES
 from selfcal.show import pictures
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

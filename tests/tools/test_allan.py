@@ -29,7 +29,7 @@ from selfcal.adequacy.allan import (
     sampled,
     terms_of,
 )
-from selfcal.adequacy.checks import CHECK_LIMIT, judge
+from selfcal.adequacy.checks import judge
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank.blocks import block_means
 from selfcal.bank.library import Bank
@@ -38,6 +38,7 @@ from selfcal.logs.recording import as_float, save
 from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN, named
 from selfcal.model.tables import make_tables
+from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.show.identification import show
 from selfcal.verbs.identify import identify
 

@@ -21,10 +21,12 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import gammaincinv, ndtri
 
-from selfcal.bank.result import HALF_90, Estimate
-from selfcal.base.grid import runs
+from selfcal.bank.blocks import Blocks
+from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.base.grid import bisected
 from selfcal.model.file import Group
-from selfcal.model.laws import KINDS, Law, named
+from selfcal.model.laws import FORGOTTEN, KINDS, Law, named
+from selfcal.model.tables import Tables
 
 _Floats = NDArray[np.float64]
 
@@ -32,16 +34,12 @@ _Floats = NDArray[np.float64]
 LONGEST = 5
 #: Step in the ln of a parameter for derivatives.
 STEP = 1e-3
-#: Correlation times after which a Gauss-Markov drift is forgotten.
-_FORGOTTEN = 14.0
-#: Least share of S that S - V keeps (curve_of): nearly equal numbers have a small difference.
-_LEAST_LEFT = 0.2
-#: Number of posterior draws of the band.
-_DRAWS = 200
+#: Least share of a variance S that S - V keeps: nearly equal numbers have a small difference.
+LEFT_LEAST = 0.2
+#: Number of draws of a posterior.
+DRAWS = 256
 #: Averaging times of a curve in an octave.
-_PER_OCTAVE = 4
-#: Most stretches without a gap that the deviation of a recording's samples is made from: the longest ones.
-_MOST_STRETCHES = 200
+PER_OCTAVE = 4
 
 
 @dataclass(frozen=True)
@@ -122,7 +120,7 @@ def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
     """Variance of the overlapping Allan variance over windows `whole`, over its mean squared, under `terms`: normal
     readings have Var = 2 / M^2 sum of Cov(u_k, u_l)^2 / 4."""
     count = int(whole.sum())
-    memory = max((_FORGOTTEN / alpha.real for _, alpha in terms.markov), default=0.0)
+    memory = max((FORGOTTEN / alpha.real for _, alpha in terms.markov), default=0.0)
     lags = min(whole.size, 2 * m + 2 + math.ceil(memory))
     if whole.all():
         pairs = count - np.arange(lags, dtype=float)
@@ -137,33 +135,32 @@ def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
 @dataclass(frozen=True)
 class Fit:
     """The curve of a law whose parameters were estimated from a record, at `m` [t] readings: `allan_variance` [t] at
-    the `terms` of the estimate, `jacobian` [d, t] of its logarithm in the ln of each parameter, `ln_estimate` [d], and
-    `covariance` [d, d] of those logarithms."""
+    the estimate, the `variance` [t] of its logarithm, and the `covariance` [d, d] of the logarithms of the parameters.
+    `terms_at`: the terms at other logarithms of the parameters."""
 
+    terms_at: Callable[[_Floats], Terms]
     terms: Terms
     allan_variance: _Floats
-    jacobian: _Floats
-    ln_estimate: _Floats
+    variance: _Floats
     covariance: _Floats
 
-    @property
-    def variance(self) -> _Floats:
-        """Variance of the curve's logarithm [t] by the estimate."""
-        return np.asarray(np.einsum("dt,de,et->t", self.jacobian, self.covariance, self.jacobian))
 
-
-def _around(
-    of: Law, ln_estimate: _Floats, dt_s: float, white: float, block: int
-) -> tuple[Callable[[_Floats], Terms], list[tuple[Terms, Terms]]]:
-    """The terms at given ln parameters, and those a step to either side of `ln_estimate` in each."""
+def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floats], Terms]:
+    """The terms of a law at given ln parameters. `white` multiplies the white noise's variance."""
 
     def terms_at(ln_theta: _Floats) -> Terms:
         theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
         terms = terms_of(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
-    steps = np.eye(ln_estimate.size) * STEP
-    return terms_at, [(terms_at(ln_estimate + step), terms_at(ln_estimate - step)) for step in steps]
+    return terms_at
+
+
+def _slopes(terms_at: Callable[[_Floats], Terms], ln_theta: _Floats, of: Callable[[Terms], _Floats]) -> _Floats:
+    """Derivatives [d, t] of the logarithm of a curve `of` terms [t] in each ln parameter."""
+    steps = np.eye(ln_theta.size) * STEP
+    sides = [(of(terms_at(ln_theta + step)), of(terms_at(ln_theta - step))) for step in steps]
+    return np.array([np.log(up / down) for up, down in sides]) / (2.0 * STEP)
 
 
 def information_of(
@@ -172,11 +169,10 @@ def information_of(
     """Information [d, d] of `n` readings every `dt_s` on ln of each parameter.
 
     Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum."""
-    ln_estimate = np.log([parameters[name] for name in of.parameters])
-    _, sides = _around(of, ln_estimate, dt_s, white, block)
     k = np.unique(np.rint(np.geomspace(1.0, n / 2.0, 1000)))
     omega = 2.0 * math.pi * k / n
-    slopes = np.array([np.log(up.spectrum(omega) / down.spectrum(omega)) for up, down in sides]) / (2.0 * STEP)
+    ln_estimate = np.log([parameters[name] for name in of.parameters])
+    slopes = _slopes(_terms_at(of, dt_s, white, block), ln_estimate, lambda terms: terms.spectrum(omega))
     return np.asarray((slopes * np.gradient(k)) @ slopes.T, np.float64)
 
 
@@ -188,19 +184,20 @@ def fit_of(
     n: float,
     m: _Floats,
     white: float = 1.0,
-    block: int = 1,
+    *,
+    block: int,
 ) -> Fit:
     """The curve at `parameters` that `n` readings have determined, with the group's priors. `white` multiplies the
     white noise's variance. A reading is the mean of `block` samples."""
     of = group.laws[law]
     ln_estimate = np.log([parameters[name] for name in of.parameters])
-    information = information_of(of, parameters, dt_s, n, white, block)
     prior = [group.priors[name].ln_sd ** -2 for name in of.parameters]
-    terms_at, sides = _around(of, ln_estimate, dt_s, white, block)
-    jacobian = np.array([np.log(up.allan_variance(m) / down.allan_variance(m)) for up, down in sides]) / (2.0 * STEP)
-    covariance = np.linalg.inv(information + np.diag(prior))
+    covariance = np.linalg.inv(information_of(of, parameters, dt_s, n, white, block) + np.diag(prior))
+    terms_at = _terms_at(of, dt_s, white, block)
+    jacobian = _slopes(terms_at, ln_estimate, lambda terms: terms.allan_variance(m))
+    variance = np.asarray(np.einsum("dt,de,et->t", jacobian, covariance, jacobian))
     terms = terms_at(ln_estimate)
-    return Fit(terms, terms.allan_variance(m), jacobian, ln_estimate, np.asarray(covariance, np.float64))
+    return Fit(terms_at, terms, terms.allan_variance(m), variance, np.asarray(covariance, np.float64))
 
 
 def lengths(n: int, per_octave: int = 1) -> NDArray[np.int64]:
@@ -250,18 +247,8 @@ class Curve:
         return self.model * np.sqrt([ratio_at(deviations, variance) for variance in self.left.tolist()])
 
 
-def curve_of(
-    y: _Floats,
-    dt_s: float,
-    law: str,
-    estimates: Mapping[str, Estimate],
-    group: Group,
-    *,
-    white: float = 1.0,
-    half_life_s: float = 0.0,
-    block: int = 1,
-) -> Curve | None:
-    """Readings `y` every `dt_s` (NaN: missing), means of `block` samples, compared with `law` at its posterior medians.
+def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> Curve | None:
+    """The means of `blocks` (NaN: missing), compared with the most probable law at its posterior medians.
 
     None if there are too few readings.
 
@@ -272,23 +259,28 @@ def curve_of(
     """
     # With forgetting the posterior rests on the last readings. Its sums, weighted by e^(-age / w), have the variance of
     # 2 w readings and 1 - e^-2 of their weight on the last 2 w: Var = S + V - 2 (1 - e^-2) V.
-    memory, shared = math.ceil(2.0 * half_life_s / math.log(2.0) / dt_s), 1.0
+    y, dt_s = blocks.mean, tables.dt_s
+    white = float(blocks.r[np.isfinite(y)].mean())
+    memory, shared = math.ceil(2.0 * tables.half_life_s / math.log(2.0) / dt_s), 1.0
     if 0 < memory < y.size:
         y, shared = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
     n = int(np.isfinite(y).sum())
     if n < 2 * LONGEST:
         return None
     y = y - float(np.nanmean(y))
-    rows = [(int(m), *overlapping(y, int(m))) for m in lengths(n, _PER_OCTAVE)]
+    rows = [(int(m), *overlapping(y, int(m))) for m in lengths(n, PER_OCTAVE)]
     rows = [entry for entry in rows if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
     m = np.array([entry[0] for entry in rows], float)
     recorded = np.array([entry[1] for entry in rows])
+    estimates = result.parameters[result.best]
     medians = {name: estimate.median for name, estimate in estimates.items()}
-    fit = fit_of(law, medians, group, dt_s, n, m, white, block)
+    fit = fit_of(result.best, medians, group, dt_s, n, m, white, block=tables.block)
     own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in rows])
-    left = np.maximum(own - shared * fit.variance, _LEAST_LEFT * own)
+    left = np.maximum(own - shared * fit.variance, LEFT_LEAST * own)
     ratio = recorded / fit.allan_variance
-    low, high = _band(law, estimates, fit, group, dt_s, m, white, block)
+    draws = np.log(np.column_stack([*posterior_draws(estimates, fit.covariance).values()]))
+    curves = [fit.terms_at(ln_theta).allan_variance(m) for ln_theta in draws]
+    low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
     return Curve(
         m * dt_s,
         np.sqrt(recorded),
@@ -302,37 +294,15 @@ def curve_of(
     )
 
 
-def _band(
-    law: str,
-    estimates: Mapping[str, Estimate],
-    fit: Fit,
-    group: Group,
-    dt_s: float,
-    m: _Floats,
-    white: float,
-    block: int,
-) -> tuple[_Floats, _Floats]:
-    """5 % and 95 % limits of the model's deviation over posterior draws."""
-    draws = posterior_draws(estimates, fit.covariance, _DRAWS)
-    curves = []
-    for row in zip(*draws.values(), strict=True):
-        terms = terms_of(group.laws[law], dict(zip(draws, map(float, row), strict=True)), dt_s, block)
-        curves.append(replace(terms, variance=terms.variance * white).allan_variance(m))
-    low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
-    return low, high
-
-
-def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats, count: int) -> dict[str, _Floats]:
-    """Values [count] of each parameter of a law: its own median and quantiles, and between parameters the correlation
+def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats) -> dict[str, _Floats]:
+    """Values [DRAWS] of each parameter of a law: its own median and quantiles, and between parameters the correlation
     of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive recurrence:
     Roberts 2018), so that quantiles of functions of them are smooth."""
     chosen = list(estimates.values())
     sd = np.sqrt(np.diag(covariance))
     d = len(chosen)
-    root = 2.0  # of x^(d+1) = x + 1
-    for _ in range(50):
-        root = (1.0 + root) ** (1.0 / (d + 1))
-    even = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, d + 1))) % 1.0
+    root, _ = bisected(lambda x: x ** (d + 1) >= x + 1.0, 1.0, 2.0)
+    even = (0.5 + np.outer(np.arange(1, DRAWS + 1), root ** -np.arange(1.0, d + 1))) % 1.0
     z = ndtri(even) @ np.linalg.cholesky(covariance / np.outer(sd, sd)).T
     middle = np.log([e.median for e in chosen])
     up = (np.log([e.q95 for e in chosen]) - middle) / HALF_90
@@ -361,26 +331,15 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     """At `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing
     ones each.
 
-    A gap parts the record: each stretch without one has its deviation, and theirs are pooled by their number of terms.
-    The interval is that of chi-square with the degrees of freedom of the power law that has the curve's slope.
+    No window has a gap in it. The interval is that of chi-square with the degrees of freedom of the power law that has
+    the curve's slope.
     """
     values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
-    broken = np.isnan(values)
-    starts, stops = np.array(runs(~broken), np.int64).reshape(-1, 2).T
-    inner = np.flatnonzero((missing_before > 0) & ~broken)
-    cuts = np.setdiff1d(inner, starts)
-    starts, stops = np.sort(np.concatenate([starts, cuts])), np.sort(np.concatenate([stops, cuts]))
-    longest = np.argsort(starts - stops, kind="stable")[:_MOST_STRETCHES]
-    n = int((stops - starts)[longest].sum())
-    total, terms = np.zeros(m.size), np.zeros(m.size)
-    for start, stop in zip(starts[longest].tolist(), stops[longest].tolist(), strict=True):
-        stretch = values[start:stop] - values[start:stop].mean()
-        for k in np.flatnonzero(2 * m < stretch.size).tolist():
-            variance, windows = overlapping(stretch, int(m[k]))
-            total[k] += windows.size * variance
-            terms[k] += windows.size
-    kept = np.flatnonzero((terms >= m) & (total > 0.0))
-    m, deviation = m[kept], np.sqrt(total[kept] / terms[kept])
+    n = int(np.isfinite(values).sum())
+    parted = np.insert(values - np.nanmean(values), np.flatnonzero(missing_before), np.nan)
+    variances, windows = zip(*(overlapping(parted, length) for length in m.tolist()), strict=True)
+    kept = (np.array(variances) > 0.0) & (np.array([whole.sum() for whole in windows]) >= m)
+    m, deviation = m[kept], np.sqrt(np.array(variances)[kept])
     slope = np.gradient(np.log(deviation), np.log(m)) if m.size > 1 else np.full(m.size, -0.5)
     powers = np.clip(np.rint(2.0 * slope), -1.0, 1.0)
     half = np.array([0.5 * freedom_of(power, length, n) for power, length in zip(powers, m.tolist(), strict=True)])

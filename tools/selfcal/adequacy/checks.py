@@ -11,27 +11,22 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from selfcal.adequacy.allan import Curve, curve_of, ratio_at, terms_of
+from selfcal.adequacy.allan import LEFT_LEAST, Curve, curve_of, ratio_at, terms_of
 from selfcal.bank.blocks import FEWEST, MOST_DENSE, Blocks
+from selfcal.bank.priors import rounded
 from selfcal.bank.result import AxisResult, Estimate
+from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import CHANGE
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
-from selfcal.readings.budget import P_LOOK
-from selfcal.readings.codes import Misread
+from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.readings.readings import Readings
 from selfcal.readings.tests import TESTS
 
-#: Largest deviation of a check's statistic that passes, sd: 4.
-CHECK_LIMIT = -float(ndtri(0.5 * P_LOOK))
 #: Largest distance of a part from its batch that passes, sd: one law's two parameters exceed it in 1 of 1000 parts.
 BATCH_LIMIT = 3.5
-#: Least prior probability of a law of the batch.
-BATCH_LAW = 0.1
-#: Least share of the prior's variance by which a record and the prior are compared.
-LEFT_LEAST = 0.1
 #: Largest share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at
 #: 0.9, where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84
@@ -63,9 +58,8 @@ def judge(
     columns that may act on the axis. Without a recording nothing is held against the drift."""
     from selfcal.adequacy.drift_checks import drift_checks
 
-    law = result.best
-    medians = {name: estimate.median for name, estimate in result.parameters[law].items()}
-    if blocks.mean.size > MOST_DENSE or not all(math.isfinite(value) for value in medians.values()):
+    sound = all(math.isfinite(estimate.median) for estimate in result.parameters[result.best].values())
+    if blocks.mean.size > MOST_DENSE or not sound:
         return Judged({}, None)
     if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
         return Judged({}, None)
@@ -73,16 +67,7 @@ def judge(
     if used:
         z = blocks.z[:, used] - np.array([tables.regressors[k].reference for k in used])
         left = replace(blocks, mean=blocks.mean - z @ coefficients_of(result))
-    curve = curve_of(
-        left.mean,
-        tables.dt_s,
-        law,
-        result.parameters[law],
-        group,
-        white=float(blocks.r[np.isfinite(blocks.mean)].mean()),
-        half_life_s=tables.half_life_s,
-        block=tables.block,
-    )
+    curve = curve_of(left, tables, group, result)
     checks = drift_check(tables, group, result)
     if all(check["passed"] for check in checks.values()):  # else the others would show the same
         checks |= batch_check(tables, group, result) | innovation_checks(blocks, tables, group, result, list(used))
@@ -131,9 +116,9 @@ def with_rate(
     alpha = result.parameters[result.best].get("alpha")
     if white > walk:
         alike_hz = rate_hz * math.sqrt(max(walk, 0.0) / white)
-        rates["decimate_hz"] = float(f"{min(rate_hz, max(2.0 / tables.dt_s, alike_hz)):.2g}")
+        rates["decimate_hz"] = rounded(min(rate_hz, max(2.0 / tables.dt_s, alike_hz)))
     elif alpha is not None and values.size * alpha.median > FEWEST * CORNERS * rate_hz:
-        rates["decimate_hz"] = float(f"{alpha.median / CORNERS:.2g}")
+        rates["decimate_hz"] = rounded(alpha.median / CORNERS)
     return replace(judged, checks={**judged.checks, "drift_in_average": {**judged.checks["drift_in_average"], **rates}})
 
 
@@ -148,7 +133,7 @@ def batch_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     for hypothesis in tables.hypotheses:
         own = {name: group.priors[name] for name in hypothesis.law.parameters}
         priors = {name: prior for name, prior in own.items() if prior.law == "log_normal"}
-        if priors.keys() - {"N"} and hypothesis.ln_probability >= math.log(BATCH_LAW):
+        if priors.keys() - {"N"} and hypothesis.ln_probability >= math.log(LIKELY):
             estimates = result.parameters[hypothesis.name]
             distances.append(max(_distance(estimates[name], prior) for name, prior in priors.items()))
     if not distances:
@@ -163,11 +148,6 @@ def _distance(estimate: Estimate, prior: Prior) -> float:
         return math.inf
     left = max(prior.ln_sd**2 - estimate.ln_sd**2, LEFT_LEAST * prior.ln_sd**2)
     return abs(math.log(estimate.median / prior.median)) / math.sqrt(left)
-
-
-def _of_map(found: Misread) -> dict[str, Any]:
-    also = {"also_possible": list(found.also_possible)} if found.also_possible else {}
-    return {"kind": found.kind, "undone": found.undone is not None, **also}
 
 
 def with_readings(
@@ -194,7 +174,7 @@ def with_readings(
         checks["lattice"] = {**outcome, "step": lattice.step * factor, "distinct": lattice.distinct, **white}
     start_s = readings.recording.start_s
     more: dict[str, Callable[[], dict[str, Any]]] = {
-        "misread": lambda: _of_map(readings.misread) if readings.misread is not None else {},
+        "misread": lambda: readings.misread.entry if readings.misread is not None else {},
         "saturation": lambda: {"at": readings.clipped and readings.clipped.limit * factor},
         "outliers": lambda: {"at": readings.recurring and readings.recurring.value * factor},
         "stuck": lambda: {"intervals": [[a + start_s, b + start_s] for a, b in readings.intervals]},

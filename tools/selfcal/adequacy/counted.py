@@ -8,16 +8,11 @@ noise is the law `moving_average` (diagnosis/causes/quantization_noise.py).
 from __future__ import annotations
 
 import math
-from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from selfcal.adequacy.one_over_f import Beside, weigh_law
+from selfcal.adequacy.one_over_f import Beside, Rerun, weigh_law
 from selfcal.bank.result import AxisResult
-from selfcal.model.file import Group, Prior
+from selfcal.model.file import Prior
 from selfcal.model.laws import RATIO_LIMITS
-from selfcal.model.tables import Tables
 from selfcal.readings.lattice import Lattice
 
 COUNTED = "moving_average"
@@ -29,27 +24,13 @@ SURE_ODDS = 100.0
 MATTERS = 0.5
 
 
-def most_of(lattice: Lattice, rate_hz: float) -> float:
-    """Q of increments of the lattice's step: the step's white remainders."""
-    return lattice.step / (rate_hz * math.sqrt(12.0))
-
-
-def weigh_counted(
-    lattice: Lattice | None,
-    result: AxisResult,
-    tables: Tables,
-    group: Group,
-    samples: NDArray[np.floating[Any]],
-    missing_before: NDArray[np.integer[Any]],
-    columns: NDArray[np.floating[Any]] | None = None,
-    mask: int = 0,
-    offset: float = 0.0,
-) -> Beside | None:
-    """White noise with quantization noise on the readings of the one axis of `tables`, where its lattice makes that
-    possible and N would change. None elsewhere, and where the remainders are not white."""
+def weigh_counted(lattice: Lattice | None, result: AxisResult, rerun: Rerun) -> Beside | None:
+    """White noise with quantization noise, where the lattice of the readings makes that possible and N would change.
+    None elsewhere, and where the remainders are not white."""
+    tables = rerun.tables
     if lattice is None or lattice.too_coarse_over(tables.dt_s):
         return None
-    N, most = result.parameters[result.best]["N"].median, WIDER * most_of(lattice, tables.rate_hz)
+    N, most = result.parameters[result.best]["N"].median, WIDER * lattice.step / (tables.rate_hz * math.sqrt(12.0))
     share = (most / N) ** 2 / tables.dt_s  # Q^2 / (N^2 dt): the share of N that it may be
     if not share > MATTERS / math.sqrt(2.0 * result.n):
         return None
@@ -57,4 +38,4 @@ def weigh_counted(
     least = max(RATIO_LIMITS[0], 1.0 / math.sqrt(1.0 + 4.0 * share / max(1.0 - 2.0 * share / WIDER**2, 0.01)))
     prior = {"spectral_ratio": Prior("log_uniform", least, 1.0)}
     odds = SURE_ODDS * len(tables.hypotheses) if lattice.carried else 1.0
-    return weigh_law(COUNTED, prior, odds, tables, group, samples, missing_before, columns, mask, offset)
+    return weigh_law(COUNTED, prior, odds, rerun)

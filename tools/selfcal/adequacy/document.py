@@ -51,23 +51,7 @@ class Identified:
         return not against(self.judged.checks)
 
 
-@dataclass(frozen=True)
-class Telemetry:
-    """What a document says of samples that only a module has seen, as of a `Recording`. None: the module does not state
-    it. `duration_s` is the time of the last report."""
-
-    path: str
-    rate_hz: float
-    samples: int | None
-    duration_s: float
-    start_s: float = 0.0
-    since_power_on_s: float | None = None
-    paths: tuple[Path, ...] = ()
-    options: tuple[tuple[str, str], ...] = ()
-    notes: tuple[str, ...] = ()
-
-
-def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
+def recording_entry(recording: Recording) -> dict[str, Any]:
     """The entry of a recording in a document."""
     return {
         "path": str(recording.path),
@@ -79,7 +63,7 @@ def recording_entry(recording: Recording | Telemetry) -> dict[str, Any]:
         **({"paths": [str(path) for path in recording.paths]} if recording.paths else {}),
         **({"options": [list(option) for option in recording.options]} if recording.options else {}),
         **({"notes": list(recording.notes)} if recording.notes else {}),
-        **(_of_file(recording) if isinstance(recording, Recording) else {}),
+        **_of_file(recording),
     }
 
 
@@ -107,31 +91,34 @@ def as_typed(recording: Mapping[str, Any]) -> str:
 
 
 def to_document(
-    recording: Recording | Telemetry,
+    recording: Recording | Mapping[str, Any],
     axes: Mapping[str, Identified | UserError],
     *,
     all_failed: Path | str | None = None,
 ) -> dict[str, Any]:
-    """The JSON of the contract. An axis without a result has its reason in its place: {"error": ...}. Raises UserError
-    if no axis has a result; the reasons are then written to `all_failed`."""
+    """The JSON of the contract, of a recording, or of its entry where a module alone has seen the samples.
+
+    An axis without a result has its reason in its place: {"error": ...}. Raises UserError if no axis has a result; the
+    reasons are then written to `all_failed`."""
+    entry = recording_entry(recording) if isinstance(recording, Recording) else dict(recording)
     reasons = {
-        name: str(axis).removeprefix(f"{recording.path}: ")
-        for name, axis in axes.items()
-        if isinstance(axis, UserError)
+        name: str(axis).removeprefix(f"{entry['path']}: ") for name, axis in axes.items() if isinstance(axis, UserError)
     }
     if len(reasons) == len(axes):
-        columns: dict[str, list[str]] = {}
+        failed: dict[str, list[str]] = {}
         for name, reason in reasons.items():
-            columns.setdefault(reason, []).append(name)
+            failed.setdefault(reason, []).append(name)
         said = "; ".join(
-            f"column{'s' if len(names) > 1 else ''} {', '.join(names)}: {reason}" for reason, names in columns.items()
+            f"column{'s' if len(names) > 1 else ''} {', '.join(names)}: {reason}" for reason, names in failed.items()
         )
         if all_failed is not None:
-            write_json(of_errors(SCHEMA, recording, reasons), all_failed)
-        raise UserError(f"{recording.path}: {said or 'no axis has a result'}")
+            write_json(of_errors(SCHEMA, entry, reasons), all_failed)
+        raise UserError(f"{entry['path']}: {said or 'no axis has a result'}")
+    columns = recording.columns if isinstance(recording, Recording) else {}
+    own_hz = {name: column.clock.rate_hz for name, column in columns.items() if column.clock is not None}
     return {
         "schema": SCHEMA,
-        "recording": recording_entry(recording),
+        "recording": entry,
         "axes": {
             name: {"error": reasons[name]}
             if isinstance(axis, UserError)
@@ -144,7 +131,7 @@ def to_document(
                 "bias_now": {"mean": axis.result.bias_mean, "sd": axis.result.bias_sd, "unit": axis.unit},
                 "samples_kept_out": dict(axis.kept_out),
                 "adequate": axis.adequate,
-                **_own_rate(recording, name),
+                **({"rate_hz": own_hz[name]} if name in own_hz else {}),
                 "checks": {key: dict(check) for key, check in axis.judged.checks.items()},
                 "allan": _allan(axis),
                 **regressors_entry(axis.scored),
@@ -156,16 +143,9 @@ def to_document(
     }
 
 
-def of_errors(schema: str, recording: Recording | Telemetry, reasons: Mapping[str, str]) -> dict[str, Any]:
+def of_errors(schema: str, entry: Mapping[str, Any], reasons: Mapping[str, str]) -> dict[str, Any]:
     """The document of a recording no axis of which has a result."""
-    axes = {name: {"error": reason} for name, reason in reasons.items()}
-    return {"schema": schema, "recording": recording_entry(recording), "axes": axes}
-
-
-def _own_rate(recording: Recording | Telemetry, name: str) -> dict[str, float]:
-    """The sampling rate of an axis that has its own."""
-    own = recording.columns[name].clock if isinstance(recording, Recording) else None
-    return {} if own is None else {"rate_hz": own.rate_hz}
+    return {"schema": schema, "recording": entry, "axes": {name: {"error": why} for name, why in reasons.items()}}
 
 
 def parameters_entry(axis: Identified) -> dict[str, Any]:
@@ -218,12 +198,8 @@ def _allan(axis: Identified) -> dict[str, Any] | None:
         "adequate_to": (curve.within(limit) * factor).tolist(),
     }
     if sampled is not None:
-        entry["samples"] = {
-            "tau_s": sampled.tau_s.tolist(),
-            "deviation": (sampled.deviation * factor).tolist(),
-            "q05": (sampled.q05 * factor).tolist(),
-            "q95": (sampled.q95 * factor).tolist(),
-        }
+        scaled = {key: (getattr(sampled, key) * factor).tolist() for key in ("deviation", "q05", "q95")}
+        entry["samples"] = {"tau_s": sampled.tau_s.tolist(), **scaled}
     return entry
 
 

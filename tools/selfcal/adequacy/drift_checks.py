@@ -26,10 +26,11 @@ from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables
+from selfcal.readings.budget import CLEARLY
 
-#: Sizes of the drift that are tried with a column, as ln of a divisor; and least gain of a smaller size, nats: noise
-#: that axes share is no drift.
-SIZES, CLEARLY = (0.0, 0.7, *SMALLER), 3.0
+#: Sizes of the drift that are tried with a column, as ln of a divisor. A smaller one must be clearly better: noise that
+#: axes share is no drift.
+SIZES = (0.0, 0.7, *SMALLER)
 #: Fewest means that are looked at: fewer show no drift.
 FEWEST = 60
 #: Smoothing, lags and the window of a rate, s: a channel's own noise hides its slow change.
@@ -140,8 +141,6 @@ def _forms(means: Array, state: State, side: bool) -> Iterator[tuple[str, Array]
 
 def _means(values: Array, recording: Recording, begin: int, block: int, count: int) -> Array:
     """Means [count] of a column over whole blocks of the even grid from the place `begin` on, NaN where it has none."""
-    if not recording.missing_before.any():
-        return block_means(values[begin : begin + count * block], block)
     place = recording.clock.place - recording.missing_before[0] - begin
     index = np.floor_divide(place, block)
     kept = (index >= 0) & (index < count)

@@ -14,7 +14,7 @@ from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
 from selfcal.adequacy.checks import against, coefficients_of, judge, with_rate, with_readings
 from selfcal.adequacy.counted import weigh_counted
 from selfcal.adequacy.document import Identified
-from selfcal.adequacy.one_over_f import weigh, with_white
+from selfcal.adequacy.one_over_f import Rerun, weigh, with_white
 from selfcal.adequacy.summary import halved_after, summarize
 from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.bank.result import AxisResult, in_unit
@@ -85,7 +85,9 @@ def identify_axis(
         answer = scored.result
     others, mask = may_act(model, fed.recording, name), mask_of(fed.regressors, fed.choices[best])
     identified = concluded(fed, unit, others, results[best], mask, inside, answer, scored, draw=draw)
-    return replace(identified, kept_out=kept_out_of(fed.blocks, fed.recording, int(fed.readings.moving.sum())))
+    moved = fed.recording.moving + int(fed.readings.moving.sum())
+    moving = {"moving": moved} if moved else {}
+    return replace(identified, kept_out={**fed.blocks.kept_out, "missing": fed.recording.lost, **moving})
 
 
 def concluded(
@@ -113,8 +115,8 @@ def concluded(
     judged = with_readings(judged, readings, group, unit, tables.dt_s, as_fed=as_fed)
     explained = fed.columns[:, used].astype(np.float64) @ coefficients_of(result) if used else 0.0
     missing, columns = fed.recording.missing_before, fed.columns if fed.regressors else None
-    again = tables, group, fed.samples, missing, columns, mask, fed.offset
-    beside, counted = weigh(*again), weigh_counted(readings.lattice, result, *again)
+    rerun = Rerun(tables, group, fed.samples, missing, columns, mask, fed.offset)
+    beside, counted = weigh(rerun), weigh_counted(readings.lattice, result, rerun)
     more_laws = [law.laws(answer.probability) for law in (beside, counted) if law is not None]
     return Identified(
         unit,
@@ -237,12 +239,6 @@ def may_act(model: Model, recording: Recording, name: str) -> list[str]:
     if model.hidden_input is not None and name in model.hidden_input.loadings:
         candidates -= model.hidden_input.loadings.keys()
     return [column for column in recording.columns if column in candidates]
-
-
-def kept_out_of(blocks: Blocks, recording: Recording, moved: int) -> dict[str, int]:
-    """Samples that were not used, by reason; `moved` of them for motion that the readings show."""
-    moving = {"moving": recording.moving + moved} if recording.moving + moved else {}
-    return {**blocks.kept_out, "missing": recording.lost, **moving}
 
 
 def _used(mask: int) -> list[int]:

@@ -34,25 +34,20 @@ FLICKER = "flicker"
 SURE = 0.98
 #: Frequency at which the white noise is the rest of the spectrum, radians a bank interval.
 _OMEGA = 2.0 * math.pi / 3.0
-#: Images of the bank's rate that count: more change the density by 1e-4.
-_IMAGES = 100
 #: Least share of the law's own white noise that is left.
 _LEAST = 1e-3
 #: Nodes of rho and of alpha.
 _NODES = (24, 20)
 #: Factor by which B's limits are wider than those of a sigma_m about a known batch, either way.
 _WIDER = 10.0
-#: Number of draws of a posterior.
-_DRAWS = 1024
 
 
 def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
     """[k], s: what 1/f noise of B = 1 has more than the law `flicker` of B = 1 and `alpha` [k] at a third of the bank's
     rate, in means of `block` readings every `dt_s`. The readings have nothing above half their own rate."""
-    points = min(block, _IMAGES)
-    image = np.abs(_OMEGA + 2.0 * math.pi * np.arange(-points, points + 1))
-    image = image[image < math.pi * points]
-    passed = (np.sin(0.5 * image) / (points * np.sin(0.5 * image / points))) ** 2
+    image = np.abs(_OMEGA + 2.0 * math.pi * np.arange(-block, block + 1))
+    image = image[image < math.pi * block]
+    passed = (np.sin(0.5 * image) / (block * np.sin(0.5 * image / block))) ** 2
     whole = float((passed / image).sum())  # 1 / (2 pi f), f per interval
     law = NAMED[FLICKER]
     own = [
@@ -83,7 +78,7 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
     if not estimates or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
         return result
     fit = fit_of(FLICKER, medians, group, dt_s, n, np.ones(1), block=block)
-    draws = posterior_draws(estimates, fit.covariance, _DRAWS)
+    draws = posterior_draws(estimates, fit.covariance)
     white = white_of(draws, dt_s, block)
     low, middle, high = np.quantile(white, (0.05, 0.5, 0.95)).tolist()
     identified = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
@@ -111,20 +106,25 @@ class Beside:
         return {**{law: (1.0 - self.probability) * p for law, p in probability.items()}, self.law: self.probability}
 
 
-def weigh(
-    tables: Tables,
-    group: Group,
-    samples: NDArray[np.floating[Any]],
-    missing_before: NDArray[np.integer[Any]],
-    columns: NDArray[np.floating[Any]] | None = None,
-    mask: int = 0,
-    offset: float = 0.0,
-) -> Beside | None:
-    """The law `flicker` on the readings of the one axis of `tables`, with the prior odds of an average law of these.
+@dataclass(frozen=True)
+class Rerun:
+    """What an engine takes of the one axis of `tables`, for another law: `samples` [n] less `offset` (see Bank) after
+    `missing_before` [n], and `columns` [n, p] of which those of `mask` are in use."""
 
-    `mask`: the columns in use. `offset`: see Bank. None where the tables have the law, no room for it, or no result.
-    """
-    times = max(1, math.ceil((samples.size + int(missing_before.sum())) / (tables.block * MOST_INTERVALS)))
+    tables: Tables
+    group: Group
+    samples: NDArray[np.floating[Any]]
+    missing_before: NDArray[np.integer[Any]]
+    columns: NDArray[np.floating[Any]] | None = None
+    mask: int = 0
+    offset: float = 0.0
+
+
+def weigh(rerun: Rerun) -> Beside | None:
+    """The law `flicker` with the prior odds of an average law of the tables. None where the tables have the law, no
+    room for it, or no result."""
+    tables, group, samples = rerun.tables, rerun.group, rerun.samples
+    times = max(1, math.ceil((samples.size + int(rerun.missing_before.sum())) / (tables.block * MOST_INTERVALS)))
     tables = replace(tables, dt_s=times * tables.dt_s, block=times * tables.block)
     drift = group.priors["sigma_m"]
     wider = _WIDER if drift.law == "log_normal" else 1.0
@@ -132,24 +132,14 @@ def weigh(
         "B": Prior("log_uniform", drift.min / wider, drift.max * wider),
         "alpha": Prior("log_uniform", *(limit / tables.dt_s for limit in ABOUT_N["alpha"][:2])),
     }
-    return weigh_law(FLICKER, own, 1.0, tables, group, samples, missing_before, columns, mask, offset)
+    return weigh_law(FLICKER, own, 1.0, replace(rerun, tables=tables))
 
 
-def weigh_law(
-    name: str,
-    priors: Mapping[str, Prior],
-    odds: float,
-    tables: Tables,
-    group: Group,
-    samples: NDArray[np.floating[Any]],
-    missing_before: NDArray[np.integer[Any]],
-    columns: NDArray[np.floating[Any]] | None = None,
-    mask: int = 0,
-    offset: float = 0.0,
-) -> Beside | None:
+def weigh_law(name: str, priors: Mapping[str, Prior], odds: float, rerun: Rerun) -> Beside | None:
     """A named law of two drift parameters as weigh() has it, with `priors` of its own. `odds`: over an average law."""
     from selfcal.bank.library import Bank
 
+    tables, group = rerun.tables, rerun.group
     count = len(tables.hypotheses)
     if count >= MOST_HYPOTHESES or any(hypothesis.name == name for hypothesis in tables.hypotheses):
         return None
@@ -159,10 +149,10 @@ def weigh_law(
     one_more = HypothesisTable(name, law, math.log(odds / (count + odds)), rho, alpha, (priors_of(own, name),))
     share = math.log(count / (count + odds))
     others = (replace(hypothesis, ln_probability=hypothesis.ln_probability + share) for hypothesis in tables.hypotheses)
-    bank = Bank(replace(tables, hypotheses=(*others, one_more)), offset=offset)
-    bank.push(samples[:, None], missing_before, columns)
+    bank = Bank(replace(tables, hypotheses=(*others, one_more)), offset=rerun.offset)
+    bank.push(rerun.samples[:, None], rerun.missing_before, rerun.columns)
     try:
-        result = bank.report(0, mask)
+        result = bank.report(0, rerun.mask)
     except UserError:
         return None
     if not math.isfinite(result.probability[name]):

@@ -43,9 +43,8 @@ def overbound(tau_s: Sequence[_Floats], limit: Sequence[_Floats]) -> tuple[float
     )
     inside = (x >= 0.0) & (y >= 0.0)
     x, y = x[inside], y[inside]
-    above = np.ones(x.size, bool)
-    for a, b, least in zip(white, walk, square, strict=True):  # a corner is on its own two lines, but for rounding
-        above &= x * a + y * b >= least * (1.0 - 1e-9)
+    # A corner is on its own two lines, but for rounding.
+    above = np.all(np.outer(x, white) + np.outer(y, walk) >= square * (1.0 - 1e-9), axis=1)
     x, y = x[above], y[above]
     ln_tau = np.unique(np.log(tau))
     curve = np.log(np.outer(x, np.exp(-ln_tau)) + np.outer(y, np.exp(ln_tau) / 3.0))

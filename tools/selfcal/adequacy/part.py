@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.adequacy.summary import NOISIER
-from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, Seen, about, laid, prior_tree, rounded, seen_of
+from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, NARROW, Seen, about, laid, prior_tree, rounded, seen_of
 from selfcal.bank.result import in_unit
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError, note, remark, short
@@ -35,10 +35,6 @@ from selfcal.readings.rest import rest_of
 STATED, OF_PART = ("N", "density", "K", "B", "bias", "range", "lsb"), ("rate",)
 #: Kinds of axes by a unit of each: their group's name, and its unit where the recording does not decide it.
 KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "degC": "temperature", "V": "voltage"}
-#: Width of the prior of a stated K or B, decades: as of K in the default model.
-DECADES_STATED = 3.0
-#: Largest ratio of an axis' N to its group's: beyond it the axis has priors of its own.
-ALIKE = 10.0
 #: Largest ratio of a recording's rate to its sensor's.
 FASTER = 1.01
 #: Least sd of the bias prior over N, of an axis of another kind, 1/sqrt(s).
@@ -123,22 +119,19 @@ def of_recording(tree: dict[str, Any], recording: Recording) -> list[str]:
             wide = rounded(max(LEVEL_SD * abs(level), LEAST_BIAS * typical))
             about_it = replace(group, priors={**group.priors, "bias": Prior("normal", sd=wide)})
         widest = replace(max(by_axis.values(), key=lambda seen: float(seen.deviation.max())), level=level)
-        priors = about(about_it, _at(widest, typical))
+        # The N of all of them, whose deviation is the largest.
+        deviation = np.concatenate([[typical / math.sqrt(widest.tau_s[0])], widest.deviation[1:]])
+        priors = about(about_it, replace(widest, deviation=deviation))
         fields["priors"] = {key: prior_tree(prior) for key, prior in priors.items()}
         listed = ", ".join(f"{axis} {seen.N:.3g}" for axis, seen in by_axis.items())
         said.append(f"{group.name}: N about {listed} {parameter_unit('N', group.unit)} (Allan deviation)")
-        far = {axis: seen for axis, seen in by_axis.items() if not 1.0 / ALIKE < seen.N / typical < ALIKE}
+        far = {axis: seen for axis, seen in by_axis.items() if not 1.0 / NARROW < seen.N / typical < NARROW}
         if far:
             fields["own_priors"] = {
                 axis: {key: prior_tree(prior) for key, prior in about(about_it, seen).items() if prior != priors[key]}
                 for axis, seen in far.items()
             }
     return said
-
-
-def _at(seen: Seen, N: float) -> Seen:
-    """The same axis with another N, whose deviation is the largest of a group's."""
-    return replace(seen, deviation=np.concatenate([[N / math.sqrt(seen.tau_s[0])], seen.deviation[1:]]))
 
 
 def _seen(recording: Recording, axis: str, model: Model) -> Seen:
@@ -213,18 +206,17 @@ def of_sheet(tree: dict[str, Any], stated: Sequence[Stated], measured: bool) -> 
                 raise UserError(f"--datasheet {number.text}: the rate is one of the part, in Hz: rate=200Hz")
             tree["sensor"]["rate_hz"] = number.value * factor(number.unit, "Hz")
             continue
-        fits = {name: group for name, group in tree["groups"].items() if _fits(number, group)}
+        fits = {
+            name: group
+            for name, group in tree["groups"].items()
+            if unit_module.same_kind(number.unit, _unit_of(number.key, group["unit"]))
+        }
         meant = [name for name, group in fits.items() if number.of in ("", name) or number.of in group["axes"]]
         if not meant:
             raise UserError(f"--datasheet {number.text}: {_not_meant(number, tree['groups'])}")
         for name in meant:
             _put(tree["groups"][name], number, number.of if number.of != name else "", measured)
     return [f"data sheet: {number.text}" for number in stated]
-
-
-def _fits(number: Stated, group: Mapping[str, Any]) -> bool:
-    """Whether its unit is one of this group's."""
-    return unit_module.same_kind(number.unit, _unit_of(number.key, group["unit"]))
 
 
 def _not_meant(number: Stated, groups: Mapping[str, Any]) -> str:
@@ -263,7 +255,7 @@ def _put(group: dict[str, Any], number: Stated, axis: str, measured: bool) -> No
     else:
         # A data sheet's bias instability is the size of the slow drift: the deviation of a Gauss-Markov one.
         name = "sigma_m" if number.key == "B" else number.key
-        half = math.sqrt(10.0**DECADES_STATED)
+        half = math.sqrt(before[name].max / before[name].min)
         held[name] = prior_tree(Prior("log_uniform", min=rounded(value / half), max=rounded(value * half)))
 
 

@@ -20,26 +20,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.allan import LONGEST, Terms, fit_of, posterior_draws, terms_of
+from selfcal.adequacy.allan import DRAWS, LONGEST, PER_OCTAVE, Terms, fit_of, posterior_draws
 from selfcal.adequacy.one_over_f import FLICKER, SURE, Beside, white_of
 from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
+from selfcal.base.grid import bisected, weighted_quantiles
 from selfcal.model.file import Group
 
 _Floats = NDArray[np.float64]
 
 #: The parameter of coloured noise.
 COLOURED = "spectral_ratio"
-#: Number of draws of each law, and averaging times in an octave: the minimum of N^2/tau + K^2 tau/3 is met to 1e-4.
-_DRAWS, _PER_OCTAVE = 256, 16
-#: Longest rest that is looked at, in lengths of the record, and halvings of its logarithm: to 2 %.
-MOST_REST, _HALVINGS = 100.0, 8
+#: Longest rest that is looked at, in lengths of the record.
+MOST_REST = 100.0
 #: Least probability of a law that counts.
 _LEAST = 1e-3
 #: Least ratio of an axis' N to its siblings' or its data sheet's that a line names.
 NOISIER = 2.0
 #: Least share of the posterior with a walk, or a minimum, that identifies the number.
-_SURE = 0.95
+_SURE = 1.0 - LIKELY
 #: Why a number is not identified: words of the table and the JSON.
 NO_WALK = "no walk is sure"
 NOT_DECIDED = "the law is not decided"
@@ -92,7 +92,7 @@ def summarize(
     white, walk, q, floor, side = (
         np.concatenate(rows) for rows in zip(*(_draws(law) for law, _ in sound), strict=True)
     )
-    w, own = np.repeat([[law.probability, float(mine)] for law, mine in sound], _DRAWS, axis=0).T
+    w, own = np.repeat([[law.probability, float(mine)] for law, mine in sound], DRAWS, axis=0).T
     w = w / w.sum()
     w_walk = w * own / max(float(w @ own), 1e-300) if (w * own).any() else w
     numbers = {
@@ -132,7 +132,7 @@ def summarize(
             most.append(_number(walk, np.where(walk > 0.0, w_walk, 0.0) / w_walk[walk > 0.0].sum()).estimate.q95)
         numbers["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
     if float(w[side == 0].sum()) < _SURE:
-        reason = BELOW if float(w[side < 0].sum()) > 0.5 else NO_MINIMUM
+        reason = BELOW if float(w[side < 0].sum()) > float(w[side > 0].sum()) else NO_MINIMUM
         numbers["bias_instability"] = _without(numbers["bias_instability"], reason)
     elif left_open({"K"}, {"sigma_m"}, {"B"}):  # then the prior of the drift makes the minimum
         numbers["bias_instability"] = _without(numbers["bias_instability"], WIDE)
@@ -148,17 +148,20 @@ def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]
     and where it is."""
     law, group, dt_s, n, block = beside.law, beside.group, beside.dt_s, beside.n, beside.block
     medians = {name: estimate.median for name, estimate in beside.estimates.items()}
-    m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(_PER_OCTAVE * math.log2(n / 2.0)))
-    draws = posterior_draws(beside.estimates, fit_of(law, medians, group, dt_s, n, m, block=block).covariance, _DRAWS)
+    m = np.geomspace(1.0, n / 2.0, 1 + math.ceil(PER_OCTAVE * math.log2(n / 2.0)))
+    fit = fit_of(law, medians, group, dt_s, n, m, block=block)
+    draws = posterior_draws(beside.estimates, fit.covariance)
     if law == FLICKER:
         white, floor = white_of(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
         side = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
     else:
-        rows = (dict(zip(draws, map(float, row), strict=True)) for row in zip(*draws.values(), strict=True))
-        lowest = [_minimum(terms_of(group.laws[law], row, dt_s, block), m) for row in rows]
+        lowest = [_minimum(fit.terms_at(ln_theta), m) for ln_theta in np.log(np.column_stack([*draws.values()]))]
         white, (floor, side) = draws["N"], np.array(lowest, dtype=float).T
-    walk = _walk(draws)
-    return white, np.where(np.isnan(walk), 0.0, walk), _quantization(draws, dt_s), floor, side
+    # A Gauss-Markov drift is like a walk. Noise without a memory, or with one of the other sign, has no Q.
+    none = np.zeros(white.size)
+    walk = draws.get("K", draws.get("sigma_m", none) * np.sqrt(2.0 * draws.get("alpha", none)))
+    over = np.maximum(draws.get(COLOURED, none + 1.0) ** -2.0 - 1.0, 0.0)
+    return white, np.nan_to_num(walk), 0.5 * draws["N"] * np.sqrt(dt_s * over), floor, side
 
 
 def noisier(white: Mapping[str, Mapping[str, Any]]) -> list[str]:
@@ -198,36 +201,14 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
         fit = fit_of(law, medians, group, dt_s, times * n, np.ones(1), block=block)
         return dict(zip(estimates, np.diag(fit.covariance).tolist(), strict=True))
 
-    now = variance(1.0)
-    rest_s: dict[str, float | None] = {}
-    for name in open_:
+    def rest_s(name: str) -> float | None:
         wanted = 0.25 * math.sqrt(now[name]) * estimates[name].ln_sd
-        low, high = 0.0, math.log(MOST_REST)
         if not variance(MOST_REST)[name] <= wanted:
-            rest_s[name] = None
-            continue
-        for _ in range(_HALVINGS):
-            middle = 0.5 * (low + high)
-            low, high = (low, middle) if variance(math.exp(middle))[name] <= wanted else (middle, high)
-        rest_s[name] = n * dt_s * math.expm1(high)
-    return rest_s
+            return None
+        return n * dt_s * (bisected(lambda times: variance(times)[name] <= wanted, 1.0, MOST_REST)[1] - 1.0)
 
-
-def _walk(draws: Mapping[str, _Floats]) -> _Floats:
-    """K of each draw; 0 of a law without a walk and without a drift that is like one."""
-    if "K" in draws:
-        return draws["K"]
-    if "sigma_m" in draws and "alpha" in draws:
-        return np.asarray(draws["sigma_m"] * np.sqrt(2.0 * draws["alpha"]))
-    return np.zeros(draws["N"].size)
-
-
-def _quantization(draws: Mapping[str, _Floats], dt_s: float) -> _Floats:
-    """Q of each draw; 0 of a law whose noise has no memory, or a memory of the other sign."""
-    if COLOURED not in draws:
-        return np.zeros(draws["N"].size)
-    over = np.maximum(draws[COLOURED] ** -2.0 - 1.0, 0.0)
-    return np.asarray(0.5 * draws["N"] * np.sqrt(dt_s * over))
+    now = variance(1.0)
+    return {name: rest_s(name) for name in open_}
 
 
 def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
@@ -243,10 +224,9 @@ def _number(values: _Floats, weight: _Floats) -> Number:
     """Mean, sd and quantiles of weighted draws."""
     order = np.argsort(values, kind="stable")
     values, weight = values[order], weight[order]
-    share = np.cumsum(weight) - 0.5 * weight
     mean = float(weight @ values)
     sd = math.sqrt(max(0.0, float(weight @ (values - mean) ** 2)))
-    low, middle, high = np.interp((0.05, 0.5, 0.95), share, values).tolist()
+    low, middle, high = weighted_quantiles(values, weight, (0.05, 0.5, 0.95)).tolist()
     return Number(Estimate(mean, middle, sd, low, high, identified=True))
 
 

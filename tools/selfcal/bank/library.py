@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import astuple
 from importlib import import_module
 from typing import Any
 
@@ -41,7 +42,7 @@ def arguments(tables: Tables) -> tuple[Any, ...]:
         tables.id,
         _regressors(tables),
         tables.half_life_s,
-        tables.handling.as_tuple,
+        astuple(tables.handling),
     )
 
 
@@ -85,7 +86,13 @@ class Bank:
         try:
             report = self.raw.report(axis, mask, ahead_s)
         except ValueError as error:  # std::length_error
-            raise UserError(_too_short(self.tables, self.raw.count, self.raw.weight)) from error
+            tables, count, least = self.tables, self.raw.count, _library32.REPORT_MIN
+            said = f"too short: {count} bank samples of {tables.dt_s:g} s, a report needs {least} "
+            said += "(record longer, or give --decimate HZ)"
+            if count > least > self.raw.weight:
+                said = f"all is forgotten: after {tables.half_life_s:g} s a bank sample counts half, "
+                said += "and the last are too old"
+            raise UserError(said) from error
         log_evidence, probability, parameters, coefficients = {}, {}, {}, {}
         used = [k for k in range(len(self.tables.regressors)) if mask >> k & 1]
         for table, entry in zip(self.tables.hypotheses, report["hypotheses"], strict=True):
@@ -106,15 +113,6 @@ class Bank:
             report["bias_sd"],
             coefficients,
         )
-
-
-def _too_short(tables: Tables, count: int, weight: float) -> str:
-    if count > _library32.REPORT_MIN and weight < _library32.REPORT_MIN:
-        return f"all is forgotten: after {tables.half_life_s:g} s a bank sample counts half, and the last are too old"
-    return (
-        f"too short: {count} bank samples of {tables.dt_s:g} s, a report needs {_library32.REPORT_MIN} "
-        "(record longer, or give --decimate HZ)"
-    )
 
 
 def _estimate(entry: tuple[float, float, float, float, float, int]) -> Estimate:

@@ -20,23 +20,23 @@ from numpy.typing import NDArray
 
 from selfcal.bank.result import FAINT, AxisResult
 from selfcal.base.errors import UserError
+from selfcal.base.grid import MEDIAN_SD
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
 from selfcal.model.laws import RATIOS
-from selfcal.readings.rest import BIAS_SD, rest_of
+from selfcal.model.tables import bank_block, make_tables
+from selfcal.readings.budget import CHECK_LIMIT, CLEARLY
+from selfcal.readings.rest import FEWEST, rest_of
 
 #: Factor of the own prior of N to each side of the record's N.
 DECADES = 100.0
-#: Narrowest range of N, a factor, that is replaced: a narrower one is knowledge of the part (warm start, own model).
-NARROW = 10.0
+#: Narrowest range of N, a factor, that is replaced: a narrower one is knowledge of the part (warm start, own model). An
+#: axis with so many times the N of its group has priors of its own.
+NARROW = math.sqrt(DECADES)
 #: Largest difference of equal means, a share of the largest mean: a counter's differences are rounded by that.
 SAME = 1e-10
-#: Differences of neighbouring means that show a deviation; of a drift they are 24.
-FEWEST = 8
 #: Level over the sd of the own bias prior.
 LEVEL_SD = 2.0
-#: Nats by which a law must gain: of records that a model's limits hold, at most 1 in 20 gain so much (Markov's bound).
-LEANS_GAIN = math.log(20.0)
 #: Most bank intervals of a search beyond the bank's own: a longer record is averaged further.
 MOST_INTERVALS = 20_000
 #: Smallest visible drift over a record of T: K in N / T, sigma_m in N / sqrt(T); of alpha 1 / T.
@@ -132,12 +132,9 @@ def at_rest(recording: Recording, name: str, model: Model) -> Seen | None:
     rest = rest_of(own, [axis for axis in model.axes if axis in own.columns])
     if not rest.moved:
         return seen
-    time_s, kept = own.time_s + own.start_s, np.ones(own.samples, bool)
-    for begin_s, end_s in rest.moved:
-        kept &= (time_s < begin_s) | (time_s >= end_s)
-    if np.count_nonzero(kept) < 2:
+    if rest.longest is None:
         return None
-    seen = seen_of(own.with_rows(kept), name, model)
+    seen = seen_of(own.without(rest.moved), name, model)
     return seen if seen is not None and outside(group, seen) else None
 
 
@@ -150,13 +147,11 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     sound = np.isfinite(values) & (np.abs(values) < (group.range if group.range > 0.0 else math.inf))
     if not sound.any():
         return None
-    block = max(1, round(recording.rate_hz / model.bank_rate_hz))
+    block = bank_block(recording.rate_hz, model.bank_rate_hz)
     tau_s = block / recording.rate_hz
     interval = (recording.clock.place // block)[sound]
     size = np.ones(interval.size)
-    tau: list[float] = []
-    deviations: list[float] = []
-    counts: list[int] = []
+    rows: list[tuple[float, float, int]] = []
     level = math.nan
     with np.errstate(over="ignore", invalid="ignore"):
         total = values[sound]
@@ -165,23 +160,20 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             interval, total, size = interval[first], np.add.reduceat(total, first), np.add.reduceat(size, first)
             whole = size > 0.5 * size.max()
             mean = total[whole] / size[whole]
-            level = level if tau else float(np.median(mean))
+            level = level if rows else float(np.median(mean))
             step = np.diff(mean)[np.diff(interval[whole]) == 1]
             step[np.abs(step) < SAME * np.abs(mean).max()] = 0.0
-            if step.size < (24 if tau else FEWEST):
+            if step.size < (24 if rows else FEWEST):  # of a drift, more
                 break
             square = step * step
-            # The median of the square of a normal value is 0.455 of its variance.
-            typical, all_of_them = float(np.median(square)) / 0.4549364, float(square.mean())
+            typical, all_of_them = float(np.median(square)) / MEDIAN_SD**2, float(square.mean())
             # On a coarse lattice the median is of its steps: never more than the mean square.
-            deviations.append(math.sqrt(0.5 * (min(typical, all_of_them) or all_of_them)))
-            tau.append(tau_s)
-            counts.append(step.size)
+            rows.append((tau_s, math.sqrt(0.5 * (min(typical, all_of_them) or all_of_them)), step.size))
             tau_s *= 2.0
             interval = interval // 2
-    if not tau or not 0.0 < deviations[0] < math.inf:
+    if not rows or not 0.0 < rows[0][1] < math.inf:
         return None
-    return Seen(level, np.array(tau), np.array(deviations), np.array(counts))
+    return Seen(level, *(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def known(group: Group) -> bool:
@@ -198,15 +190,11 @@ def outside(group: Group, seen: Seen) -> bool:
     # Two sd of ln N beyond a limit: 1.2 over sqrt(n) each.
     margin = math.exp(2.0 * 1.2 / math.sqrt(float(seen.differences[0])))
     beyond = not N.min / margin <= seen.N <= N.max * margin
-    return beyond or _drifts(group, seen) or abs(seen.level) > BIAS_SD * group.priors["bias"].sd
-
-
-def _drifts(group: Group, seen: Seen) -> bool:
-    """Whether the deviation over some time is above all that the priors allow."""
-    N, K, sigma_m = (group.priors[key].max for key in ("N", "K", "sigma_m"))
     # The greatest Allan deviation of a Gauss-Markov drift is 0.62 of its sigma_m.
-    most = np.sqrt(N**2 / seen.tau_s + K**2 * seen.tau_s / 3.0 + (0.62 * sigma_m) ** 2)
-    return bool((seen.deviation > 1.5 * most).any())
+    K, sigma_m = group.priors["K"].max, group.priors["sigma_m"].max
+    most = np.sqrt(N.max**2 / seen.tau_s + K**2 * seen.tau_s / 3.0 + (0.62 * sigma_m) ** 2)
+    drifts = bool((seen.deviation > 1.5 * most).any())
+    return beyond or drifts or abs(seen.level) > CHECK_LIMIT * group.priors["bias"].sd
 
 
 def about(group: Group, seen: Seen) -> dict[str, Prior]:
@@ -225,7 +213,7 @@ def laid(
     N = rounded(N)
     scale = N / math.sqrt(priors["N"].min * priors["N"].max)
     sd = priors["bias"].sd
-    if abs(level) > BIAS_SD * sd:
+    if abs(level) > CHECK_LIMIT * sd:
         sd = rounded(LEVEL_SD * abs(level))
     # A bias prior may be so much wider than the least N: first it gives way, then N.
     sd = max(min(sd, WIDEST_BIAS * N / DECADES), rounded(abs(level) / LEVEL_SD))
@@ -249,10 +237,11 @@ def moved_along(
     length_s = recording.duration_s
     size = UNSEEN * seen.N / math.sqrt(length_s)
     least = {"K": UNSEEN * seen.N / length_s, "sigma_m": size, "B": size, "alpha": 1.0 / length_s}
-    if not _may_lean(priors, seen, least):
+    # It may show no more than the priors hold: what it cannot show lies well below no least, nor the drift near a most.
+    below = any(math.e * least[key] < prior.min for key, prior in priors.items() if key in least)
+    if not below and float(seen.deviation[-1]) * math.sqrt(3.0 / float(seen.tau_s[-1])) <= 0.5 * priors["K"].max:
         return priors
     from selfcal.bank.library import Bank
-    from selfcal.model.tables import make_tables
     from selfcal.readings.readings import look
 
     plain = {law: weight for law, weight in model.hypotheses.items() if not model.laws[law].is_sum}
@@ -306,19 +295,11 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
     of all laws must gain: as alpha falls it becomes a walk, which may be one of them."""
     gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
     whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
-    return whole[1] > whole[0] + LEANS_GAIN or any(
-        gain[law] > LEANS_GAIN and second.probability[law] > FAINT
+    return whole[1] > whole[0] + CLEARLY or any(
+        gain[law] > CLEARLY and second.probability[law] > FAINT
         for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )
-
-
-def _may_lean(priors: Mapping[str, Prior], seen: Seen, least: Mapping[str, float]) -> bool:
-    """Whether the record may show more than the priors hold: what it cannot show lies well below a least, or the drift
-    comes near a most."""
-    below = any(math.e * least[key] < prior.min for key, prior in priors.items() if key in least)
-    reach = float(seen.deviation[-1]) * math.sqrt(3.0 / float(seen.tau_s[-1]))
-    return below or reach > 0.5 * priors["K"].max
 
 
 def _moved(key: str, prior: Prior, end: int, least: Mapping[str, float]) -> Prior:

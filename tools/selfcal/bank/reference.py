@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import generate_binary_structure, maximum_filter
 
 from selfcal import _reference
 from selfcal.bank.result import AxisResult, Estimate
@@ -31,8 +32,8 @@ _DEPTH = 16.0
 _STEP = 0.75
 #: Fewest steps of a direction between its limits.
 _FEWEST = 24
-#: Most nodes of a hypothesis: a larger posterior is out of this engine's reach.
-_MOST = 1_000_000
+#: Most nodes of a hypothesis, and of a direction: a larger posterior is out of this engine's reach.
+_MOST = 2**20
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -81,16 +82,14 @@ def identify_axis(
     offset = float(np.nanmean(y))
     centred = np.ascontiguousarray(y - offset, np.float64)
     factors = None if r is None else np.ascontiguousarray(r, np.float64)
-    columns = None if z is None else (np.ascontiguousarray(z, np.float64), np.array(coefficient_sd, np.float64))
+    columns = None if z is None else np.ascontiguousarray(z, np.float64)
+    sd = None if z is None else np.array(coefficient_sd, np.float64)
     posteriors = {
-        name: _posterior(centred, dt, offset, group, name, factors, columns, block, ahead_s) for name in hypotheses
+        name: _posterior(centred, dt, offset, group, name, factors, columns, sd, block, ahead_s) for name in hypotheses
     }
-    ln_weight = {
-        name: math.log(hypotheses[name]) + posteriors[name].ln_evidence for name in posteriors if hypotheses[name] > 0.0
-    }
-    top = max(ln_weight.values())
-    total = sum(math.exp(value - top) for value in ln_weight.values())
-    probability = {name: math.exp(ln_weight[name] - top) / total if name in ln_weight else 0.0 for name in posteriors}
+    ln_weight = np.array([math.log(hypotheses[name]) + p.ln_evidence for name, p in posteriors.items()])
+    weight = np.exp(ln_weight - ln_weight.max())
+    probability = dict(zip(posteriors, (weight / weight.sum()).tolist(), strict=True))
     bias_mean = sum(probability[name] * p.mean[0] for name, p in posteriors.items())
     spread = sum(probability[name] * (p.var[0] + (p.mean[0] - bias_mean) ** 2) for name, p in posteriors.items())
     return AxisResult(
@@ -114,14 +113,14 @@ def _posterior(
     group: Group,
     law: str,
     r: _Floats | None,
-    columns: tuple[_Floats, _Floats] | None,
+    z: _Floats | None,
+    sd: _Floats | None,
     block: int,
     ahead_s: float,
 ) -> _Posterior:
-    z, sd = (None, None) if columns is None else columns
     of = group.laws[law]
     means = len(of.read) if block > 1 else 0  # of the terms, over the block; e_i and e_(i-1) are noise
-    beside = means + of.noise_states
+    beside = means + 2 * of.coloured_noise
     columns_now = np.empty(0) if z is None else z[np.flatnonzero(np.isfinite(y))[-1]]
     constant = np.concatenate([np.zeros(beside), [1.0], columns_now])
     own_from = max(len(of.read), 1) + beside + 1
@@ -186,14 +185,6 @@ def _later(of: Law, drift: _Floats, second: _Floats, time_s: float) -> tuple[_Fl
     return np.column_stack(taken or [np.ones(drift.size)]), gained
 
 
-def _prior_sd(prior: Prior) -> float:
-    """Standard deviation of ln(parameter) under its prior."""
-    if prior.law != "uniform":
-        return prior.ln_sd
-    share = prior.min / prior.max
-    return math.sqrt(1.0 - share * (math.log(share) / (1.0 - share)) ** 2)
-
-
 # ------------------------------------------------------------------------------------------------- finding the modes
 
 
@@ -219,14 +210,10 @@ def _modes(value: Callable[[_Floats], _Floats], low: _Floats, high: _Floats) -> 
         rows = np.arange(len(rest))
         best, profile = ln_n[rows, top], values[rows, top]
         left, right = ln_n[rows, np.maximum(top - 1, 0)], ln_n[rows, np.minimum(top + 1, count - 1)]
-    grid = np.pad(profile.reshape(points), 1, constant_values=-np.inf)
-    inner = tuple(slice(1, -1) for _ in points)
-    peak = np.ones(points, bool)
-    for d in range(len(points)):
-        for shift in (-1, 1):
-            peak &= grid[inner] >= np.roll(grid, shift, axis=d)[inner]
-    starts = np.column_stack([best, rest])[peak.ravel()]
-    starts = starts[np.argsort(-profile[peak.ravel()])][:4]
+    grid = profile.reshape(points or 1)
+    peak = (grid == maximum_filter(grid, footprint=generate_binary_structure(grid.ndim, 1), mode="nearest")).ravel()
+    starts = np.column_stack([best, rest])[peak]
+    starts = starts[np.argsort(-profile[peak])][:4]
     step = (high - low) / (2.0 * np.array([500, *points]))
     polished: list[tuple[float, _Floats]] = []
     for start in starts:
@@ -277,7 +264,7 @@ class _Lattice:
     ) -> None:
         self.filtered, self.low, self.high = filtered, low, high
         steps = np.maximum(np.ceil((high - low) / (_STEP * widths)), _FEWEST)
-        self.count: _Indices = (2 * np.ceil(np.minimum(steps, 2**20) / 2)).astype(np.int64)
+        self.count: _Indices = (2 * np.ceil(np.minimum(steps, _MOST) / 2)).astype(np.int64)
         self.index: _Indices = np.empty((0, len(low)), np.int64)
         self.value = np.empty(0)
         self.mean, self.var = np.empty((0, moments)), np.empty((0, moments))
@@ -321,7 +308,7 @@ class _Lattice:
                 # ln evidence may change by 4e-4, which moves a probability by 1e-4, and a moment by 5e-3 posterior sd.
                 excess.append(max(abs(half[0] - full[0]) / 4e-4, float(moments.max()) / 5e-3))
             worst = int(np.argmax(excess))
-            if excess[worst] <= 1.0 or self.count[worst] >= 2**20:
+            if excess[worst] <= 1.0 or self.count[worst] >= _MOST:
                 return
             self.index[:, worst] *= 2
             self.count[worst] *= 2
@@ -404,5 +391,5 @@ def _estimate(lattice: _Lattice, d: int, prior: Prior) -> Estimate:
     edge = 0.02 * (math.log(prior.max) - math.log(prior.min))
     at_min = float(np.interp(math.log(prior.min) + edge, fine, cumulative, left=0.0, right=1.0))
     at_max = 1.0 - float(np.interp(math.log(prior.max) - edge, fine, cumulative, left=0.0, right=1.0))
-    identified = sd_ln < 0.5 * _prior_sd(prior) and max(at_min, at_max) < 0.05
+    identified = sd_ln < 0.5 * prior.ln_sd and max(at_min, at_max) < 0.05
     return Estimate(mean, float(median), sd, float(q05), float(q95), identified)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from selfcal.base.grid import bisected
 from selfcal.model.laws import RATIOS
 
 #: Standard deviations from the middle of a normal to either end of its 90 % interval.
-HALF_90 = 1.6448536269514722
+HALF_90 = NormalDist().inv_cdf(0.95)
 #: Least probability of a law that a table, a picture or a prior takes into account.
 FAINT = 0.01
 

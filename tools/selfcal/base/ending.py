@@ -30,8 +30,8 @@ class Stopped(Exception):
 _AGAIN_S = 0.02
 
 
-class _State:
-    """The signal that came while signals are held."""
+class Held:
+    """The signal that came while signals are held: whether it has asked for the end. One for the process."""
 
     holding = False
     came: int | None = None
@@ -39,13 +39,26 @@ class _State:
     raised: int | None = None
     abandoned = False
 
+    @property
+    def asked(self) -> bool:
+        """A signal came."""
+        return Held.came is not None
 
-_state = _State()
+    @property
+    def overdue(self) -> bool:
+        """A signal came 0.6 s ago: results have to be written."""
+        return Held.came is not None and time.monotonic() > Held.came_at + 0.6
+
+    def check(self) -> None:
+        """Raise Ended if a signal came."""
+        if Held.came is not None:
+            number, Held.came = Held.came, None
+            _end(number)
 
 
 def _on_signal(number: int, frame: FrameType | None) -> None:
-    if _state.holding and _state.came is None:
-        _state.came, _state.came_at = number, time.monotonic()  # a second one ends at once, whatever is held
+    if Held.holding and Held.came is None:
+        Held.came, Held.came_at = number, time.monotonic()  # a second one ends at once, whatever is held
         return
     if _imports(frame):
         signal.signal(signal.SIGALRM, lambda _, later: _on_signal(number, later))
@@ -64,23 +77,23 @@ def _imports(frame: FrameType | None) -> bool:
 
 
 def _end(number: int) -> NoReturn:
-    _state.raised = number
+    Held.raised = number
     raise Ended(number)
 
 
 def last_signal() -> int:
     """Exit code for the signal that was raised, 128 + its number; 0: none was."""
-    return 0 if _state.raised is None else 128 + _state.raised
+    return 0 if Held.raised is None else 128 + Held.raised
 
 
 def abandon() -> None:
     """Threads are left at their work: the process ends without them."""
-    _state.abandoned = True
+    Held.abandoned = True
 
 
 def leave(code: int) -> NoReturn:
     """End the process, whatever threads are still at work."""
-    if _state.abandoned:
+    if Held.abandoned:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         os._exit(code)
@@ -94,36 +107,16 @@ def install() -> None:
             signal.signal(number, _on_signal)
 
 
-class Held:
-    """Whether a signal has asked for the end."""
-
-    @property
-    def asked(self) -> bool:
-        """A signal came."""
-        return _state.came is not None
-
-    @property
-    def overdue(self) -> bool:
-        """A signal came 0.6 s ago: results have to be written."""
-        return _state.came is not None and time.monotonic() > _state.came_at + 0.6
-
-    def check(self) -> None:
-        """Raise Ended if a signal came."""
-        if _state.came is not None:
-            number, _state.came = _state.came, None
-            _end(number)
-
-
 @contextmanager
 def held() -> Iterator[Held]:
     """Within, a signal is noted instead of raised, if `install()` has been called; the caller asks `asked`.
 
     What came stays noted after the end of the block until `check()` raises it.
     """
-    before, _state.holding = _state.holding, True
+    before, Held.holding = Held.holding, True
     if not before:
-        _state.came = None
+        Held.came = None
     try:
         yield Held()
     finally:
-        _state.holding = before
+        Held.holding = before

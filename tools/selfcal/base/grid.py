@@ -6,6 +6,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from itertools import accumulate, pairwise, starmap
+from statistics import NormalDist
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ Mask = NDArray[np.bool_]
 Rows = NDArray[np.int64]
 
 #: Median absolute deviation of a normal with the standard deviation 1.
-MEDIAN_SD = 0.6745
+MEDIAN_SD = NormalDist().inv_cdf(0.75)
 
 
 def bisected(holds: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
@@ -58,9 +59,10 @@ def counts_of_pieces(code: Rows, many: int, least: int, most: int) -> tuple[Rows
     return piece, np.bincount(piece * many + code, minlength=(int(piece[-1]) + 1) * many).reshape(-1, many)
 
 
-def block_means(values: Array, size: int) -> Array:
-    """Means of whole blocks of `size` values [n], [n // size]; NaN where a value is NaN."""
-    return np.asarray(values[: values.size // size * size].reshape(-1, size).mean(axis=1))
+def block_means(rows: Array, size: int) -> Array:
+    """Means [..., n // size] of whole blocks of rows [..., n]; NaN where a value is NaN."""
+    n = rows.shape[-1] // size
+    return np.ascontiguousarray(rows[..., : n * size].reshape(*rows.shape[:-1], n, size).mean(axis=-1))
 
 
 def half_means(values: Array, size: int) -> tuple[Array, Rows]:
@@ -70,12 +72,6 @@ def half_means(values: Array, size: int) -> tuple[Array, Rows]:
     there = np.isfinite(cells)
     used: Rows = there.sum(axis=1)
     return np.where(2 * used >= size, np.where(there, cells, 0.0).sum(axis=1) / np.maximum(used, 1), np.nan), used
-
-
-def in_blocks(rows: Array, size: int) -> Array:
-    """Means [..., n // size] of whole blocks of rows [..., n], all of which are there."""
-    n = rows.shape[-1] // size
-    return np.ascontiguousarray(rows[..., : n * size].reshape(*rows.shape[:-1], n, size).mean(axis=-1))
 
 
 def regridded(values: Array, dt: float, n: int, to_dt: float) -> Array:
@@ -91,4 +87,4 @@ def noise_of(values: Array) -> float:
     if not steps.size:
         return 0.0
     middle, upper = np.quantile(steps, [0.5, 0.6])
-    return max(float(middle) / MEDIAN_SD, float(upper) / 0.8416) / math.sqrt(2.0)
+    return max(float(middle) / MEDIAN_SD, float(upper) / NormalDist().inv_cdf(0.8)) / math.sqrt(2.0)

@@ -11,11 +11,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from selfcal.adequacy.checks import CHECK_LIMIT
 from selfcal.base.errors import UserError, first_line
 from selfcal.batch.batch_summary import MOST_NAMED
 from selfcal.batch.spread import Job, Kept, Row, spread
 from selfcal.batch.unit_table import Unit
+from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.readings.tests import TESTS
 
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.base.grid import in_blocks
+from selfcal.base.grid import block_means
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import (
     ALIKE,
@@ -103,7 +103,7 @@ class Shape:
         moved, sharper = self.moved, self.sharper
         return replace(
             self,
-            columns=in_blocks(self.columns, block),
+            columns=block_means(self.columns, block),
             moved=moved and (lambda numbers: moved(numbers).in_means(block)),
             sharper=sharper and (lambda fit: sharper(fit).in_means(block)),
             whole=self,

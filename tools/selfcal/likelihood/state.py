@@ -13,7 +13,7 @@ from scipy.special import chdtrc, logsumexp, ndtr, softmax
 
 from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
-from selfcal.base.grid import half_means, in_blocks
+from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Terms
 from selfcal.readings.budget import OF_MODULES, P_LOOK
@@ -95,7 +95,7 @@ class State:
         n = self.y.size
         block = max(1, int(min(n // MEANS_MOST, longest_s / self.dt)))
         mean, used = half_means(self.y, block)
-        r, columns = in_blocks(self.r, block), in_blocks(self.series.columns, block)
+        r, columns = block_means(self.r, block), block_means(self.series.columns, block)
         return Series(mean, self.dt * block, r * block / np.maximum(used, 1), columns), block
 
     @property

@@ -55,10 +55,10 @@ LONGEST_TEXT = 200
 MOST_AXES, MOST_TAPS = 64, 1024
 #: Largest number of any kind: its square is still a float.
 LARGEST = 1e18
-#: Smallest number but 0: below what any prior may reach.
-SMALLEST = 1e-20
 #: Largest ln of a parameter that a prior may reach, as a float: LN_LIMIT in lib/bank.c.
 LN_LIMIT = 46.0
+#: Smallest number but 0: what a prior may reach, to one digit.
+SMALLEST = float(f"{math.exp(-LN_LIMIT):.0e}")
 #: sd from the middle of a log-normal prior to its limits: SELFCAL_LOG_NORMAL in lib/selfcal_tables.h.
 LOG_NORMAL_REACH = 4.0
 #: Limits of the sd of a log-normal prior: below, the limits of large logarithms are equal floats.
@@ -73,8 +73,6 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "turn_on": ("tau_s",),
     "pulse": ("start_s", "end_s"),
 }
-#: Most knots of a curve.
-MOST_KNOTS = 200
 #: Most hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
 MOST_HYPOTHESES = 8
 #: Most columns of a bank's regressors together, and most that a model file may state.
@@ -228,10 +226,6 @@ class Handling:
     steps: bool = False
     variance_changes: bool = False
 
-    @property
-    def as_tuple(self) -> tuple[float, bool, bool]:
-        return self.outlier_sd, self.steps, self.variance_changes
-
 
 #: Handling of a model that states none.
 NOT_HANDLED = Handling()
@@ -306,12 +300,13 @@ class Model:
     def load(path: Path | str | None = None) -> Model:
         """Read and check a model file, or that of a part by its name; None is the default model. Raises UserError
         naming the file and the entry."""
-        return _Reader(file_of(path)).model()
+        file = file_of(path)
+        return Model.of_tree(read_yaml(file, f"model file (a YAML mapping with schema: {SCHEMA})"), file)
 
     @staticmethod
     def of_tree(tree: Mapping[str, Any], path: Path) -> Model:
         """Check a tree that is read already, from the file `path`."""
-        return _Reader(path, tree).model()
+        return _Reader(path).model(tree)
 
 
 def with_room(regressors: Sequence[Regressor]) -> tuple[Regressor, ...]:
@@ -422,15 +417,11 @@ def read_yaml(path: Path, kind: str) -> dict[str, Any]:
 class _Reader:
     """Walks the YAML tree; every complaint carries the file and the dotted name of the entry."""
 
-    def __init__(self, path: Path, tree: Mapping[str, Any] | None = None) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._tree = tree
 
     def fail(self, where: str, what: str) -> UserError:
         return UserError(f"{self.path}: {where}: {what}" if where else f"{self.path}: {what}")
-
-    def tree(self) -> dict[str, Any]:
-        return read_yaml(self.path, f"model file (a YAML mapping with schema: {SCHEMA})")
 
     def entry(self, tree: Mapping[str, Any], key: str, where: str) -> Any:
         if key not in tree:
@@ -459,7 +450,7 @@ class _Reader:
         if LARGEST < abs(number) < math.inf:
             raise self.fail(where, f"must be within +-{LARGEST:g}: the firmware computes in float")
         if 0.0 < abs(number) < SMALLEST:
-            raise self.fail(where, f"must be 0, or {SMALLEST:g} and more: the firmware computes in float")
+            raise self.fail(where, f"must be 0, or {SMALLEST:.0e} and more: the firmware computes in float")
         if isinstance(value, bool) or not math.isfinite(number) or number < low or (strict and number == low):
             bound = "" if low == -math.inf else f" above {low:g}" if strict else f" of at least {low:g}"
             raise self.fail(where, f"must be a finite number{bound}, not {shown(value)}")
@@ -474,7 +465,7 @@ class _Reader:
     def rate(self, value: Any, where: str) -> float:
         return self.within(value, where, (LEAST_RATE_HZ, MOST_RATE_HZ), " Hz")
 
-    def count(self, value: Any, where: str, low: int, high: int = 2**31 - 1) -> int:
+    def count(self, value: Any, where: str, low: int, high: int = np.iinfo(np.int32).max) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
             raise self.fail(where, f"must be a whole number from {low} to {high}, not {shown(value)}")
         return value
@@ -500,6 +491,17 @@ class _Reader:
         except UserError as error:
             raise self.fail(f"{where}.unit", str(error)) from None
 
+    def once(self, names: list[str], where: str, what: str) -> None:
+        for name in names:
+            if names.count(name) > 1:
+                raise self.fail(where, f"{what}'{name}' appears twice")
+
+    def by_group(self, tree: Any, where: str, groups: tuple[Group, ...]) -> dict[str, float]:
+        numbers = self.only(tree, tuple(group.name for group in groups), where)
+        if not numbers:
+            raise self.fail(where, "must name at least one group")
+        return {name: self.number(value, f"{where}.{name}") for name, value in numbers.items()}
+
     def prior(self, tree: Any, where: str, *, bias: bool) -> Prior:
         fields = self.only(tree, ("law", "min", "max", "median", "sd"), where)
         law = self.entry(fields, "law", where)
@@ -523,7 +525,7 @@ class _Reader:
         if where.rpartition(".")[2] in RATIOS and not (least <= low and high <= most):
             raise self.fail(where, f"must lie within {least:g} to {most:g}")
         if not -LN_LIMIT <= np.float32(math.log(low)) < np.float32(math.log(high)) <= LN_LIMIT:
-            reach = f"{math.exp(-LN_LIMIT):.0e} to {math.exp(LN_LIMIT):.0e}"
+            reach = f"{SMALLEST:.0e} to {math.exp(LN_LIMIT):.0e}"
             raise self.fail(where, f"min and max must differ, within {reach}, not {low!r} to {high!r}")
         return prior
 
@@ -598,9 +600,6 @@ class _Reader:
                 raise self.fail(f"{where}.{key}", f"goes with form: {form} alone")
         if ("knots" in fields) != (chosen["form"] == "free"):
             raise self.fail(f"{where}.knots", "goes with form: free, and form: free with knots")
-        priors = self.only(self.entry(fields, "sd", where), tuple(group.name for group in groups), f"{where}.sd")
-        if not priors:
-            raise self.fail(f"{where}.sd", "must name at least one group")
         probability = self.number(fields.get("probability", 0.5), f"{where}.probability")
         if probability >= 1.0:
             raise self.fail(f"{where}.probability", f"must be below 1, not {probability:g}")
@@ -619,7 +618,7 @@ class _Reader:
             if chosen["form"] == "free"
             else units.power(unit, power) + ("/s" if "rate" in (kind, chosen["form"]) else ""),
             channel_unit=unit,
-            sd={name: self.number(value, f"{where}.sd.{name}") for name, value in priors.items()},
+            sd=self.by_group(self.entry(fields, "sd", where), f"{where}.sd", groups),
             probability=probability,
             reference=self.number(fields.get("reference", 0.0), f"{where}.reference", low=-math.inf, strict=False),
             column=self.text(fields, "column", where) if "column" in REGRESSORS[kind] else "",
@@ -630,8 +629,8 @@ class _Reader:
 
     def knots(self, tree: Any, where: str) -> Knots:
         """The curve of a form: free."""
-        if not isinstance(tree, list) or not 2 <= len(tree) <= MOST_KNOTS:
-            raise self.fail(where, f"must be a list of 2 to {MOST_KNOTS} pairs [channel, height]")
+        if not isinstance(tree, list) or len(tree) < 2:
+            raise self.fail(where, "must be a list of two pairs [channel, height] or more")
         knots: list[tuple[float, float]] = []
         for i, pair in enumerate(tree):
             if not isinstance(pair, list) or len(pair) != 2:
@@ -648,10 +647,7 @@ class _Reader:
         if len(tree) > MOST_STATED:
             raise self.fail("regressors", f"{len(tree)} are more than {MOST_STATED}")
         regressors = tuple(self.regressor(entry, f"regressors[{i}]", groups) for i, entry in enumerate(tree))
-        names = [regressor.name for regressor in regressors]
-        for name in names:
-            if names.count(name) > 1:
-                raise self.fail("regressors", f"'{name}' appears twice")
+        self.once([regressor.name for regressor in regressors], "regressors", "")
         columns = sum(len(regressor.columns) for regressor in regressors)
         if columns > MOST_STATED:
             raise self.fail("regressors", f"{columns} columns are more than {MOST_STATED} (periodic: two each)")
@@ -659,22 +655,17 @@ class _Reader:
 
     def gate(self, tree: Any, groups: tuple[Group, ...]) -> Gate:
         names = ("window_s", "false_alarm", "hold", "settle", "memory", "N")
-        fields = self.only(tree, names, "gate")
-        for name in names:
-            self.entry(fields, name, "gate")
+        fields = {name: self.entry(self.only(tree, names, "gate"), name, "gate") for name in names}
         false_alarm = self.number(fields["false_alarm"], "gate.false_alarm", strict=False)
         if false_alarm > 0.1:
             raise self.fail("gate.false_alarm", f"must be 0.1 at most, not {false_alarm:g}")
-        noise = self.only(fields["N"], tuple(group.name for group in groups), "gate.N")
-        if not noise:
-            raise self.fail("gate.N", "must name at least one group")
         return Gate(
             window_s=self.number(fields["window_s"], "gate.window_s"),
             false_alarm=false_alarm,
             hold=self.count(fields["hold"], "gate.hold", 1),
             settle=self.count(fields["settle"], "gate.settle", 0),
             memory=self.count(fields["memory"], "gate.memory", 1),
-            N={name: self.number(value, f"gate.N.{name}") for name, value in noise.items()},
+            N=self.by_group(fields["N"], "gate.N", groups),
         )
 
     def handling(self, tree: Any, regressors: bool) -> Handling:
@@ -830,9 +821,8 @@ class _Reader:
             )
         return HiddenInput(deviation, alpha, *numbers)
 
-    def model(self) -> Model:
+    def model(self, raw: Mapping[str, Any]) -> Model:
         needed = ("schema", "name", "bank_rate_hz", "sensor", "groups", "hypotheses", "nodes", "simulate")
-        raw = self.tree() if self._tree is None else self._tree
         if raw.get("schema") != SCHEMA:
             raise self.fail("schema", f"must be {SCHEMA}, not {shown(raw.get('schema'))}")
         more = ("regressors", "half_life_s", "gate", "handle", "correlation_time_s", "hidden_input")
@@ -852,9 +842,7 @@ class _Reader:
         axes = [axis for group in groups for axis in group.axes]
         if len(axes) > MOST_AXES:
             raise self.fail("groups", f"have {len(axes)} axes, {MOST_AXES} are the most")
-        for axis in axes:
-            if axes.count(axis) > 1:
-                raise self.fail("groups", f"axis '{axis}' appears twice")
+        self.once(axes, "groups", "axis ")
         targets = self.entry(tree, "nodes", "")
         if not isinstance(targets, dict) or "host" not in targets:
             raise self.fail("nodes", "must be a mapping of targets, 'host' among them")

@@ -71,15 +71,8 @@ def source_of(form: str, channel: int, number: float, about: float, mean_s: floa
     return KIND["CHANNEL"], channel, mean_s, 0.0
 
 
-def formed(
-    values: Array,
-    form: str,
-    number: float = math.nan,
-    about: float = 0.0,
-    interval_s: float = 1.0,
-    missing: NDArray[np.integer[Any]] | None = None,
-) -> Array:
-    """[n]: the column that `values` [n] of a channel make. Sample i follows `missing[i]` absent ones.
+def formed(values: Array, form: str, number: float = math.nan, about: float = 0.0, interval_s: float = 1.0) -> Array:
+    """[n]: the column that `values` [n] of a channel make.
 
     `number`: the time constant of a lag, s; the window of a rate, s; the whole width of a play; a delay, s. A rate is
     the slope of the straight line that fits its window best. `about`: what powers are taken about. A lag, a rate, a
@@ -90,9 +83,9 @@ def formed(
     if form == "play":
         return played(values, number)
     if form == "delay":
-        return delayed(values, number / interval_s, missing)
+        return delayed(values, number / interval_s)
     origin = about if form in POWER else float(values[0])  # float32 has seven digits
-    column = made([source_of(form, 0, number, 0.0, 0.0)], interval_s, (values - origin)[:, None], missing)[:, 0]
+    column = made([source_of(form, 0, number, 0.0, 0.0)], interval_s, (values - origin)[:, None])[:, 0]
     return np.asarray(column + origin) if form == "lag" else column
 
 

@@ -165,11 +165,6 @@ class Law:
         return tuple(share for term in self.terms for share in KINDS[term.kind].read)
 
     @property
-    def noise_states(self) -> int:
-        """States of the white noise: e_i and e_(i-1) of coloured noise."""
-        return 2 if self.coloured_noise else 0
-
-    @property
     def has_alpha(self) -> bool:
         """A bandwidth is unknown."""
         return any(KINDS[term.kind].time and not term.stated for term in self.terms)
@@ -233,11 +228,8 @@ class Law:
 
     def with_time(self, correlation_time_s: float) -> Law:
         """The law with a correlation time for the term whose stated bandwidth is left open (NaN)."""
-        open_terms = (t.stated and math.isnan(t.bandwidth) for t in self.terms)
-        terms = (
-            replace(t, bandwidth=1.0 / correlation_time_s) if is_open else t
-            for t, is_open in zip(self.terms, open_terms, strict=True)
-        )
+        bandwidth = 1.0 / correlation_time_s
+        terms = (replace(t, bandwidth=bandwidth) if math.isnan(t.bandwidth) else t for t in self.terms)
         return replace(self, terms=tuple(terms))
 
 
@@ -285,21 +277,14 @@ def lost_of(x: float, block: int) -> float:
     return (rest + (1.0 - gain + rest) / (block - 1.0)) / gain
 
 
-def _flicker() -> Law:
-    """Three Gauss-Markov terms of deviation 0.96 B, their bandwidths a factor of 16 apart.
-
-    Their two-sided spectrum is B^2 / (2 pi f) within 16 % where 2 pi f is between the outer bandwidths, and within 1 %
-    in the mean over ln f. A factor of 10 comes nearer, but it covers less: on 1/f noise B came out 4 to 7 % too high.
-    """
-    return Law(tuple(Term("markov", 0.96, ratio) for ratio in (0.0625, 1.0, 16.0)), drift_name="B")
-
-
 #: Laws that a model file may give by name. `walk_and_markov` takes its time from the model's correlation_time_s.
 NAMED: dict[str, Law] = {
     "constant": Law(),
     "random_walk": Law((Term("walk"),)),
     "gauss_markov": Law((Term("markov"),)),
-    "flicker": _flicker(),
+    # Its two-sided spectrum is B^2 / (2 pi f) within 16 % where 2 pi f is between the outer ones. In the mean over
+    # ln f it is within 1 %. A factor of 10 comes nearer, but it covers less: on 1/f noise B came out 4 to 7 % too high.
+    "flicker": Law(tuple(Term("markov", 0.96, ratio) for ratio in (0.0625, 1.0, 16.0)), drift_name="B"),
     "moving_average": Law((Term("walk"),), coloured_noise=True),
     "walk_and_markov": Law((Term("walk"), Term("markov", bandwidth=math.nan, stated=True, by_ratio=True))),
 }

@@ -7,7 +7,7 @@ import math
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from enum import IntEnum
+from enum import IntEnum, auto
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from selfcal import _library32
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
-from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior, Regressor
+from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior
 from selfcal.model.laws import KINDS, NAMED, PARAMETERS, PLACES, Law
 from selfcal.model.regressors import channels_of, sources_of
 
@@ -28,8 +28,8 @@ class PriorLaw(IntEnum):
     """`selfcal_prior_law_t`."""
 
     LOG_UNIFORM = 0
-    UNIFORM = 1
-    LOG_NORMAL = 2
+    UNIFORM = auto()
+    LOG_NORMAL = auto()
 
     def __repr__(self) -> str:
         """The text of the first checksums, which knew two laws: a model's checksum stays."""
@@ -202,7 +202,7 @@ def bank_block(rate_hz: float, bank_rate_hz: float) -> int:
 
 def gate_table(model: Model, tables: Tables) -> GateTable | None:
     """The model's gate for the axes and the rate of `tables`; None if it has none, or a bank interval is one sample."""
-    if model.gate is None or tables.block < 2:
+    if model.gate is None or tables.block == 1:
         return None
     gate, rate_hz = model.gate, tables.rate_hz
     wanted = gate.window_s * rate_hz
@@ -291,9 +291,12 @@ def _regressor_tables(model: Model, names: Sequence[str]) -> Iterator[RegressorT
             0.0 if regressor.column == name else regressor.sd.get(model.group_of(name).name, 0.0) for name in names
         )
         ln_odds = math.log(regressor.probability / (1.0 - regressor.probability))
+        channels = channels_of((regressor,))
         for place, column in enumerate(regressor.columns):
             odds = len(names) * (ln_odds if place == 0 else 0.0,)
-            yield RegressorTable(column, regressor.unit, regressor.offset, sd, _source(regressor, place), odds)
+            kind, _, number, second = sources_of(regressor, channels)[place]
+            source = (kind, number, second, *(channels[0][:2] if channels else ("", "")))
+            yield RegressorTable(column, regressor.unit, regressor.offset, sd, source, odds)
 
 
 def _check_times(model: Model, dt: float) -> None:
@@ -325,10 +328,3 @@ def priors_of(group: Group, law: str) -> tuple[PriorRow, ...]:
 
 def _law(prior: Prior) -> PriorLaw:
     return PriorLaw[prior.law.upper()]
-
-
-def _source(regressor: Regressor, place: int) -> tuple[int, float, float, str, str]:
-    """Source of a column by its place in the regressor."""
-    channels = channels_of((regressor,))
-    kind, _, number, second = sources_of(regressor, channels)[place]
-    return kind, number, second, *(channels[0][:2] if channels else ("", ""))

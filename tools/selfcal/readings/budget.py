@@ -7,7 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from statistics import NormalDist
 from types import MappingProxyType
+
+from selfcal.base.units import SENSORS
 
 #: Of axes at rest whose readings are sound, by test (a check of `identify`, a cause of `diagnose`). The sum keeps 2 in
 #: 1000. Tests whose evidence is certain as soon as there is any take less.
@@ -31,12 +34,16 @@ OF_MODULES: Mapping[str, float] = MappingProxyType(
     {"looks": 7e-3, "together": 1e-2, "statistics": 8e-4, "coherence": 2e-4}
 )
 #: Axes of a module, by which its shares are split.
-AXES = 6
+AXES = len(SENSORS)
 #: Independent looks at an axis, in effect: the eight checks, and eleven of `diagnose`. Of 348 axes of clean modules
 #: (seeds 1000 to 1028 of `make false-alarms`, 1 and 10 Hz) 17 gain 5.4 nats for some cause, as 11 e^-5.4 of them do.
 LOOKS = 19
 #: Of looks at an axis: by chance as rare as 4 standard deviations, or 9.7 nats.
 P_LOOK = OF_MODULES["looks"] / (AXES * LOOKS)
+#: Largest deviation of a look's statistic that passes, sd: 4.
+CHECK_LIMIT = -NormalDist().inv_cdf(0.5 * P_LOOK)
+#: Nats by which an explanation is clearly better than another: by chance at most once in 20 (Markov's bound).
+CLEARLY = math.log(20.0)
 
 
 def nats_of(test: str) -> float:

@@ -12,13 +12,14 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.special import ndtr
 
 from selfcal.base.grid import Array, counts_of_pieces, noise_of
-from selfcal.readings.budget import nats_of
+from selfcal.readings.budget import CLEARLY, nats_of
 from selfcal.readings.lattice import COARSEST, FINE, Lattice, step_of
 
 #: Codes or cells at most, and readings at least.
@@ -41,8 +42,6 @@ TURNS = 3
 ODD = 1e-6
 #: Readings that a map changes, or of a value that is one, at least.
 CHANGED_LEAST = 5
-#: Nats within which another map is possible too.
-ALSO = 5.0
 #: Kinds that are no cause of their own here: lost_words.py and readings.py have them.
 ELSEWHERE = ("word", "limit")
 #: Kinds of codes that are not alike.
@@ -63,6 +62,12 @@ class Misread:
     value: float | None = None
     width: float | None = None
     also_possible: tuple[str, ...] = ()
+
+    @property
+    def entry(self) -> dict[str, Any]:
+        """What a check states of it."""
+        also = {"also_possible": list(self.also_possible)} if self.also_possible else {}
+        return {"kind": self.kind, "undone": self.undone is not None, **also}
 
     @property
     def sd(self) -> float:
@@ -87,13 +92,13 @@ class _Map:
         """Readings [codes, ...] of `expected` true ones [codes, ...]."""
         assert self.lost is not None
         moved = (self.lost * expected.T).T
-        found = np.asarray(expected - moved)
+        read = np.asarray(expected - moved)
         if self.kind == "uneven":
-            found[:-1] += 0.5 * moved[1:]
-            found[1:] += 0.5 * moved[:-1]
+            read[:-1] += 0.5 * moved[1:]
+            read[1:] += 0.5 * moved[:-1]
         else:
-            found[self.place] += moved.sum(axis=0)
-        return found
+            read[self.place] += moved.sum(axis=0)
+        return read
 
     def within(self, cells: Cells) -> csr_matrix:
         """`to`, of codes as they are without the map."""
@@ -145,11 +150,11 @@ class Cells:
             self.origin *= abs(self.origin) > 0.1 * step
         # A code has an upper and a lower half: that is enough for a cast.
         self.parts = 2 if self.width < 1.5 * self.step else PARTS
-        place = np.rint((y - self.origin) / self.width).astype(np.int64)
-        middle = int(np.median(place))
-        self.kept = np.abs(place - middle) < CODES // self.parts
-        place = place[self.kept]
-        low, high = int(place.min()), int(place.max())
+        code = np.rint((y - self.origin) / self.width).astype(np.int64)
+        middle = int(np.median(code))
+        self.kept = np.abs(code - middle) < CODES // self.parts
+        code = code[self.kept]
+        low, high = int(code.min()), int(code.max())
         self.about_zero = abs(self.origin) < 1e-9 * self.width or self.pile is not None
         reach = (high - low + 1) // 2
         self.first, last = low - reach, high + reach
@@ -157,7 +162,7 @@ class Cells:
         if self.folds:
             self.first, last = min(self.first, -high), max(last, -low)
         self.many = last - self.first + 2
-        self.code = place - self.first
+        self.code = code - self.first
         if self.pile is not None:
             self.code[y[self.kept] == commonest] = self.many - 1
         self.piece, self.count = counts_of_pieces(self.code, self.many, PIECE, PIECES)
@@ -182,7 +187,7 @@ class Cells:
     @cached_property
     def true(self) -> list[tuple[Array, Array]]:
         """Of each noise the levels, and the chance [parts, levels] of parts of codes."""
-        found = []
+        chances = []
         # The mean of a piece is within two noises of its level, unless the readings are folded.
         mean = self.count @ (self.origin + self.width * np.append(np.arange(self.many - 1) + self.first, 0))
         mean = mean / self.count.sum(axis=1)
@@ -191,8 +196,8 @@ class Cells:
             low, high = min(low, -high), max(high, -low)
         for sigma in self.noise * NOISES:
             level = np.arange(low, high + LEVEL_STEP * sigma, LEVEL_STEP * sigma)
-            found.append((level, np.diff(ndtr((self.edges[:, None] - level) / sigma), axis=0)))
-        return found
+            chances.append((level, np.diff(ndtr((self.edges[:, None] - level) / sigma), axis=0)))
+        return chances
 
     def fit(self, to: csr_matrix, near: _Fit | None = None) -> _Fit:
         """The likeliest levels and noises under a map: Fisher's scoring from those of a `near` map, or from the best of
@@ -200,19 +205,19 @@ class Cells:
         count, to = self.count[:, self.there].T[:, None], to[self.there]
         price = np.outer([0.0, 0.5], np.log(self.count.sum(axis=1)))
         none = _Fit(np.zeros_like(price), np.zeros_like(price), np.full(price.shape, -np.inf))
-        found = none if near is None else replace(near, ln=none.ln)
+        best = none if near is None else replace(near, ln=none.ln)
         for (levels, chance), tried in zip(self.true, self.noise * NOISES, strict=True) if near is None else ():
             ln = count[:, 0].T @ np.log(self._likely(to @ chance))
-            at = np.broadcast_to(levels[np.argmax(ln, axis=1)], price.shape)
-            found = found.better(_Fit(at, np.full(at.shape, tried), ln.max(axis=1) - price))
-        level, sigma = found.level, found.sigma
+            level_of = np.broadcast_to(levels[np.argmax(ln, axis=1)], price.shape)
+            best = best.better(_Fit(level_of, np.full(level_of.shape, tried), ln.max(axis=1) - price))
+        level, sigma = best.level, best.sigma
         for _ in range(TURNS):
             z = (self.edges[:, None, None] - level) / sigma
             density = np.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)
             cells = (np.diff(each, axis=0).reshape(len(z) - 1, -1) for each in (ndtr(z), -density, -z * density))
             chance, by_level, by_noise = ((to @ each).reshape(-1, *level.shape) for each in cells)
             likely = self._likely(chance)
-            found = found.better(_Fit(level, sigma, (count * np.log(likely)).sum(axis=0) - price))
+            best = best.better(_Fit(level, sigma, (count * np.log(likely)).sum(axis=0) - price))
             score, of_noise = ((count * by / likely).sum(axis=0) for by in (by_level, by_noise))
             total = count.sum(axis=0) / likely
             known, both, noise = ((total * by).sum(axis=0) for by in (by_level**2, by_level * by_noise, by_noise**2))
@@ -222,7 +227,7 @@ class Cells:
             step = np.clip(of_noise / noise, -LEVEL_STEP, LEVEL_STEP)
             level = level + sigma * np.clip((score - both * step) / known, -LEVEL_STEP, LEVEL_STEP)
             sigma = np.clip(sigma * np.exp(step), *self.noise * NOISES[[0, -1]])
-        return found
+        return best
 
     def _likely(self, chance: Array) -> Array:
         return np.asarray((1.0 - ODD) * chance + ODD / self.many)
@@ -256,11 +261,9 @@ class Cells:
         if self.pile is None or side * (self.pile - end) < -self.width:
             return self.read(lambda x: clip(x, end))
         beyond = side * (self.edges[:-1] + 0.5 * self.width / self.parts - self.pile) > 0.0
-        row = csr_matrix(
-            (np.ones(int(beyond.sum())), (np.full(int(beyond.sum()), self.many - 1), np.flatnonzero(beyond))),
-            shape=self.own.shape,
-        )
-        return (self.own.multiply(~beyond) + row).tocsr()
+        read = self.own.multiply(~beyond).tolil()
+        read[self.many - 1, beyond] = 1.0
+        return read.tocsr()
 
 
 def noise_beside(y: Array) -> tuple[float, int, float]:
@@ -268,14 +271,6 @@ def noise_beside(y: Array) -> tuple[float, int, float]:
     unique, counts = np.unique(y, return_counts=True)
     commonest, most = float(unique[np.argmax(counts)]), int(counts.max())
     return commonest, most, noise_of(y[y != commonest] if most > COMMON * y.size else y)
-
-
-def _no_zeros(x: Array) -> Array:
-    """Zeros behind the point are lost: 0.05 is read as 0.5."""
-    size = np.abs(x)
-    whole = np.floor(size)
-    zeros = np.floor(-np.log10(np.maximum(size - whole, 1e-9)))
-    return np.asarray(np.sign(x) * (whole + (size - whole) * 10.0**zeros))
 
 
 def _about_zero(cells: Cells, y: Array) -> Iterator[_Map]:
@@ -288,7 +283,9 @@ def _about_zero(cells: Cells, y: Array) -> Iterator[_Map]:
         return np.where((x < 0.0) & (x > -gap), -x, x)
 
     def printed(x: Array) -> Array:
-        return _no_zeros(step * np.rint(x / step) if step > 0.0 else x)
+        """Zeros behind the point are lost: 0.05 is read as 0.5."""
+        part, whole = np.modf(np.abs(step * np.rint(x / step) if step > 0.0 else x))
+        return np.asarray(np.sign(x) * (whole + part * 10.0 ** np.floor(-np.log10(np.maximum(part, 1e-9)))))
 
     yield _Map("digits_lost", cells.read(printed))
     if gap > max(cells.noise, 1.5 * step):
@@ -352,7 +349,8 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
             fit = cells.fit(best.within(cells), fit)
         fits.append((fit.over(plain) - math.log(len(tried) if each.kind in UNEVEN else len(maps)), best, fit))
     nats, best, fit = max(fits, key=lambda tried_map: tried_map[0])
-    also = tuple(dict.fromkeys(rival.kind for more, rival, _ in fits if more > nats - ALSO and rival.kind != best.kind))
+    possible = (rival.kind for more, rival, _ in fits if more > nats - CLEARLY)
+    also = tuple(kind for kind in dict.fromkeys(possible) if kind != best.kind)
     now, to = cells.expected(fit), best.within(cells)
     if best.to is None:
         # Of a few codes noise that is not normal makes evidence as well: as it makes what the map leaves, beyond half a
@@ -381,7 +379,7 @@ def codes_of(values: Array, lattice: Lattice | None) -> Misread | None:
 
 def _drawn(cells: Cells, y: Array, to: csr_matrix, fit: _Fit) -> Array:
     """Each reading [n] as one that it may come from, drawn by chance."""
-    random, chance, found = np.random.default_rng(1), cells.of_pieces(fit), y.copy()
+    random, chance, drawn = np.random.default_rng(1), cells.of_pieces(fit), y.copy()
     other = to - to.multiply(cells.own > 0.0)
     own = cells.own.argmax(axis=0).A1 + cells.first
     for code in np.flatnonzero(np.asarray(other.sum(axis=1)).ravel() > 0.0):
@@ -394,7 +392,7 @@ def _drawn(cells: Cells, y: Array, to: csr_matrix, fit: _Fit) -> Array:
         below = possible[:, piece] < random.random(rows.size) * possible[-1, piece]
         part = parts[below.sum(axis=0)]
         if cells.step > 0.0:
-            found[rows] = y[rows] + cells.width * (own[part] - (code + cells.first))
+            drawn[rows] = y[rows] + cells.width * (own[part] - (code + cells.first))
         else:
-            found[rows] = cells.edges[part] + cells.width / cells.parts * random.random(rows.size)
-    return found
+            drawn[rows] = cells.edges[part] + cells.width / cells.parts * random.random(rows.size)
+    return drawn

@@ -63,10 +63,10 @@ def gated(recording: Recording, model: Model) -> Recording:
     samples = np.ascontiguousarray(samples, np.float32)
     used, ended = _resting(samples, recording.missing_before, table)
     if used.any():
-        at = recording.clock.place
-        at -= at[np.argmax(used)]
-        interval = at // tables.block
-        moved = np.concatenate([interval[~used], (at[ended] + 1) // tables.block])
+        places = recording.clock.place
+        places -= places[np.argmax(used)]
+        interval = places // tables.block
+        moved = np.concatenate([interval[~used], (places[ended] + 1) // tables.block])
         used &= ~np.isin(interval, np.unique(moved))
     if int(used.sum()) < 2:
         raise UserError(

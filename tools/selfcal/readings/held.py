@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.fft import next_fast_len, rfft
+from scipy.special import kl_div
 
 from selfcal.base.grid import Array, Mask, Rows
 from selfcal.logs.sampling import followed_phase, rhythm
@@ -50,26 +51,26 @@ class Held:
     even: bool = True
 
 
-def held(columns: Sequence[Array], at: Rows, off: Array | None) -> Held | None:
+def held(columns: Sequence[Array], places: Rows, off: Array | None) -> Held | None:
     """The part's own readings among rows [n], where the values of all columns [n] are held; None where they are not.
 
-    `at` [n]: places of the rows on the logger's grid; `off` [n]: the stamps' distance from it, in intervals.
+    `places` [n]: places of the rows on the logger's grid; `off` [n]: the stamps' distance from it, in intervals.
     """
 
     def equal(lag: int) -> Mask:
         """Whether a row repeats the one so many before, [n]."""
-        found = np.zeros(at.size, bool)
-        found[lag:] = np.logical_and.reduce([column[lag:] == column[:-lag] for column in columns])
-        return found
+        of_part = np.zeros(places.size, bool)
+        of_part[lag:] = np.logical_and.reduce([column[lag:] == column[:-lag] for column in columns])
+        return of_part
 
     same, again = equal(1), equal(2)
-    regular = _in_runs(same, at)
-    found = regular or _at_a_beat(same, again, at, off) or _now_and_then(same, again, at)
-    if found is None or found is regular:
-        return found
+    regular = _in_runs(same, places)
+    of_part = regular or _at_a_beat(same, again, places, off) or _now_and_then(same, again, places)
+    if of_part is None or of_part is regular:
+        return of_part
     # Repeats that stretches of a lower rate explain are theirs.
-    of_stretches = sum(one.rows.size for one in slower(columns[0]))
-    return None if 2 * of_stretches > at.size - found.rows.size else found
+    of_stretches = sum(stretch.rows.size for stretch in slower(columns[0]))
+    return None if 2 * of_stretches > places.size - of_part.rows.size else of_part
 
 
 @dataclass(frozen=True)
@@ -93,14 +94,23 @@ def slower(values: Array) -> list[Slower]:
     same = np.zeros(n, bool)
     same[1:] = values[1:] == values[:-1]
     chance = max(equal_by_chance(values), 1.0 / n)
-    found: list[Slower] = []
-    while len(found) < STRETCHES:
-        best = max((_slower(same, ratio, chance) for ratio in range(2, RATIO_MOST + 1)), key=lambda one: one.nats)
+    stretches: list[Slower] = []
+    while len(stretches) < STRETCHES:
+        tried = [_slower(same, ratio, chance) for ratio in range(2, RATIO_MOST + 1)]
+        best = max(tried, key=lambda stretch: stretch.nats)
         if best.nats < nats_of("held_samples"):
             break
-        found.append(best)
+        stretches.append(best)
         same[best.rows] = False
-    return found
+    return stretches
+
+
+def repeats_of(stretches: Sequence[Slower], n: int) -> Mask:
+    """Which of n rows repeat in stretches of a lower rate."""
+    repeats = np.zeros(n, bool)
+    for stretch in stretches:
+        repeats[stretch.rows] = True
+    return repeats
 
 
 def equal_by_chance(values: Array) -> float:
@@ -144,9 +154,9 @@ def _best_sum(worth: Array) -> tuple[float, int, int]:
     return float(gain[end]), int(np.argmin(total[: end + 1])), end
 
 
-def updates(values: Array, at: Rows) -> Rows | None:
+def updates(values: Array, places: Rows) -> Rows | None:
     """Rows at which a channel [n] is read anew, where its value is held in between or bridged by straight lines; None
-    where no one period shows. `at` [n]: places of the rows on the logger's grid.
+    where no one period shows. `places` [n]: places of the rows on the logger's grid.
 
     A new value may equal the last one, so all changes lie whole periods apart. Chance would spread them evenly."""
     steps = np.diff(values)
@@ -155,20 +165,21 @@ def updates(values: Array, at: Rows) -> Rows | None:
     rows = held_rows if 2 * held_rows.size < values.size else np.flatnonzero(bends) + 1
     if rows.size <= CHANGES_LEAST:
         return None
-    gaps = np.diff(at[rows])
+    gaps = np.diff(places[rows])
     nats, period = rhythm(gaps)
     if nats < nats_of("held_samples"):
         return None
     times = np.maximum(1, np.rint(gaps / period))
     count = np.concatenate([[0.0], np.cumsum(times)])
-    before, after = (math.floor(float(rest) / period) for rest in (at[rows[0]] - at[0], at[-1] - at[rows[-1]]))
+    first, last = places[rows[[0, -1]]]
+    before, after = math.floor((first - places[0]) / period), math.floor((places[-1] - last) / period)
     count = np.concatenate([[-before], count, [count[-1] + after]])
-    place = np.concatenate([[at[rows[0]] - before * period], at[rows], [at[rows[-1]] + after * period]])
-    every = np.interp(np.arange(count[0], count[-1] + 1.0), count, place)
-    return np.unique(np.minimum(np.searchsorted(at, np.rint(every)), at.size - 1))
+    place_of = np.concatenate([[first - before * period], places[rows], [last + after * period]])
+    every = np.interp(np.arange(count[0], count[-1] + 1.0), count, place_of)
+    return np.unique(np.minimum(np.searchsorted(places, np.rint(every)), places.size - 1))
 
 
-def _in_runs(same: Mask, at: Rows) -> Held | None:
+def _in_runs(same: Mask, places: Rows) -> Held | None:
     """Readings that repeat by chance make runs of any length, most of them of one. The runs of held ones are whole
     multiples of one length, those of several lengths of as many readings that are equal by chance."""
     starts = np.flatnonzero(~same)
@@ -178,17 +189,17 @@ def _in_runs(same: Mask, at: Rows) -> Held | None:
         return None
     times = np.maximum(1, np.rint(lengths / ratio)).astype(np.int64)
     run = np.repeat(np.arange(starts.size), times)
-    place = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)
-    rows = starts[run] + place * lengths[run] // times[run]
-    apart = np.rint(np.diff(at[rows], prepend=at[rows[0]] - ratio) / ratio).astype(np.int64)
+    in_run = np.arange(run.size) - np.repeat(np.cumsum(times) - times, times)
+    rows = starts[run] + in_run * lengths[run] // times[run]
+    apart = np.rint(np.diff(places[rows], prepend=places[rows[0]] - ratio) / ratio).astype(np.int64)
     return Held(ratio, rows, np.maximum(0, apart - 1), nats)
 
 
-def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | None:
+def _at_a_beat(same: Mask, again: Mask, places: Rows, off: Array | None) -> Held | None:
     """Rows that repeat the one before at the beat of two rates. `again` [n]: a row equals the one two before, which a
     held reading does by chance alone."""
     n = same.size
-    next_one = np.diff(at, prepend=at[0] - 2) == 1
+    next_one = np.diff(places, prepend=places[0] - 2) == 1
     pairs = max(1, int(np.count_nonzero(next_one)))
     share, chance = (int(np.count_nonzero(each & next_one)) / pairs for each in (same, again))
     excess, sd = share - chance, math.sqrt((share + chance) / n)
@@ -196,11 +207,11 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
         return None
     x = np.where(next_one, same - share, 0.0)
     size = min(n, HEAD)
-    place = at[:size] - at[0]
-    if place[-1] > 4 * HEAD:
+    head = places[:size] - places[0]
+    if head[-1] > 4 * HEAD:
         return None
-    grid = np.zeros(next_fast_len(4 * (int(place[-1]) + 1), real=True))
-    grid[place] = x[:size]
+    grid = np.zeros(next_fast_len(4 * (int(head[-1]) + 1), real=True))
+    grid[head] = x[:size]
     power = np.abs(rfft(grid)) ** 2
     mean = float(np.median(power)) / math.log(2.0)
     least = round(SHARE_LEAST * grid.size)
@@ -211,7 +222,7 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
         return None
     frequency = top / grid.size
     block = max(256, math.ceil(size * IN_BLOCK * mean / float(power[top])))
-    even = (at - at[0]).astype(np.float64)
+    even = (places - places[0]).astype(np.float64)
     phase, size_of_line = followed_phase(x, even, frequency, block)
     if off is not None:
         stamped = followed_phase(x, even + off, frequency, block)
@@ -231,8 +242,8 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
         return None
     rows = np.flatnonzero(~(same & next_one & held_there[bin_of]))
     # A row repeats where the phase passes a whole number: it is as many readings behind the rows.
-    index = at[rows] - np.floor(phase[rows] + 0.5 * frequency).astype(np.int64)
-    ratio = float(at[rows[-1]] - at[rows[0]]) / float(index[-1] - index[0])
+    index = places[rows] - np.floor(phase[rows] + 0.5 * frequency).astype(np.int64)
+    ratio = float(places[rows[-1]] - places[rows[0]]) / float(index[-1] - index[0])
     ahead = np.maximum.accumulate(index - np.arange(rows.size))
     missing = np.diff(ahead, prepend=ahead[0])
     if chance > CHANCE:
@@ -243,7 +254,7 @@ def _at_a_beat(same: Mask, again: Mask, at: Rows, off: Array | None) -> Held | N
     return Held(ratio, rows, missing, nats)
 
 
-def _now_and_then(same: Mask, again: Mask, at: Rows) -> Held | None:
+def _now_and_then(same: Mask, again: Mask, places: Rows) -> Held | None:
     """Rows that repeat the one before at no beat, where readings are hardly ever equal by chance. A run of more than
     RUN_MOST is a stuck one."""
     n = same.size
@@ -254,10 +265,10 @@ def _now_and_then(same: Mask, again: Mask, at: Rows) -> Held | None:
     if share < max(SHARE_LEAST, 10.0 * chance) or chance > CHANCE:
         return None
     expected = max(chance, 1.0 / n)
-    nats = n * (share * math.log(share / expected) - share + expected)
+    nats = n * float(kl_div(share, expected))
     if nats < nats_of("held_samples"):
         return None
     rows = np.flatnonzero(~repeats)
     ratio = n / rows.size
-    unasked = np.diff(at[rows] - rows, prepend=at[rows[0]] - rows[0])
+    unasked = np.diff(places[rows] - rows, prepend=places[rows[0]] - rows[0])
     return Held(ratio, rows, np.rint(unasked / ratio).astype(np.int64), nats, even=False)

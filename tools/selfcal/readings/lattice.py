@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 #: At 1.9 that noise is 0.44 steps and N a fifth too large; below, rounding is white noise of step^2 / 12.
 BELOW_LATTICE = 1.9
 #: Sums that show whether rounding errors are carried on, of a second and of so many readings at least: they scatter by
-#: less than this share of what rounding by itself makes of them. That takes a lattice coarser than the noise.
-CARRIED_SUMS, CARRIED_READINGS, CARRIED_SHARE, CARRIED_FROM = 120, 8, 0.5, 1.0
+#: less than this share of what rounding by itself makes of them. That takes a lattice coarser than COARSEST.
+CARRIED_SUMS, CARRIED_READINGS, CARRIED_SHARE = 120, 8, 0.5
 #: Difference of two remainders of sums that follow each other, each uniform in a step: its share in the scatter.
 REMAINDERS = 0.25
 #: Least variance that is told of a counter, steps^2 in a second: what 120 seconds show is as uncertain as 0.04.
@@ -26,11 +26,13 @@ WHITE_REMAINDERS = 0.1
 #: Values nearer than this share of the largest are one: differences of a counter are rounded so. Those of a float32 are
 #: six times as far apart.
 ROUNDED = 1e-8
-#: Steps in the noise of a reading at most where codes are compared: beyond, heavy tails look like a dead band, and ln
-#: of the counts is not smooth.
+#: Steps in the noise of a reading from which on the lattice is coarser than it. Codes are compared below alone: beyond,
+#: heavy tails look like a dead band, and ln of the counts is not smooth.
 COARSEST = 1.0
 #: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
 FINE = 0.01
+#: Largest distance of a value from its lattice, in steps.
+OFF = 0.02
 #: Last digits of printed values in a step at least, for it to show.
 PRINTED = 3.0
 #: Differences between neighbouring values from which on the values of one decade, or of one octave, show their step.
@@ -52,7 +54,7 @@ class Lattice:
     @property
     def most(self) -> float:
         """Coarseness beyond which the noise is below the lattice. Of a counter it is: else no remainder would show."""
-        return CARRIED_FROM if self.carried else BELOW_LATTICE
+        return COARSEST if self.carried else BELOW_LATTICE
 
     @property
     def too_coarse(self) -> bool:
@@ -88,7 +90,7 @@ def lattice_of(values: NDArray[np.floating[Any]], rate_hz: float) -> Lattice | N
     if size > rate_hz:
         noise = min(noise, float(np.diff(values).std()) / math.sqrt(2.0))
     coarseness = step / noise if noise > 0.0 else math.inf
-    if count >= CARRIED_SUMS and CARRIED_FROM < coarseness < math.inf:
+    if count >= CARRIED_SUMS and COARSEST < coarseness < math.inf:
         sums = within.sum(axis=1) / step
         scatter = 0.5 * float((np.diff(sums) ** 2).mean())
         if scatter < CARRIED_SHARE * size / coarseness**2:
@@ -110,10 +112,10 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
     for base in (2.0, 10.0):
         with np.errstate(divide="ignore"):
             kind = np.floor(np.log(size) / math.log(base))
-        for one in np.unique(kind[np.isfinite(kind)]):
-            for part in (unique[(kind == one) & (unique > 0.0)], unique[(kind == one) & (unique < 0.0)]):
+        for decade in np.unique(kind[np.isfinite(kind)]):
+            for part in (unique[(kind == decade) & (unique > 0.0)], unique[(kind == decade) & (unique < 0.0)]):
                 some = part.size > SHOWN and np.ptp(part) > 0.5 * step  # else one value, rounded
-                if some and not abs(_step(part) / step - 1.0) < 0.02:
+                if some and not abs(_step(part) / step - 1.0) < OFF:
                     return False
     return True
 
@@ -121,19 +123,17 @@ def _throughout(unique: NDArray[np.floating[Any]], step: float) -> bool:
 def _step(unique: NDArray[np.floating[Any]]) -> float:
     """The spacing of the lattice that all values lie on, 0 if there is none: the smallest difference between values,
     where every difference is a whole multiple of it; or to the last digit of values that are printed with few."""
-    if unique.size < 2:
-        return 0.0
     gaps = np.diff(unique)
-    gaps = gaps[gaps > ROUNDED * max(np.ptp(unique), np.abs(unique).max())]
+    gaps = gaps[gaps > ROUNDED * np.abs(unique).max(initial=0.0)]
     if not gaps.size:
         return 0.0
     q, digit = float(gaps.min()), 0.0
     if unique.size > SHOWN:
         digit = 10.0 ** math.floor(math.log10(q / PRINTED))
-        if float(np.abs(unique / digit - np.rint(unique / digit)).max()) > 0.02:
+        if float(np.abs(unique / digit - np.rint(unique / digit)).max()) > OFF:
             digit = 0.0
         else:
             q = float(np.mean(gaps[gaps < q + 2.5 * digit]))
     steps = np.rint(gaps / q)
     q = float(gaps.sum() / steps.sum())
-    return q if float(np.abs(gaps - steps * q).max()) < max(0.02 * q, 1.1 * digit) else 0.0
+    return q if float(np.abs(gaps - steps * q).max()) < max(OFF * q, 1.1 * digit) else 0.0

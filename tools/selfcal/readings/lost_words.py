@@ -9,15 +9,16 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.special import kl_div
 
 from selfcal.base.grid import Array, Mask
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import CHANGED_LEAST, Misread, noise_beside
 from selfcal.readings.lattice import step_of
 
-#: Share of the readings that are one value up to which they are left out.
-#: Of a value with more, either the value or the others may be the noise. Then most averages have too few readings too,
-#: and a bias that walks is lost between the others.
+#: Share of wrong readings up to which they are left out.
+#: Of more, either they or the others may be the noise. Then most averages have too few readings too, and a bias that
+#: walks is lost between the others.
 MOST = 0.5
 #: Readings of a value whose neighbours are looked at, at most; these on either side, and how far off they may be, in
 #: the noise.
@@ -76,9 +77,7 @@ def _alone(y: Array, sigma: float, spacing: float) -> tuple[float, float]:
     total, reach = np.concatenate([[0], np.cumsum(counts)]), max(sigma, 2.5 * spacing)
     first, last = np.searchsorted(value, value - reach), np.searchsorted(value, value + reach, "right")
     expected = 0.5 + (total[last] - total[first] - counts) / np.maximum(1, last - first - 1)
-    worth = np.where(
-        (counts >= CHANGED_LEAST) & (expected < 2.0), counts * np.log(counts / expected) - counts + expected, 0.0
-    )
+    worth = np.where((counts >= CHANGED_LEAST) & (expected < 2.0), kl_div(counts, expected), 0.0)
     top = int(np.argmax(worth))
     return float(value[top]), float(worth[top]) - math.log(value.size)
 
@@ -95,12 +94,12 @@ def _stands_out(y: Array, value: float, spacing: float) -> bool:
 
 def _rests(y: Array, own: Mask, sigma: float) -> bool:
     """Whether most of the own ones among readings [n] lie among others that rest, as many on either side."""
-    others, at = np.flatnonzero(~own), np.flatnonzero(own)
-    at = at[:: -(-at.size // SAMPLED)]
-    first = np.clip(np.searchsorted(others, at) - AROUND, 0, others.size - 2 * AROUND)
+    others, rows = np.flatnonzero(~own), np.flatnonzero(own)
+    rows = rows[:: -(-rows.size // SAMPLED)]
+    first = np.clip(np.searchsorted(others, rows) - AROUND, 0, others.size - 2 * AROUND)
     around = y[others[first[:, None] + np.arange(2 * AROUND)]]
     off = np.abs(around - np.median(around, axis=1, keepdims=True))
-    return bool(np.mean(np.quantile(off, 0.75, axis=1) < NEAR * sigma) >= 0.5)
+    return bool(np.mean(np.quantile(off, 0.75, axis=1) < NEAR * sigma) >= MOST)
 
 
 def is_limit(others: Array, value: float, count: int, step: float) -> bool:

@@ -66,8 +66,8 @@ def spans_of(values: Array) -> Misread | None:
     if not spans:
         return None
     line = _ln_of_noise(y - uniform_filter1d(y, PIECE, mode="nearest"), size)
-    found = [_of_span(y, span, line, span < size, k < len(spans) - 1) for k, span in enumerate(spans)]
-    best = max(filter(None, found), key=lambda misread: misread.nats, default=None)
+    tried = [_of_span(y, span, line, span < size, k < len(spans) - 1) for k, span in enumerate(spans)]
+    best = max(filter(None, tried), key=lambda misread: misread.nats, default=None)
     if best is None or best.nats < nats_of("misread") + math.log(len(spans)):
         return None
     if best.undone is None:
@@ -136,24 +136,24 @@ def _of_bits(values: Array, lattice: Lattice | None) -> list[Misread]:
         return []
     code = np.rint(y / lattice.step).astype(np.int64)
     low, high = (int(edge) for edge in np.quantile(code, INNER))
-    found = []
+    maps = []
     for k in range(max(2, int(math.log2(high - low + 1)) + 1)):
         bit = (code >> k) & 1
         for part in (code, code[::-1]) if k < 2 else ():
             size = int(np.argmax((part - part[0]) % 2 ** (k + 1) != 0))
             nats = (k + 1) * math.log(2.0) * np.count_nonzero(np.diff(part[:size])) - 2.0 * math.log(y.size)
-            found.append(Misread("range_change", size / y.size, nats))
+            maps.append(Misread("range_change", size / y.size, nats))
         inner = np.arange(low, high + 1)
         inner = inner[((inner >> k) & 1) == bit[0]]
         if k and bit.min() == bit.max() and np.isin(inner, code).mean() > ALIKE:
             nats = math.log(2.0) * np.count_nonzero(np.diff(code >> (k + 1))) - math.log(64.0)
-            found.append(Misread(f"bit_{'set' if bit[0] else 'clear'}", 0.5, nats))
-    return [misread for misread in found if misread.nats > nats_of("misread")]
+            maps.append(Misread(f"bit_{'set' if bit[0] else 'clear'}", 0.5, nats))
+    return [misread for misread in maps if misread.nats > nats_of("misread")]
 
 
 def misread_of(values: Array, lattice: Lattice | None) -> Misread | None:
     """How readings [n], NaN where there are none, were misread: by the likeliest map; None where they were not."""
-    found = _of_bits(values, lattice)
-    stuck = [misread for misread in found if misread.kind != "range_change"]
+    of_bits = _of_bits(values, lattice)
+    stuck = [misread for misread in of_bits if misread.kind != "range_change"]
     codes = None if stuck else codes_of(values, lattice)
-    return max(stuck[:1] or [*found, *([codes] if codes else [])], key=lambda misread: misread.nats, default=None)
+    return max(stuck[:1] or [*of_bits, *([codes] if codes else [])], key=lambda misread: misread.nats, default=None)

@@ -18,11 +18,11 @@ from typing import TypeVar
 
 import numpy as np
 from scipy.ndimage import median_filter
-from scipy.special import binom, fdtrc, gammainc, gammaincinv
+from scipy.special import binom, fdtrc, gammainc, gammaincinv, kl_div
 
 from selfcal.base.grid import MEDIAN_SD, Array, Mask, Rows, block_means
 from selfcal.logs.recording import SIDE_CHANNELS, Recording
-from selfcal.readings.budget import SHARES
+from selfcal.readings.budget import CLEARLY, SHARES
 
 Time = TypeVar("Time", int, float)
 
@@ -47,10 +47,8 @@ QUIETER = (0.1587, 0.5)
 #: Nats by which the search over windows costs all axes together less than as many windows apart: of 124 clean records
 #: of 600 and 1500 s at 1 and 10 Hz the largest of one is 1.5 to 1.9 less in the median, and 2.0 to 2.7 in a tenth.
 FEWER = 2.0
-#: Nats that each of several stretches of all axes has at least, and from which on an axis is in one of others: ln 20.
-TOGETHER = 3.0
-#: Least probability whose logarithm is taken.
-TINY = 1e-300
+#: Smallest probability that a float holds.
+TINY = np.finfo(np.float64).tiny
 #: Correlation of axes at rest from which on they share a source, beyond chance.
 SHARED = 0.05
 #: Standard deviations of a correlation by chance from which on axes depend on each other, and that of a copy.
@@ -106,6 +104,11 @@ class Stretch:
     nats: Array
     net: float
 
+    @property
+    def several(self) -> bool:
+        """Whether axes move together."""
+        return int(self.axes.sum()) > 1
+
 
 def moves_of(recording: Recording) -> dict[str, Moved]:
     """By axis when the sensor moved, s from the first row. Looked at once."""
@@ -114,37 +117,37 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         channels = {column for column, _ in SIDE_CHANNELS.values()}
         names = [name for name in recording.columns if name not in channels]
         energy = energy_of(recording, names)
-        found: dict[str, list[Stretch]] = {name: [] for name in names}
-        for one in stretches(energy):
-            for k in np.flatnonzero(one.axes).tolist():
-                found[names[k]].append(one)
-        times = {name: joined([_times(energy, one, recording) for one in found[name]]) for name in names}
+        of_axis: dict[str, list[Stretch]] = {name: [] for name in names}
+        for stretch in stretches(energy):
+            for k in np.flatnonzero(stretch.axes).tolist():
+                of_axis[names[k]].append(stretch)
+        times = {name: joined([_times(energy, stretch, recording) for stretch in of_axis[name]]) for name in names}
         events = events_of(times).values()
 
         def within(k: int, spans: Sequence[tuple[float, float]]) -> Moved:
             name = names[k]
-            own = [one for one in found[name] if _overlap(spans, *_times(energy, one, recording))]
+            own = [stretch for stretch in of_axis[name] if _overlap(spans, *_times(energy, stretch, recording))]
             moved = tuple(each for each in times[name] if _overlap(spans, *each))
-            nats, net = sum(float(one.nats[k]) for one in own), sum(one.net for one in own)
+            nats, net = sum(float(stretch.nats[k]) for stretch in own), sum(stretch.net for stretch in own)
             return Moved(moved, nats, net, _loudness(recording, name, energy, own, times[name]))
 
         for k, name in enumerate(names):
             each = tuple(within(k, spans) for spans in events)
-            seen[name] = replace(within(k, times[name]), events=tuple(one for one in each if one.intervals))
-    return {name: one for name, one in seen.items() if one.intervals}
+            seen[name] = replace(within(k, times[name]), events=tuple(event for event in each if event.intervals))
+    return {name: moved for name, moved in seen.items() if moved.intervals}
 
 
-def _times(energy: Energy, one: Stretch, recording: Recording) -> tuple[float, float]:
+def _times(energy: Energy, stretch: Stretch, recording: Recording) -> tuple[float, float]:
     """Begin and end of a stretch, s, a margin more on either side."""
-    begin, end, length_s = one.begin * energy.piece_s, one.end * energy.piece_s, recording.duration_s
+    begin, end, length_s = stretch.begin * energy.piece_s, stretch.end * energy.piece_s, recording.duration_s
     margin_s = max(MARGIN_S, 3.0 * energy.piece_s)  # the first loud samples may look like single wild ones
     return begin - margin_s if begin > EDGE_S else 0.0, end + margin_s if end < length_s - EDGE_S else length_s
 
 
 def _loudness(
-    recording: Recording, name: str, energy: Energy, found: Sequence[Stretch], times: Sequence[tuple[float, float]]
+    recording: Recording, name: str, energy: Energy, moved: Sequence[Stretch], times: Sequence[tuple[float, float]]
 ) -> float:
-    """The ratio of Moved, of the stretches that were `found` in an axis and the `times` left out for them."""
+    """The ratio of Moved, of the stretches in which an axis `moved` and the `times` left out for them."""
     y, time = recording.columns[name].values, recording.clock_of(name).time_s
     rest = np.isfinite(y)
 
@@ -156,8 +159,8 @@ def _loudness(
     steps = np.abs(np.diff(y[rest]))
     noise = float(np.median(steps)) / (MEDIAN_SD * math.sqrt(2.0)) if steps.size else 0.0
     total, count = 0.0, 0
-    for one in found:
-        a, b = one.begin * energy.piece_s, one.end * energy.piece_s
+    for stretch in moved:
+        a, b = stretch.begin * energy.piece_s, stretch.end * energy.piece_s
         sides = [rows(a - EDGE_S - PUSH_S, a), rows(b, b + EDGE_S + PUSH_S)]
         levels = [(np.median(time[at][rest[at]]), np.median(y[at][rest[at]])) for at in sides if rest[at].any()]
         if levels:
@@ -179,8 +182,8 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
     scaled_rows = [_scaled(own) for own, _ in tame]
     rows = _apart_from_each_other([own for own, _ in tame], scaled_rows)
 
-    def pieces(at: Array) -> Rows:
-        return np.minimum((at / piece_s + 1e-6).astype(np.int64), count - 1)
+    def pieces(time_s: Array) -> Rows:
+        return np.minimum((time_s / piece_s + 1e-6).astype(np.int64), count - 1)
 
     def apart(k: int) -> tuple[Array, Rows]:
         scaled = _scaled(_tame(recording.columns[names[k]].values[there[k]])[0])
@@ -194,17 +197,17 @@ def energy_of(recording: Recording, names: Sequence[str]) -> Energy:
             pushes, more = band == len(sizes) - 1, size > 1
             if (band and not (pushes or more)) or (more and not BAND_LEAST <= size <= own.size // SIDE_SQUARES):
                 continue
-            means, at = block_means(own, size), block_means(time, size)
+            means, middle_s = block_means(own, size), block_means(time, size)
             around = round(PUSH_S * clock.rate_hz / size) if pushes else LEVEL
             scaled = _scaled(_tame(means, around)[0] if pushes else means, around)
             if pushes:
                 scaled = np.maximum(np.abs(scaled) - PUSH, 0.0)
-            piece = pieces(at[: scaled.size])
+            piece = pieces(middle_s[: scaled.size])
             square = np.minimum(scaled**2, tame[k][1])
             totals = counts[k, band], sums[k, band], *([squares[k]] if pushes else [])
             for power, total in enumerate(totals):
                 total[:] = np.bincount(piece, square**power, minlength=count)
-    return Energy(piece_s, sums, counts, squares, apart, np.array([one for _, one in tame]))
+    return Energy(piece_s, sums, counts, squares, apart, np.array([most for _, most in tame]))
 
 
 def _scaled(y: Array, size: int = LEVEL) -> Array:
@@ -220,27 +223,22 @@ def _scaled(y: Array, size: int = LEVEL) -> Array:
 def _apart_from_each_other(rows: Sequence[Array], scaled: Sequence[Array]) -> list[Array]:
     """Readings of axes, [n] each, that are independent at rest: those of one clock that correlate in the nearest units
     that do not. Of a copy nothing is left. `scaled`: about their level over their noise."""
-    found = list(rows)
-    for size in {one.size for one in scaled} - {0}:
-        own = [k for k, one in enumerate(scaled) if one.size == size]
+    free = list(rows)
+    for size in {axis.size for axis in scaled} - {0}:
+        own = [k for k, axis in enumerate(scaled) if axis.size == size]
         together = _correlation([scaled[k] for k in own])
         copies: Mask = np.any(np.abs(np.tril(together, -1)) > COPY, axis=1)
         for k in np.flatnonzero(copies).tolist():
-            found[own[k]] = np.zeros(size)
+            free[own[k]] = np.zeros(size)
         own = [k for k, copy in zip(own, copies, strict=True) if not copy]
         together = together[np.ix_(~copies, ~copies)]
         if np.abs(together - np.eye(len(own))).max(initial=0.0) > CORRELATED / math.sqrt(size):
             values, vectors = np.linalg.eigh(together)
-            noise = [float(np.median(np.abs(rows[k] - _level(rows[k])))) for k in own]
-            mixed = (
-                vectors
-                / np.sqrt(np.maximum(values, 1.0 - COPY))
-                @ vectors.T
-                @ [rows[k] / n for k, n in zip(own, noise, strict=True)]
-            )
-            for k, row in zip(own, mixed, strict=True):
-                found[k] = row
-    return found
+            noise = np.array([float(np.median(np.abs(rows[k] - _level(rows[k])))) for k in own])
+            whiten = vectors / np.sqrt(np.maximum(values, 1.0 - COPY)) @ vectors.T / noise
+            for k, row in zip(own, whiten @ [rows[k] for k in own], strict=True):
+                free[k] = row
+    return free
 
 
 def _correlation(rows: Sequence[Array] | Array) -> Array:
@@ -255,8 +253,7 @@ def _correlation(rows: Sequence[Array] | Array) -> Array:
 
 def _level(y: Array, size: int = LEVEL) -> Array:
     """Running median of readings [n]."""
-    found: Array = median_filter(y, max(LEVEL, min(size, y.size // 4)) | 1, mode="nearest")
-    return found
+    return np.asarray(median_filter(y, max(LEVEL, min(size, y.size // 4)) | 1, mode="nearest"))
 
 
 def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
@@ -274,15 +271,16 @@ def _tame(y: Array, size: int = LEVEL) -> tuple[Array, float]:
 def stretches(energy: Energy) -> list[Stretch]:
     """The stretches in which the sensor moves. Those that are found no longer hide others beside them: their energy
     is taken out."""
-    found: list[Stretch] = []
-    while more := _loud_windows(energy, found):
+    known: list[Stretch] = []
+    while more := _loud_windows(energy, known):
         margin = math.ceil(MARGIN_S / energy.piece_s)
-        for one in more:
-            gone = slice(max(0, one.begin - margin), one.end + margin)
+        for stretch in more:
+            gone = slice(max(0, stretch.begin - margin), stretch.end + margin)
             energy.sums[..., gone] = energy.counts[..., gone] = energy.squares[..., gone] = 0.0
-        found += more
-    together = [one for one in found if one.axes.sum() > 1]
-    return [one for one in found if one.axes.sum() == 1] if together and _of_one_source(energy, together) else found
+        known += more
+    together = [stretch for stretch in known if stretch.several]
+    source = together and _of_one_source(energy, together)
+    return [stretch for stretch in known if not (source and stretch.several)]
 
 
 def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch]:
@@ -293,7 +291,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
     while lengths[-1] * energy.piece_s <= WINDOW_S and 8 * lengths[-1] <= pieces:
         last = lengths[-1]
         lengths.append(last + max(1, last & -last if last & (last - 1) else last // 2))
-    found: list[tuple[float, int, int, Mask]] = []
+    loud: list[tuple[float, int, int, Mask]] = []
     wide, used = np.ones((axes, bands)), np.flatnonzero(energy.counts.any(axis=(0, 2)))
     lengths, before = lengths if used.size else [], energy.before()
     for length in lengths:
@@ -307,26 +305,26 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         looks = math.log(used.size * pieces / length)
         singly = alone.max(axis=0) - looks - math.log(axes * len(lengths))
         for net, several in ((others.max(axis=0) - looks + FEWER, True), (singly, False)):
-            for at in np.flatnonzero(net > (TOGETHER if several else -math.log(SHARE))):
-                which = loudest[:, at] > TOGETHER if several else np.arange(axes) == np.argmax(alone[:, at])
+            for window in np.flatnonzero(net > (CLEARLY if several else -math.log(SHARE))):
+                which = loudest[:, window] > CLEARLY if several else np.arange(axes) == np.argmax(alone[:, window])
                 if several == (which.sum() > 1):
-                    found.append((float(net[at]), int(begin[at]), length, which))
+                    loud.append((float(net[window]), int(begin[window]), length, which))
     taken = np.zeros(pieces, bool)
     apart: list[Stretch] = []
     sure = -math.log(SHARE)  # a stretch that is sure by itself says nothing of others, and no other takes its place
-    for net, first, length, which in sorted(found, key=lambda one: (one[0] <= sure, one[3].sum() == 1, -one[0])):
+    for net, first, length, which in sorted(loud, key=lambda entry: (entry[0] <= sure, entry[3].sum() == 1, -entry[0])):
         if not taken[first : first + length].any():
             a, b = _ends(energy, *_ends(energy, first, first + length, which), which)
             nats = _nats(energy, before, np.array([a]), b - a, np.ones((axes, bands)))[0][:-1, :, 0].max(axis=1)
             of_others = np.count_nonzero(which) == 1
-            more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else TOGETHER))
+            more = _sharing(energy, a, b, which) & (nats > (-math.log(SHARE) if of_others else CLEARLY))
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
-    nets = sorted((one.net for one in [*known, *apart] if one.axes.sum() > 1 and one.net <= sure), reverse=True)
+    nets = sorted((each.net for each in [*known, *apart] if each.several and each.net <= sure), reverse=True)
     # At rest exp(-net) stretches of several axes are beyond a net: the fewest that are together no chance.
     least = [net for many, net in enumerate(nets, 1) if gammainc(many, math.exp(-net)) < SHARE]
-    return [one for one in apart if one.net > sure or (one.axes.sum() > 1 and one.net >= max(least, default=sure))]
+    return [each for each in apart if each.net > sure or (each.several and each.net >= max(least, default=sure))]
 
 
 def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
@@ -392,7 +390,7 @@ def _of_band(
         most = energy.most[:, None]
         share = np.exp(-0.5 * most) + sums[:, -1:] / (most * np.maximum(counts[:, -1:], 1.0))
         far, usual = own * n / most, n * share
-        rare = np.where(far > usual, far * np.log(np.maximum(far, TINY) / np.maximum(usual, TINY)) - far + usual, 0.0)
+        rare = np.where(far > usual, kl_div(far, usual), 0.0)
         nats = np.minimum(nats, np.concatenate([rare, np.take_along_axis(rare, order, 0).cumsum(axis=0)]))
         both |= own > 0.5 * most
     axes, ways = len(sums), binom(len(order), 1.0 + np.arange(len(order)))
@@ -424,7 +422,7 @@ def _sharing(energy: Energy, begin: int, end: int, axes: Mask) -> Mask:
     n = 0.5 / SQUARES * energy.counts[..., begin:end].sum(axis=2)
     r = np.quantile(ratio[axes], 0.5, axis=0, method="lower")
     nats, expected = n * (ratio * (1.0 - 1.0 / r) - np.log(r)), n * (r - 1.0 - np.log(r))
-    return np.asarray(nats.max(axis=1) > np.minimum(TOGETHER, 0.5 * expected.max(axis=1)))
+    return np.asarray(nats.max(axis=1) > np.minimum(CLEARLY, 0.5 * expected.max(axis=1)))
 
 
 def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
@@ -448,16 +446,16 @@ def _ends(energy: Energy, begin: int, end: int, axes: Mask) -> tuple[int, int]:
 def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
     """Whether the axes that moved share a source at rest, each with another one, and it alone is loud where they moved.
     It is the direction in which they are loudest, in units of the axes' joint noise at rest."""
-    axes = np.flatnonzero(np.any([one.axes for one in moved], axis=0))
+    axes = np.flatnonzero(np.any([stretch.axes for stretch in moved], axis=0))
     parts = [energy.apart(k) for k in axes.tolist()]
     if len({piece.size for _, piece in parts}) > 1:
         return False
     values, piece = np.array([part for part, _ in parts]), parts[0][1]
-    inside = np.any([(piece >= one.begin) & (piece < one.end) for one in moved], axis=0)
+    inside = np.any([(piece >= stretch.begin) & (piece < stretch.end) for stretch in moved], axis=0)
     together = _correlation(values[:, ~inside])
     linked = np.abs(together) > SHARED + CORRELATED / math.sqrt(values.shape[1])
     linked = np.linalg.matrix_power(linked.astype(float), axes.size) > 0.0  # by others too
-    loudest = np.max([one.nats[axes] for one in moved], axis=0)
+    loudest = np.max([stretch.nats[axes] for stretch in moved], axis=0)
     sure = loudest >= min(-math.log(SHARE), float(loudest.max()))
     if not linked[np.ix_(sure, sure)].all() or (linked.sum(axis=1)[sure] == 1).any():
         return False
@@ -473,11 +471,11 @@ def events_of(
 ) -> dict[tuple[str, ...], list[tuple[float, float]]]:
     """Events by their axes, of the intervals of each axis: those that meet are one, and those of the same axes are one
     again."""
-    found: dict[tuple[str, ...], list[tuple[float, float]]] = {}
+    events: dict[tuple[str, ...], list[tuple[float, float]]] = {}
     for each in joined([each for own in intervals.values() for each in own]):
         names = tuple(name for name, own in intervals.items() if _overlap(own, *each))
-        found.setdefault(names, []).append(each)
-    return found
+        events.setdefault(names, []).append(each)
+    return events
 
 
 def _overlap(intervals: Sequence[tuple[float, float]], begin: float, end: float) -> bool:
@@ -486,10 +484,10 @@ def _overlap(intervals: Sequence[tuple[float, float]], begin: float, end: float)
 
 def joined(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:
     """In order of time, those that touch made one."""
-    found: list[tuple[Time, Time]] = []
+    spans: list[tuple[Time, Time]] = []
     for a, b in sorted(intervals):
-        if found and a <= found[-1][1]:
-            found[-1] = (found[-1][0], max(b, found[-1][1]))
+        if spans and a <= spans[-1][1]:
+            spans[-1] = (spans[-1][0], max(b, spans[-1][1]))
         else:
-            found.append((a, b))
-    return found
+            spans.append((a, b))
+    return spans

@@ -6,7 +6,7 @@ None of it needs a fit. `identify` and `diagnose` look at it once, at the record
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
@@ -14,19 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
-from scipy.special import log_ndtr, ndtr, ndtri_exp
+from scipy.special import kl_div, log_ndtr, ndtr, ndtri_exp
 
 from selfcal.base.grid import Array, Mask, Rows, block_means, equal_runs, noise_of, runs
-from selfcal.logs.recording import Column, Recording
+from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
-from selfcal.readings.codes import ELSEWHERE, PIECE, PIECES, UNEVEN, Cells, Misread
-from selfcal.readings.held import Held, Slower, held, slower
+from selfcal.readings.codes import CHANGED_LEAST, ELSEWHERE, PIECE, PIECES, UNEVEN, Cells, Misread
+from selfcal.readings.held import Held, Slower, held, repeats_of, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
-from selfcal.readings.lost_words import Recurring, is_limit, recurring_of
+from selfcal.readings.lost_words import MOST, Recurring, is_limit, recurring_of
 from selfcal.readings.misread import misread_of, spans_of
 from selfcal.readings.motion import Moved, moves_of
+from selfcal.readings.rest import FEWEST
 
 #: Rows of a recording whose readings are kept once they were looked at, at most.
 KEPT_MOST = 1 << 22
@@ -58,8 +59,7 @@ class Clipped:
     @property
     def mask(self) -> Mask:
         """Every clipped reading, [n]."""
-        found: Mask = np.logical_or.reduce(list(self.limits.values()))
-        return found
+        return np.asarray(np.logical_or.reduce(list(self.limits.values())))
 
     @property
     def limit(self) -> float:
@@ -69,8 +69,6 @@ class Clipped:
 
 #: A model file has a range to six digits: readings at the limit that it states may lie so much beyond.
 ROUNDED = 1e-5
-#: Share of readings beyond the range from which on the others are no readings of a sensor either.
-MOST_BEYOND = 0.5
 #: Share of readings beyond the range from which on they count as clipped, and noises to the range at most: the noise of
 #: the others is too small.
 BEYOND_MOST, BEYOND_SD = 0.01, 8.0
@@ -104,15 +102,10 @@ class Readings:
     changes: tuple[Change, ...] = ()
     slower: tuple[Slower, ...] = ()
 
-    @property
-    def held_hz(self) -> float | None:
-        """The rate of the part, where the logger asked oftener."""
-        return None if self.held is None else self.recording.rate_hz
-
     def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
         """Samples of an engine that are not used, by reason, with the readings that are none or that are clipped."""
-        found = {**self.kept_out, **{key: count + self.kept_out.get(key, 0) for key, count in kept_out.items()}}
-        return {**found, "not_finite": found["not_finite"] - int((~np.isfinite(self.working)).sum())}
+        counts = {**self.kept_out, **{key: count + self.kept_out.get(key, 0) for key, count in kept_out.items()}}
+        return {**counts, "not_finite": counts["not_finite"] - int((~np.isfinite(self.working)).sum())}
 
     @property
     def coarse(self) -> float:
@@ -120,7 +113,7 @@ class Readings:
         values = self.working[np.isfinite(self.working)]
         with np.errstate(over="ignore"):
             largest = np.float32(np.abs(values).max(initial=0.0))
-        noise = float(np.diff(values).std()) / math.sqrt(2.0) if values.size > 2 else 0.0
+        noise = float(np.diff(values).std()) / math.sqrt(2.0) if values.size > 1 else 0.0
         return float(np.spacing(largest)) / noise if noise > 0.0 and np.isfinite(largest) else 0.0
 
     def matters(self, block: int) -> bool:
@@ -135,33 +128,34 @@ class Readings:
     @property
     def intervals(self) -> list[list[float]]:
         """Start and end of every stuck stretch, s."""
-        return [list(interval) for interval in _intervals(self.recording, self.stuck)]
+        time, step = self.recording.time_s, 1.0 / self.recording.rate_hz
+        return [[float(time[a]), float(time[b - 1]) + step] for a, b in runs(self.stuck)]
 
     @property
     def slower_intervals(self) -> list[list[float]]:
         """Start and end of every stretch of a slower rate, s."""
         time, step = self.recording.time_s, 1.0 / self.recording.rate_hz
-        return sorted([float(time[one.rows[0] - 1]), float(time[one.rows[-1]]) + step] for one in self.slower)
+        ends = (stretch.rows[[0, -1]] for stretch in self.slower)
+        return sorted([float(time[first - 1]), float(time[last]) + step] for first, last in ends)
 
 
 def look(recording: Recording, axis: str, group: Group) -> Readings:
     """The readings of an axis at the part's own rate. O(n log n)."""
     even, changes = evened(recording)
-    own, found = thinned(even, (axis,))
-    return replace(readings_of(own, axis, group), held=found, changes=changes)
+    own, of_part = thinned(even, (axis,))
+    return replace(readings_of(own, axis, group), held=of_part, changes=changes)
 
 
 def within(values: NDArray[np.floating[Any]], group: Group) -> Mask:
     """Which readings [n] are no farther than the range of the part."""
-    found: Mask = np.abs(values) <= (group.range * (1.0 + ROUNDED) if group.range > 0.0 else math.inf)
-    return found
+    return np.asarray(np.abs(values) <= (group.range * (1.0 + ROUNDED) if group.range > 0.0 else math.inf))
 
 
 def mostly_beyond(values: NDArray[np.floating[Any]], group: Group) -> str:
     """What to say where most readings [n] lie beyond the range: then the others are none either. Empty elsewhere."""
     there = _known(values)
     share = 1.0 - float(within(there, group).mean()) if there.size else 0.0
-    if share <= MOST_BEYOND:
+    if share <= MOST:
         return ""
     said = f"{100.0 * share:.0f} % of the readings are beyond the range of {group.range:g} {group.unit}: is the unit "
     return f"{said}right, or are words of the log swapped or lost?"
@@ -174,11 +168,11 @@ def readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         return _readings_of(recording, axis, group)
     looks: list[tuple[float, Readings]]
     looks = recording.seen.setdefault((axis, group.unit, group.stuck_limit), [])
-    for known, found in looks:
-        values = (recording.in_unit(axis, group.unit), found.values)
+    for known, readings in looks:
+        values = (recording.in_unit(axis, group.unit), readings.values)
         most = max(float(np.max(np.abs(_known(each)), initial=0.0)) for each in values)
-        if known == group.range or all(most <= one or not one > 0.0 for one in (known, group.range)):
-            return found
+        if known == group.range or all(most <= limit or not limit > 0.0 for limit in (known, group.range)):
+            return readings
     looks.append((group.range, _readings_of(recording, axis, group)))
     return looks[-1][1]
 
@@ -191,7 +185,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
         values = misread.undone
     # Readings beyond the part's range are none: the engines leave them out. Of many it is known that they are beyond.
     inside = within(values, group)
-    if inside.sum() < 2 or not np.ptp(values[inside]) > 0.0:
+    if not (inside.any() and np.ptp(values[inside]) > 0.0):
         return Readings(recording, values, values, values, None, none, none, misread=misread)
     beyond = float(np.mean(~inside & np.isfinite(values)))
     sound = values if inside.all() else np.where(inside, values, np.nan)
@@ -219,12 +213,12 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if stuck.any():
         sound = np.where(stuck, np.nan, sound)
     stretches = tuple(slower(sound))
-    repeats = (
-        np.isin(np.arange(values.size), np.concatenate([stretch.rows for stretch in stretches])) if stretches else none
-    )
+    repeats = repeats_of(stretches, values.size)
     left_out = lost | stuck | repeats
     values = np.where(left_out, np.nan, values) if left_out.any() else values
-    moving, moved = _moving(recording, axis)
+    moved, moving, time = moves_of(recording).get(axis), none.copy(), recording.time_s
+    for begin_s, end_s in moved.intervals if moved is not None else ():
+        moving |= (time >= begin_s) & (time < end_s)
     if stretches or moving.any():
         sound = np.where(repeats | moving, np.nan, sound)
     folded = misread is not None and misread.undone is None and misread.kind != "range_change"  # ends at zero
@@ -264,36 +258,21 @@ def _known(values: NDArray[Any]) -> NDArray[Any]:
     return values if finite.all() else values[finite]
 
 
-def _intervals(recording: Recording, mask: Mask) -> list[tuple[float, float]]:
-    """Start and end of every stretch of a mask [n], s."""
-    time, step = recording.time_s, 1.0 / recording.rate_hz
-    return [(float(time[a]), float(time[b - 1]) + step) for a, b in runs(mask)]
-
-
-def _moving(recording: Recording, axis: str) -> tuple[Mask, Moved | None]:
-    """Rows [n] in which the sensor moved, by all axes, and the motion of the axis."""
-    moved, time = moves_of(recording).get(axis), recording.time_s
-    found = np.zeros(time.size, bool)
-    for begin_s, end_s in moved.intervals if moved is not None else ():
-        found |= (time >= begin_s) & (time < end_s)
-    return found, moved
-
-
 # ------------------------------------------------------------------------------------------------------ change of rate
 
 
 def evened(recording: Recording) -> tuple[Recording, tuple[Change, ...]]:
     """The recording on one even grid, where its rate changes: means over an interval that all rates share."""
     off = recording.off_grid_s
-    if off is None or off.size < 60:
+    if off is None:
         return recording, ()
     time = recording.time_s
     time += off
-    found = tuple(rate_changes(time))
-    if not found:
+    changes = tuple(rate_changes(time))
+    if not changes:
         return recording, ()
-    intervals = [1.0 / rate_hz for rate_hz in (found[0].before_hz, *(change.after_hz for change in found))]
-    return _regridded(recording, time, [change.row for change in found], intervals), found
+    intervals = [1.0 / rate_hz for rate_hz in (changes[0].before_hz, *(change.after_hz for change in changes))]
+    return _regridded(recording, time, [change.row for change in changes], intervals), changes
 
 
 def _regridded(recording: Recording, time: Array, rows: Sequence[int], intervals: Sequence[float]) -> Recording:
@@ -311,47 +290,47 @@ def _regridded(recording: Recording, time: Array, rows: Sequence[int], intervals
             first += sizes[-1].size
         gaps = np.rint(np.maximum(0.0, np.diff(here, prepend=here[0]) - 0.5 * step) / step).astype(np.int64)
         gaps = np.where(gaps > 1, gaps - 1, 0)  # a late stamp is no gap
-        at = (np.arange(here.size) + np.cumsum(gaps)) // block
-        index[begin:end] = first + at
-        sizes.append(np.full(int(at[-1]) + 1, block))
+        cell = (np.arange(here.size) + np.cumsum(gaps)) // block
+        index[begin:end] = first + cell
+        sizes.append(np.full(int(cell[-1]) + 1, block))
         first, last_s = first + sizes[-1].size, float(here[-1])
     size = np.concatenate(sizes)
     used = np.bincount(index, minlength=first)
     whole = np.flatnonzero(used == size)
-    columns = {
-        name: column
-        if column.clock is not None
-        else Column(name, column.unit, np.bincount(index, column.values, minlength=first)[whole] / used[whole])
-        for name, column in recording.columns.items()
-    }
     missing = np.diff(whole, prepend=-1) - 1
     missing[0] = 0
-    rate = float(f"{1.0 / cell_s:.10g}")
-    moved = _with_moving(recording, np.searchsorted(index, whole), missing, time.size / first)
-    return replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
+
+    def means(values: Array) -> Array:
+        return np.asarray(np.bincount(index, values, minlength=first)[whole] / used[whole])
+
+    rate_hz = float(f"{1.0 / cell_s:.10g}")
+    return _fewer(recording, rate_hz, means, np.searchsorted(index, whole), missing, time.size / first)
 
 
-def _with_moving(recording: Recording, rows: Rows, missing: Rows, ratio: float) -> dict[str, Any]:
-    """The samples left out for motion of a recording of fewer rows: these `rows` [m] of it, each of `ratio` of its own,
-    and `missing` [m] before each."""
-    if recording.moving_before is None:
-        return {}
-    total = np.cumsum(recording.moving_before)[rows]
-    moved = np.rint(np.diff(total, prepend=total[:1]) / ratio).astype(np.int64)
-    return {"moving_before": np.minimum(moved, missing), "moving": round(recording.moving / ratio)}
+def _fewer(
+    recording: Recording, rate_hz: float, made: Callable[[Array], Array], rows: Rows, missing: Rows, ratio: float
+) -> Recording:
+    """The recording of fewer rows, each `made` of `ratio` of its own from these `rows` [m] on, `missing` [m] before
+    each."""
+    columns = {
+        name: column if column.clock is not None else replace(column, values=made(column.values))
+        for name, column in recording.columns.items()
+    }
+    moved = recording.moving_before
+    if moved is not None:
+        total = np.cumsum(moved)[rows]
+        moved = np.minimum(np.rint(np.diff(total, prepend=total[:1]) / ratio).astype(np.int64), missing)
+    fewer = replace(recording, rate_hz=rate_hz, columns=columns, missing_before=missing, off_grid_s=None)
+    return replace(fewer, moving_before=moved, moving=round(recording.moving / ratio))
 
 
 def _common(intervals: Sequence[float]) -> tuple[int, ...]:
     """Samples of each interval (s) that take the same time: the fewest, else those that fit best within COMMON_S."""
-    best, least, longest = (1,) * len(intervals), math.inf, max(*intervals, 1e-9)
-    for count in range(1, max(1, int(COMMON_S / longest)) + 1):
-        counts = tuple(max(1, round(count * longest / one)) for one in intervals)
-        off = max(abs(number * one / (count * longest) - 1.0) for number, one in zip(counts, intervals, strict=True))
-        if off < COMMON_OFF:
-            return counts
-        if off < least:
-            best, least = counts, off
-    return best
+    longest = max(intervals)
+    times = np.arange(1, max(1, int(COMMON_S / longest)) + 1)[:, None] * longest
+    counts = np.maximum(1, np.rint(times / intervals)).astype(np.int64)
+    off = np.abs(counts * np.array(intervals) / times - 1.0).max(axis=1)
+    return tuple(counts[np.argmax(off < COMMON_OFF) if off.min() < COMMON_OFF else np.argmin(off)].tolist())
 
 
 # -------------------------------------------------------------------------------------------------------- held readings
@@ -361,33 +340,28 @@ def thinned(recording: Recording, axes: tuple[str, ...]) -> tuple[Recording, Hel
     """The recording with each reading of the part once, where all of `axes` hold every reading for as long. Else the
     recording as it is, and None."""
     each = [_held(recording, (name,)) for name in axes]
-    if not axes or any(one is None for one in each):
+    if not axes or any(own_held is None for own_held in each):
         return recording, None
-    ratios = [one.ratio for one in each if one is not None]
-    found = each[0] if len(axes) == 1 else _held(recording, axes)
-    if found is None or max(ratios) > 1.01 * min(ratios):
+    ratios = [own_held.ratio for own_held in each if own_held is not None]
+    together = each[0] if len(axes) == 1 else _held(recording, axes)
+    if together is None or max(ratios) > 1.01 * min(ratios):
         return recording, None
-    columns = {
-        name: one if one.clock is not None else Column(name, one.unit, one.values[found.rows])
-        for name, one in recording.columns.items()
-    }
-    rate, missing = recording.rate_hz / found.ratio, found.missing
-    moved = _with_moving(recording, found.rows, missing, found.ratio)
-    own = replace(recording, rate_hz=rate, columns=columns, missing_before=missing, off_grid_s=None, **moved)
-    return own, found
+    rows, ratio = together.rows, together.ratio
+    own = _fewer(recording, recording.rate_hz / ratio, lambda values: values[rows], rows, together.missing, ratio)
+    return own, together
 
 
 def own_rows(recording: Recording, axis: str) -> Rows | None:
     """The rows that hold a new reading of an axis, where it holds each for several rows; else None."""
-    found = _held(recording, (axis,))
-    return None if found is None else found.rows
+    of_part = _held(recording, (axis,))
+    return None if of_part is None else of_part.rows
 
 
 def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
     off = recording.off_grid_s
-    at = recording.clock.place
+    places = recording.clock.place
     values = [recording.columns[name].values for name in axes]
-    return held(values, at, None if off is None else off * recording.rate_hz)
+    return held(values, places, None if off is None else off * recording.rate_hz)
 
 
 # ------------------------------------------------------------------------------------------------------- stuck readings
@@ -400,16 +374,16 @@ def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]
     -k ln p. A dependence of neighbours raises every p alike: as much as runs of two and of three readings say."""
     n, none = values.size, np.zeros(values.size, bool)
     size = max(PIECE, -(-n // PIECES))
-    if lengths.max(initial=0) < 3 or n < 2 * size:
+    long = lengths > 2
+    if not long.any() or n < 2 * size:
         return none, 0.0
     piece = np.minimum(np.arange(n) // size, n // size - 1)
     _, code = np.unique(values, return_inverse=True)  # NaN are one code, and in no run
     _, cell, counts = np.unique(piece * np.int64(n) + code, return_inverse=True, return_counts=True)
-    long = lengths > 2
     of_run = counts[cell[starts[long]]]
     del piece, code, cell  # as long as the record
     many, cells = np.unique(counts, return_counts=True)
-    readings, at = many * cells, np.searchsorted(many, of_run)
+    readings, row = many * cells, np.searchsorted(many, of_run)
     # Chance of the first repeat, and of each later one; those that are alone show both.
     p = many / size
     pairs, single = float((p * readings).sum()), float(np.count_nonzero(lengths == 2))
@@ -419,14 +393,14 @@ def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]
     later = np.minimum(p * max(alike, alone), 1.0 - 1.0 / n)
     each, once = -np.log(later), -np.log(first)
     worth = np.zeros(lengths.size)
-    worth[long] = (lengths[long] - 2) * each[at] + once[at]
+    worth[long] = (lengths[long] - 2) * each[row] + once[row]
     best, least = 0.0, math.inf
     for nats in range(HELD_NATS, 0, -1):
         more = np.maximum(1.0, np.ceil((nats - once) / each))
         expected = float((readings * (1.0 - first) * first * later**more).sum()) + 1.0
         seen = float(np.count_nonzero(worth >= nats))
         if seen > HELD_TIMES * expected:
-            best, least = max(best, seen * math.log(seen / expected) - seen + expected), nats
+            best, least = max(best, float(kl_div(seen, expected))), nats
     if best < -LN_STUCK:
         return none, 0.0
     held = np.repeat(worth >= least, lengths)
@@ -444,7 +418,7 @@ def _stuck(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, f
     n = values.size
     change, lengths = equal_runs(values)
     none = np.zeros(n, bool)
-    if lengths.max(initial=0) < 4:
+    if not (lengths > 1).any():
         return none, 0.0
     inside = 0.0
     if lattice is not None and math.isfinite(lattice.coarseness):
@@ -490,25 +464,23 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
     """
     if lattice is not None and lattice.carried:
         return None
-    rows = np.flatnonzero(np.isfinite(values))
-    y, step = values[rows], 0.0 if lattice is None else lattice.step
-    edges = [float(y.max()), float(y.min())] if y.size >= 4 * AROUND else []
-    at_edges = [np.abs(y - edge) <= max(1e-9 * max(1.0, abs(edge)), 0.25 * step) for edge in edges]
-    if max((int(at_edge.sum()) for at_edge in at_edges), default=0) < 3 or np.unique(y).size < 3:
+    y, step = _known(values), 0.0 if lattice is None else lattice.step
+    sides = []
+    for side, edge in ((1, float(y.max())), (-1, float(y.min()))) if y.size >= 4 * AROUND else ():
+        at_edge = np.abs(values - edge) <= max(1e-9 * max(1.0, abs(edge)), 0.25 * step)
+        others, count = values[np.isfinite(values) & ~at_edge], int(at_edge.sum())
+        if count < CHANGED_LEAST or not (others.size and np.ptp(others) > 0.0):
+            continue
+        # Where the others do not come near it, it is a word that the logger shows for lost ones.
+        if (lattice is not None and lattice.too_coarse) or is_limit(others, edge, count, step):
+            sides.append((side, edge, at_edge))
+    if not sides:
         return None
     cells = Cells(y, step)
-    plain, limits, total = cells.fit(cells.own), dict[float, Mask](), 0.0
-    for side, edge, at_edge in zip((1, -1), edges, at_edges, strict=True):
-        nats = cells.fit(cells.limit(side)).over(plain)
-        count = int(at_edge.sum())
-        if count < 3 or nats < nats_of("saturation"):
-            continue
-        if not (lattice is not None and lattice.too_coarse) and not is_limit(y[~at_edge], edge, count, step):
-            continue  # the others do not come near it: a word that the logger shows for lost ones
-        limits[edge] = np.zeros(values.size, bool)
-        limits[edge][rows[at_edge]] = True
-        total += nats
-    return Clipped(limits, total) if limits else None
+    plain = cells.fit(cells.own)
+    gains = [(cells.fit(cells.limit(side)).over(plain), edge, at_edge) for side, edge, at_edge in sides]
+    sure = [(nats, edge, at_edge) for nats, edge, at_edge in gains if nats >= nats_of("saturation")]
+    return Clipped({edge: at_edge for _, edge, at_edge in sure}, sum(nats for nats, _, _ in sure)) if sure else None
 
 
 def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tuple[Array, Array]:
@@ -526,20 +498,26 @@ def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tupl
     half = 0.5 * lattice.step if lattice is not None else 0.0
     # A limit at or below the middle of the readings is a lower one.
     middle = 0.5 * (float(y.max()) + float(y.min()))
-    upper = [limit for limit in clipped.limits if limit > middle]
-    lower = [limit for limit in clipped.limits if limit <= middle]
-    at_upper = clipped.limits[upper[0]][rows] if upper else np.zeros(y.size, bool)
-    at_lower = clipped.limits[lower[0]][rows] if lower else np.zeros(y.size, bool)
-    high = upper[0] - half if upper else math.inf
-    low = lower[0] + half if lower else -math.inf
+    at_upper, at_lower, high, low = *np.zeros((2, y.size), bool), math.inf, -math.inf
+    for limit, mask in clipped.limits.items():
+        if limit > middle:
+            at_upper, high = mask[rows], limit - half
+        else:
+            at_lower, low = mask[rows], limit + half
     window = _quiet_window(y)
-    level = np.full(y.size, float(y.mean())) if window >= y.size else uniform_filter1d(y, window, mode="nearest")
+    level = _smooth(y, window)
     sigma = float((y - level).std())
     score, information = y, y
     for _ in range(ITERATIONS):
-        up = np.clip((high - level) / sigma, -4.0, None)
-        down = np.clip((low - level) / sigma, None, 4.0)
-        score, second, information = _tobit((y - level) / sigma, up, down, at_upper, at_lower)
+        # Where there is no limit, one beyond all normal readings has no part in the sums.
+        up = np.clip((high - level) / sigma, -4.0, 37.0)
+        down = np.clip((low - level) / sigma, -37.0, 4.0)
+        # About the level, in the noise: the score of the level, the expected square and the expected information.
+        u, p, q = ((y - level) / sigma, *(np.exp(-0.5 * z * z) / math.sqrt(2.0 * math.pi) for z in (up, down)))
+        above, below = p / ndtr(-up), q / ndtr(down)
+        score = np.where(at_upper, above, np.where(at_lower, -below, u))
+        second = np.where(at_upper, 1.0 + up * above, np.where(at_lower, 1.0 - down * below, u * u))
+        information = ndtr(up) - ndtr(down) - up * p + down * q + p * above + q * below
         known = np.maximum(_smooth(information, window), INFORMATION_LEAST)
         level = _smooth(information * level + sigma * score, window) / known
         level = np.clip(level, low - 4.0 * sigma, high + 4.0 * sigma)
@@ -562,36 +540,10 @@ def _unclipped(values: Array, clipped: Clipped, lattice: Lattice | None) -> tupl
     return working, drawn
 
 
-def _tobit(u: Array, up: Array, down: Array, at_upper: Mask, at_lower: Mask) -> tuple[Array, Array, Array]:
-    """Of readings `u` about their level in units of the noise, with limits `up` and `down`: the score of the level, the
-    expected square, and the expected information of a reading; [n] each."""
-
-    def density(z: Array) -> Array:
-        found: Array = np.exp(-0.5 * np.minimum(z * z, 1400.0)) / math.sqrt(2.0 * math.pi)
-        return found
-
-    def product(z: Array, value: Array) -> Array:
-        found: Array = np.where(np.isfinite(z), np.where(np.isfinite(z), z, 0.0) * value, 0.0)
-        return found
-
-    def tail(z: Array) -> Array:
-        """Density over the probability beyond, of `z` upwards; 0 where there is no limit."""
-        here = np.where(np.isfinite(z), np.minimum(z, 37.0), 0.0)
-        return np.where(np.isfinite(z), density(here) / ndtr(-here), 0.0)
-
-    p, q = density(up), density(down)
-    above, below = tail(up), tail(-down)
-    score = np.where(at_upper, above, np.where(at_lower, -below, u))
-    second = np.where(at_upper, 1.0 + product(up, above), np.where(at_lower, 1.0 - product(down, below), u * u))
-    information = ndtr(up) - ndtr(down) - product(up, p) + product(down, q) + p * above + q * below
-    return score, second, information
-
-
 def _smooth(values: Array, window: int) -> Array:
     if window >= values.size:
         return np.full(values.size, float(values.mean()))
-    found: Array = uniform_filter1d(values, window, mode="nearest")
-    return found
+    return np.asarray(uniform_filter1d(values, window, mode="nearest"))
 
 
 def _quiet_window(y: Array) -> int:
@@ -599,7 +551,7 @@ def _quiet_window(y: Array) -> int:
     all of them where the longest that the record shows is the best."""
     best, least, length = 2 * AROUND, math.inf, 2 * AROUND
     means = block_means(y, length)
-    while means.size >= 8:
+    while means.size >= FEWEST:
         variance = 0.5 * float((np.diff(means) ** 2).mean())
         if variance < least:
             best, least = length, variance
@@ -625,7 +577,7 @@ def copied(recording: Recording, name: str, others: Sequence[str]) -> str:
         factor = float(np.dot(a, b)) / float(np.dot(b, b))
         left, size = float(np.mean((a - factor * b) ** 2)), float(np.mean(a**2))
         if left < LIKE * size:
-            steps = (step_of(recording.columns[one].values)[0] for one in (name, other))
+            steps = (step_of(recording.columns[column].values)[0] for column in (name, other))
             left -= ROUNDING / 6.0 * float(np.dot(np.square([*steps]), (1.0, factor**2)))
         if left <= SAME * size:
             return f"its readings are those of {other}, but for a factor and an offset: which column is {name}?"

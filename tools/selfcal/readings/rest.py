@@ -7,29 +7,26 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaincinv
 
+from selfcal.base.errors import few
 from selfcal.base.grid import MEDIAN_SD, runs
 from selfcal.base.units import factor
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
+from selfcal.model.tables import bank_block
+from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.readings.lattice import step_of
+from selfcal.readings.motion import PUSH
 
 #: Length of a piece, s, and its samples at least.
 PIECE_S, PIECE_LEAST = 1.0, 4
-#: Pieces without which nothing is said of motion.
+#: Fewest pieces, or differences of neighbouring means, that show a deviation.
 FEWEST = 8
 #: Share of the quietest pieces that rest is known from: a recording may move for most of its time.
 QUIET_SHARE = 0.2
 #: Probability that a piece of normal noise is called motion, and a factor for noise that is not normal.
 LOUD_P, LOUD_MARGIN = 1e-7, 1.5
-#: A change of level from piece to piece counts from so many of the usual ones on.
-JUMP_SD = 8.0
-#: A level is beyond the prior of the bias from so many of its standard deviations on.
-BIAS_SD = 4.0
-#: Stretches of motion that are listed at most.
-MOST_LISTED = 4
 
 
 @dataclass(frozen=True)
@@ -49,44 +46,36 @@ def rest_of(recording: Recording, axes: Sequence[str]) -> Rest:
     """When the sensor moved, by the scatter within pieces of 1 s and the jumps between their means, each against those
     of the recording's quietest fifth. An axis alone counts. A change by one step of its lattice is no motion."""
     piece = max(PIECE_LEAST, round(PIECE_S * recording.rate_hz))
-    at = recording.clock.place
-    index = (at - at[0]) // piece
-    count = int(index[-1]) + 1 if (at[-1] - at[0] + 1) % piece == 0 else int(index[-1])
+    place = recording.clock.place - recording.clock.place[0]
+    index, count = place // piece, int(place[-1] + 1) // piece  # of whole pieces
     if not FEWEST <= count <= recording.samples:
         return Rest((), ())
     kept = index < count
     used = np.bincount(index[kept], minlength=count)
     whole = used == piece
     moving = np.zeros(count, bool)
+    quiet, loud = gammaincinv(0.5 * (piece - 1), (QUIET_SHARE, 1.0 - LOUD_P))  # of squares about the mean of a piece
     for name in axes:
         values = recording.columns[name].values[kept]
         with np.errstate(invalid="ignore", divide="ignore"):
             mean = np.bincount(index[kept], values, minlength=count) / used
             square = np.bincount(index[kept], (values - mean[index[kept]]) ** 2, minlength=count)
         lattice = step_of(values[np.isfinite(values)])[0]
-        moving |= whole & (square > max(_loudest(square[whole], piece), piece * (0.5 * LOUD_MARGIN * lattice) ** 2))
+        shown = square[whole & (square > 0.0)]
+        most = math.sqrt(float(np.quantile(shown, QUIET_SHARE) * loud / quiet)) if shown.size else math.inf
+        moving |= whole & (square > (LOUD_MARGIN * max(most, 0.5 * lattice * math.sqrt(piece))) ** 2)
         step = np.abs(np.diff(mean))
         known = np.isfinite(step)
         usual = float(np.quantile(step[known], 0.5)) if known.any() else 0.0
-        jumps = np.flatnonzero(known & (step > max(JUMP_SD * usual / MEDIAN_SD, lattice)))
+        jumps = np.flatnonzero(known & (step > max(PUSH * usual / MEDIAN_SD, lattice)))
         moving[jumps] = moving[jumps + 1] = True
     length_s = piece / recording.rate_hz
     start = recording.start_s
 
-    def times(mask: NDArray[np.bool_]) -> list[tuple[float, float]]:
-        return [(start + a * length_s, start + b * length_s) for a, b in runs(mask)]
-
-    return Rest(tuple(times(moving)), tuple(times(~moving)))
-
-
-def _loudest(square: NDArray[np.float64], piece: int) -> float:
-    """Sum of squares about their mean of `piece` normal readings at most, at the noise of the quietest pieces."""
-    square = square[square > 0.0]
-    if not square.size:
-        return math.inf
-    half = 0.5 * (piece - 1)
-    quiet, loud = gammaincinv(half, QUIET_SHARE), gammaincinv(half, 1.0 - LOUD_P)
-    return LOUD_MARGIN**2 * float(np.quantile(square, QUIET_SHARE)) * float(loud / quiet)
+    moved, still = (
+        tuple((start + a * length_s, start + b * length_s) for a, b in runs(mask)) for mask in (moving, ~moving)
+    )
+    return Rest(moved, still)
 
 
 def outside_priors(recording: Recording, model: Model, axes: Sequence[str]) -> str:
@@ -94,41 +83,38 @@ def outside_priors(recording: Recording, model: Model, axes: Sequence[str]) -> s
     deviation at 1 s, when the sensor moved, and the stretch of rest to type; or to widen the priors, if it rested."""
     sides: dict[str, list[str]] = {}
     for name in axes:
-        side, told = _side(recording, model, name)
-        sides.setdefault(side, []).append(told)
-    said = "; ".join(f"{side}: {', '.join(told)}" for side, told in sides.items())
+        side, numbers = _side(recording, model, name)
+        sides.setdefault(side, []).append(numbers)
+    said = "; ".join(f"{side}: {', '.join(numbers)}" for side, numbers in sides.items())
     rest = rest_of(recording, [name for name in model.axes if name in recording.columns])
     text = f"outside the model's priors, {said}"
     if not rest.moved or rest.longest is None:
         where = "no part of it is quieter" if rest.longest is not None else "it is too short to see motion in it"
         return f"{text}; {where}: take another stretch if it is shaken, check the unit, or widen these priors"
-    listed = ", ".join(f"{a:.10g} to {b:.10g} s" for a, b in rest.moved[:MOST_LISTED])
-    more = f" and {len(rest.moved) - MOST_LISTED} times more" if len(rest.moved) > MOST_LISTED else ""
+    listed = few([f"{a:.10g} to {b:.10g} s" for a, b in rest.moved], more="times more")
     first, last = rest.longest
-    return f"{text}; it moved at {listed}{more}; its longest rest: --start {first:.10g} --end {last:.10g}"
+    return f"{text}; it moved at {listed}; its longest rest: --start {first:.10g} --end {last:.10g}"
 
 
 def _side(recording: Recording, model: Model, name: str) -> tuple[str, str]:
     """Which prior an axis leaves, and its Allan deviation beside that prior's limit."""
     group, unit = model.group_of(name), recording.columns[name].unit
-    block = max(1, round(recording.rate_hz / model.bank_rate_hz))
+    block = bank_block(recording.rate_hz, model.bank_rate_hz)
     tau_s = block / recording.rate_hz
     values = recording.columns[name].values
-    at = recording.clock.place
-    index = at // block
-    places, first = np.unique(index, return_index=True)
+    interval, first = np.unique(recording.clock.place // block, return_index=True)
     mean = np.add.reduceat(values, first) / np.diff(np.append(first, values.size))
-    present = np.diff(places) == 1
+    present = np.diff(interval) == 1
     deviation = math.sqrt(0.5 * float(np.mean(np.diff(mean)[present] ** 2))) if present.any() else math.nan
     prior, scale = group.priors["N"], factor(group.unit, unit)
     bias_sd, level = group.priors["bias"].sd * scale, float(values.mean())
-    if abs(level) > BIAS_SD * bias_sd:
+    if abs(level) > CHECK_LIMIT * bias_sd:
         return "its level above the bias", f"{name} {level:.6g} {unit} (sd {bias_sd:.3g})"
     N = deviation * math.sqrt(tau_s) / scale
-    told = f"{name} {deviation:.3g} {unit}"
+    number = f"{name} {deviation:.3g} {unit}"
     at_tau = f"Allan deviation at {tau_s:.3g} s"
     if prior.max < N:
-        return f"above: {at_tau}", f"{told} (N to {prior.max * scale:.3g})"
+        return f"above: {at_tau}", f"{number} (N to {prior.max * scale:.3g})"
     if prior.min > N:
-        return f"below: {at_tau}", f"{told} (N from {prior.min * scale:.3g})"
-    return f"its drift above K or sigma_m: {at_tau}", f"{told} (N {prior.min * scale:.3g} to {prior.max * scale:.3g})"
+        return f"below: {at_tau}", f"{number} (N from {prior.min * scale:.3g})"
+    return f"its drift above K or sigma_m: {at_tau}", f"{number} (N {prior.min * scale:.3g} to {prior.max * scale:.3g})"

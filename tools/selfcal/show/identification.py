@@ -22,7 +22,6 @@ from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.misread import MISREAD
 from selfcal.readings.motion import events_of
-from selfcal.readings.rest import MOST_LISTED
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 #: A check, its axes, and their outcomes.
@@ -183,7 +182,7 @@ def _why(check: str, outcome: Mapping[str, Any], unit: str, nats: str) -> str:
 
 
 def _times(intervals: Sequence[Sequence[float]]) -> str:
-    return few([f"{a:.6g} to {b:.6g} s" for a, b in intervals], MOST_LISTED)
+    return few([f"{a:.6g} to {b:.6g} s" for a, b in intervals])
 
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:

@@ -68,7 +68,7 @@ def diagnose(
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
     yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.
     """
-    from selfcal.adequacy.document import of_errors
+    from selfcal.adequacy.document import of_errors, recording_entry
     from selfcal.adequacy.identify import chosen_axes
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.ending import held
@@ -109,7 +109,7 @@ def diagnose(
         with work.within(work.Work(lambda: ending.overdue)):
             if not diagnosed:
                 if fail_on is not None:  # a production line gets its files in each case
-                    document = of_errors(SCHEMA, recording, errors) | {"model": {}}
+                    document = of_errors(SCHEMA, recording_entry(recording), errors) | {"model": {}}
                     if report is not None:
                         write_text(report, page(document, record, {}))
                     write_json(document, json)

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.adequacy.checks import Judged
-from selfcal.adequacy.document import Identified, Telemetry, to_document
+from selfcal.adequacy.document import Identified, to_document
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError
 from selfcal.logs.framelog import FrameLog
@@ -209,12 +209,14 @@ def document(
     """The last complete reports as `identify` gives its results. Checks need the samples, which are not here."""
     status, why = decoder.status, reasons(decoder.status, decoder.corrected)
     interval, block = status.get("bank_interval", math.nan), status.get("bank_block", math.nan)
-    run = Telemetry(
-        path=name,
-        rate_hz=block / interval if interval > 0.0 else math.nan,
-        samples=int(status["samples"]) if "samples" in status else None,
-        duration_s=max(reports[-1].time_s for reports in history.values()),
-    )
+    run = {
+        "path": name,
+        "rate_hz": block / interval if interval > 0.0 else math.nan,
+        "samples": int(status["samples"]) if "samples" in status else None,
+        "duration_s": max(reports[-1].time_s for reports in history.values()),
+        "start_s": 0.0,
+        "since_power_on_s": None,
+    }
     identified = {
         axis: Identified(axis_unit(axis), axis_unit(axis), reports[-1].result(names), Judged({}, None), {})
         for axis, reports in history.items()
