@@ -11,10 +11,9 @@ import numpy as np
 
 from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
-from selfcal.base.errors import UserError, few
+from selfcal.base.errors import MOST_NAMED, UserError, few
 from selfcal.batch.drift import Drift, Series, drifts_of
 from selfcal.batch.population import (
-    FALSE_ALARM,
     FEWEST,
     FEWEST_OF_GROUP,
     MOST_ODD,
@@ -28,18 +27,16 @@ from selfcal.batch.population import (
     sd_off,
 )
 from selfcal.batch.unit_table import Unit
+from selfcal.batch.verdicts import MOST_TIMES
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
+from selfcal.readings.budget import FALSE_ALARM
 
-#: Least evidence of an odd unit's law over the batch's law, nats: at most 1 in e^12 by chance.
-OTHER_LAW = 12.0
+#: Least evidence of an odd unit's law over the batch's law, nats: chance reaches it in FALSE_ALARM at most.
+OTHER_LAW = -math.log(FALSE_ALARM)
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Most devices that a line or a list names, and that have a page of their own.
-MOST_NAMED = 20
-#: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
-MOST_TIMES = 1000.0
 
 
 @dataclass(frozen=True)

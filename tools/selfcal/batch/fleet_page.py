@@ -101,20 +101,15 @@ def _histogram(population: Population, limits: Sequence[tuple[float, str]]) -> F
 def _control(batch: Batch) -> Markup | None:
     """Control charts of N and of the bias in the order of the dates: individuals and moving ranges. None: no dates."""
     when = [units[-1].recorded_at for units in batch.devices.values()]
-    charts = [population for population in batch.populations if population.measured.name.endswith((".N", ".bias"))]
-    if len({date[:10] for date in when if date}) < 2 or not charts:
-        return None
     figures: list[Figure] = []
-    for chart in charts[:MOST_PICTURES]:
-        measured = chart.measured
-        order = sorted(
-            (k for k, device in enumerate(measured.at.tolist()) if when[device]),
-            key=lambda k: when[int(measured.at[k])],
-        )
-        if len(order) >= 3:
+    charts = [chart.measured for chart in batch.populations if chart.measured.name.endswith((".N", ".bias"))]
+    for measured in charts[:MOST_PICTURES]:
+        dated = sorted((when[device], k) for k, device in enumerate(measured.at.tolist()) if when[device])
+        if len({date[:10] for date, _ in dated}) > 1:
+            order = [k for _, k in dated]
             y = np.asarray(np.exp(measured.y[order]) if measured.logarithm else measured.y[order], np.float64)
             figures += _individuals(measured.name, unit_module.typeset(measured.unit), y)
-    return _drawn(figures)
+    return _drawn(figures) if figures else None
 
 
 def _individuals(name: str, unit: str, y: Array) -> list[Figure]:

@@ -32,8 +32,10 @@ from selfcal.model.laws import PLACES, RATIOS
 
 SCHEMA = "selfcal.limits/1"
 PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
-#: Probability of a verdict after the rest that is asked for; longest such rest, in times the record.
-CHANCE, MOST_TIMES = 0.8, 1000.0
+#: Probability of a verdict after the rest that is asked for.
+CHANCE = 0.8
+#: Largest factor that is stated: of a rest to the record, of a unit's quantity to the batch's median.
+MOST_TIMES = 1000.0
 
 
 @dataclass(frozen=True)

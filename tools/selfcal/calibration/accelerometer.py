@@ -16,7 +16,8 @@ from selfcal.base.grid import Array, Mask, slices
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import ACCEL, REST_S, Tumble
-from selfcal.calibration.tumble_fit import FALSE_ALARM, Fit, Problem, fit
+from selfcal.calibration.tumble_fit import Fit, Problem, fit
+from selfcal.readings.budget import FALSE_ALARM
 
 #: Stated priors, sd: bias, m/s^2 (100 mg); scale; angle, rad; temperature coefficient, m/s^2/degC (1 mg/degC).
 BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
@@ -29,7 +30,7 @@ GRAVITY = ANGLE.stop
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 2))
 #: sd of a parameter that the logs do not have: not 0, so that the prior has an inverse.
-NONE = 1e-12
+NONE = float(np.finfo(float).eps)
 #: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
 REACH = 10.0
 #: Fewest rests that give an answer.

@@ -254,7 +254,7 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
         end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in motion.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
-        if end - begin >= 2.0 and behind - first >= PIECES:
+        if end - begin >= 2.0 * PIECE_S and behind - first >= PIECES:
             rests.append(slice(first, behind))
     return _Log(recording, begin_s, own, bridged, steps, temp, tuple(rests))
 
@@ -352,10 +352,10 @@ def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, 
     rows = slice(begin - 1, end + 1)
     place = log.recording.clock.place[rows]
     place = place - place[0]
-    columns, unsure, reasons = [], [], []
-    for k, name in enumerate(ACCEL + GYRO):
+    values, unsure = np.zeros((2, place[-1] + 1, len(UNITS)))
+    reasons = [f"{name} is not recorded" for name in GYRO if name not in log.own]
+    for k, name in enumerate(UNITS):
         if name not in log.own:
-            reasons.append(f"{name} is not recorded")
             continue
         part = log.own[name][rows]
         if np.nanmax(np.abs(part), initial=0.0) >= ranges[name] or _flat(part, log.own[name], log.steps[name]):
@@ -367,14 +367,9 @@ def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, 
         for edge, rest in zip((0, -1), ends, strict=True):
             if math.isnan(whole[edge]):
                 whole[edge] = (*rest.accel, *rest.gyro)[k]
-        values, variance = _bridged(whole)
-        columns.append(values)
-        unsure.append(variance)
-    none = np.zeros((1, 3))
-    accel, gyro = (none, none) if len(columns) < 6 else (np.column_stack(columns[a : a + 3]) for a in (0, 3))
-    temp = float(np.mean(log.temp[rows]))
-    reason = reasons[0] if reasons else ""
-    return Turn(first, 1.0 / log.recording.rate_hz, accel, gyro, np.column_stack(unsure[-3:]), temp, reason)
+        values[:, k], unsure[:, k] = _bridged(whole)
+    dt, temp, reason = 1.0 / log.recording.rate_hz, float(np.mean(log.temp[rows])), next(iter(reasons), "")
+    return Turn(first, dt, values[:, :3], values[:, 3:], unsure[:, 3:], temp, reason)
 
 
 def _over_lost(time: Array, values: Array) -> Array:

@@ -67,7 +67,7 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
             continue
         again = time + np.concatenate(([0.0], np.cumsum(np.where(begins, span, 0.0))))
         times = f"{count} time{'s' if count > 1 else ''}"
-        bits = [bits for bits in _BITS for tick in (tick_s, *_TICKS) if abs(span / tick / 2.0**bits - 1.0) < 1e-9]
+        bits = [bits for bits in _BITS for tick in (tick_s, *_TICKS) if math.isclose(span / tick, 2.0**bits)]
         if bits:
             return again, [f"column 't' wraps {times} like a {bits[0]}-bit counter: undone"]
         return again, [f"column 't' goes back {times} by {_CLOCKS.get(span, f'{span:.10g} s')}: undone"]
@@ -115,11 +115,10 @@ def _mended(order: Order) -> Order:
     """Without damaged stamps, sorted where rows are near their place, without stamps that repeat; the order as it was
     where that takes too many rows."""
     time, n, notes = order.time, order.time.size, list(order.notes)
-    if n < 2 or broken(time) is None:
+    if broken(time) is None:
         return order
-    kept = np.arange(n)
     far = _far(time)
-    kept = np.delete(kept, far)
+    kept = np.delete(np.arange(n), far)
     sort = np.argsort(time[kept], kind="stable")
     moved = int(np.count_nonzero(np.diff(time[kept]) < 0.0))
     if not few(int(np.abs(sort - np.arange(sort.size)).max(initial=0)), n):
@@ -129,7 +128,7 @@ def _mended(order: Order) -> Order:
     if repeats.any() and not _coarse(np.diff(time[kept])):
         kept = kept[~repeats]
     left_out = n - kept.size
-    if not few(left_out, n) or kept.size < 2:
+    if not few(left_out, n):
         return order
     if left_out:
         were = "s were" if left_out > 1 else " was"

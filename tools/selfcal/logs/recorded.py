@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.limits import LONGEST_S
 from selfcal.logs.loaders.damage import SOUND, Damaged
 from selfcal.logs.timebase import Clock
 
-#: s from power-on to a recording's beginning, at most: a year.
-LONGEST_POWERED_S = 3.2e7
 #: Columns that are no axis but may explain one, by cause: name and unit.
 SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
 #: Their units, by name.
@@ -148,10 +147,10 @@ class Recording:
 
     def later(self, since_power_on_s: float) -> Recording:
         """The recording with its distance from power-on, s. Raises UserError for one that is none."""
-        if not 0.0 <= since_power_on_s <= LONGEST_POWERED_S:
+        if not 0.0 <= since_power_on_s <= LONGEST_S:
             raise UserError(
                 f"--since-power-on {since_power_on_s:g}: takes the seconds from power-on to the recording's beginning, "
-                f"0 to {LONGEST_POWERED_S:g}"
+                f"0 to {LONGEST_S:g}"
             )
         return replace(self, since_power_on_s=since_power_on_s)
 

@@ -17,8 +17,12 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, rhythm, sampling
+from selfcal.logs.sampling import SAME, Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, rhythm, sampling
 
+#: Share of an interval between the samples of one instant, at most.
+ONE_INSTANT = 0.01
+#: Largest difference of the stamps' rate from a stated one, as a share.
+_AGREES = 0.1
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
 #: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost. Regular losses
@@ -88,8 +92,8 @@ class Clock:
     def alike(self, other: Clock) -> bool:
         """Whether both are one clock."""
         return (
-            abs(self.rate_hz / other.rate_hz - 1.0) < 1e-6
-            and abs(self.start_s - other.start_s) * self.rate_hz < 0.01
+            abs(self.rate_hz / other.rate_hz - 1.0) < SAME
+            and abs(self.start_s - other.start_s) * self.rate_hz < ONE_INSTANT
             and np.array_equal(self.missing_before, other.missing_before)
         )
 
@@ -115,7 +119,7 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
         _too_long(time, fail)
     time = time - start if start else time
     found, missing = _sampling(path, time, noise_s, rate, fail)
-    if rate is not None and not 0.9 < found / rate < 1.1:
+    if rate is not None and not abs(found / rate - 1.0) < _AGREES:
         raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
     rate = found if rate is None else rate
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
@@ -152,7 +156,7 @@ def _sampling(
 def remarks(clock: Clock) -> list[str]:
     """A line on stamps that another clock explains as well, or that show no lost sample."""
     rate, missing, off_grid = clock.rate_hz, clock.missing_before, clock.off_grid_s
-    if off_grid is None or off_grid.size < 3:
+    if off_grid is None:
         return []
     time = clock.time_s + off_grid
     steps = np.diff(time)
@@ -171,7 +175,7 @@ def remarks(clock: Clock) -> list[str]:
         return [told + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
     if gaps.size:
         return []
-    if 0.0 < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:
+    if 0.0 < lattice * rate < 1.0 - SAME and steps.min() > 0.5 * lattice:
         turns = np.rint(steps / lattice)
         if turns.min() == 1.0 and (lattice * rate > _NEARLY or in_pattern(turns)):
             other = float(f"{1.0 / lattice:.6g}")

@@ -27,12 +27,10 @@ from selfcal.base.output import together, whole
 from selfcal.logs.loaders import WRITTEN
 from selfcal.logs.loaders.table import heading, meta_place
 from selfcal.logs.recorded import Recording
-from selfcal.logs.timebase import Clock
+from selfcal.logs.timebase import ONE_INSTANT, Clock
 
 #: Headings, without a unit, of the columns that are not the recording's.
 SAMPLE, LATE = "sample", "late"
-#: Stamps of several clocks closer than this, as a share of the fastest axes' interval, are one row.
-_ONE_ROW = 0.01
 #: Lines that are written at once; signs that separate columns, and so are none of a heading.
 _LINES, _SIGNS = 10_000, re.compile(r'[,;\t"]')
 #: What `meta` of the log says of the log's own table.
@@ -55,7 +53,7 @@ def laid_out(recording: Recording) -> Laid:
         of.setdefault(id(column.clock), []).append(name)
     clocks = [recording.clock_of(names[0]) for names in of.values()]
     stamps = [clock.time_s if clock.off_grid_s is None else clock.time_s + clock.off_grid_s for clock in clocks]
-    t, rows = _rows(stamps, _ONE_ROW / recording.rate_hz)
+    t, rows = _rows(stamps, ONE_INSTANT / recording.rate_hz)
 
     def cells(values: NDArray[Any], at: Rows) -> Array:
         full = np.full(t.size, np.nan)

@@ -30,8 +30,6 @@ _Event = tuple[str, list[str], list[Mapping[str, Any]]]
 
 #: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
-#: Largest distance of jumps of one event, s.
-ONE_EVENT_S = 30.0
 
 
 def show(
@@ -359,6 +357,8 @@ def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether two axes fail a check by the same event or source."""
     match check:
         case "jump":
+            from selfcal.diagnosis.causes.step import ONE_EVENT_S  # it takes a second
+
             return bool(abs(a["time_s"] - b["time_s"]) < ONE_EVENT_S)
         case "turn_on":
             return True

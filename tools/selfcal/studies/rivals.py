@@ -22,6 +22,7 @@ from rich.table import Table
 
 from selfcal.adequacy.document import recording_entry
 from selfcal.adequacy.identify import chosen_axes
+from selfcal.bank.blocks import MOST_DENSE
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
@@ -41,8 +42,6 @@ ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
 #: The model of the ensemble, and its default numbers of samples.
 ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
 SAMPLES = (150, 600)
-#: Samples of a record of the ensemble at most: the slowest method takes eight minutes then.
-MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
 #: Columns of a terminal that the table takes with the intervals; without them it takes 110.
@@ -104,8 +103,8 @@ class Ensemble:
         seeds = record_seeds(self.records, self.seed)
         if self.truth not in ("middle", "prior"):
             raise UserError(f"--truth is middle or prior, not '{self.truth}'")
-        if not all(FEWEST <= n <= MOST_ENSEMBLE for n in self.samples):
-            raise UserError(f"--samples must be {FEWEST} to {MOST_ENSEMBLE}")
+        if not all(FEWEST <= n <= MOST_DENSE for n in self.samples):
+            raise UserError(f"--samples must be {FEWEST} to {MOST_DENSE}")
         if not set(self.model.hypotheses) <= set(PLAIN):
             raise UserError(f"{self.model.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
         given = {"axis": self.axis, "truth": self.truth, "seed": self.seed}

@@ -18,14 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.limits import MOST_COLUMNS
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 BEGIN = b"H Product:Blackbox"
 #: Columns that are read: letter of the axes here by the name in the headers.
 _AXES = {"gyroADC": "g", "accSmooth": "a"}
-#: Fields of a frame at most.
-_MOST_FIELDS = 256
 #: Bytes of an event's data, by its number; a log's end is known by its text.
 _EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30: "vv", 40: "v"}
 
@@ -163,7 +162,7 @@ class _Log:
         """Read the headers. Raises ValueError where they describe no frames."""
         self.data = _Bytes(data)
         self.headers: dict[str, str] = {}
-        while data[self.data.at : self.data.at + 2] == b"H " and self.data.at < 1 << 18:
+        while data[self.data.at : self.data.at + 2] == b"H ":
             end = data.find(b"\n", self.data.at)
             if end < 0:
                 break
@@ -171,13 +170,13 @@ class _Log:
             self.headers[name] = value
             self.data.at = end + 1
         self.names = self.headers.get("Field I name", "").split(",")
-        if not 2 < len(self.names) <= _MOST_FIELDS or "time" not in self.names:
+        if len(self.names) > MOST_COLUMNS or "time" not in self.names:
             raise ValueError("its headers describe no frames")
         self.kinds = {}
         for kind in "IPSGH":
             if f"Field {kind} encoding" in self.headers:
                 parts = [self._numbers(f"Field {kind} {part}") for part in ("predictor", "encoding")]
-                if len(parts[0]) == len(parts[1]) <= _MOST_FIELDS:
+                if len(parts[0]) == len(parts[1]) <= MOST_COLUMNS:
                     self.kinds[ord(kind)] = _Frames(*parts)
         self.time = self.names.index("time")
         self.motor = self.names.index("motor[0]") if "motor[0]" in self.names else 0

@@ -13,13 +13,9 @@ from functools import lru_cache
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
-from selfcal.base.limits import (
-    LONGEST_HEADING,
-)
+from selfcal.base.limits import LONGEST_HEADING
 from selfcal.base.options import Scale, parse_pairs
 
-#: Characters of a heading of no program that is known.
-_LONGEST_NAME = 120
 #: Headings of a time column that states its unit, or holds dates.
 TIMES = ("time", "timestamp")
 #: Name here of a second column of the time, which is added to the first.
@@ -191,7 +187,7 @@ def sensors_of(
     """
     native = [key for key in keys if key not in taken and split(key)[0] in own]
     if native or any(name in own for name in taken.values()):
-        warm = {} if "temp" in taken.values() else _temperature(FORMS[-1], _free(FORMS[-1], keys, taken), "")
+        warm = {} if "temp" in taken.values() else _temperature(FORMS[-1], _free(keys, taken), "")
         return [Sensor("", warm | _native_time(keys, taken))]
     for form in FORMS:
         if form.before and before is not None and not any(line.startswith(form.before) for line in before):
@@ -221,13 +217,12 @@ def _native_time(keys: Sequence[str], taken: Mapping[str, str]) -> dict[str, Mea
     times = [key for key, name in zip(keys, names, strict=True) if name.lower() in TIMES and key not in taken]
     if "t" not in names and len(times) == 1:
         return {times[0]: Meaning("t", split(times[0])[1])}
-    return {} if "t" in names else _time(FORMS[-1], _free(FORMS[-1], keys, taken), taken, "")
+    return {} if "t" in names else _time(FORMS[-1], _free(keys, taken), taken, "")
 
 
-def _free(form: _Form, keys: Sequence[str], taken: Mapping[str, str]) -> list[str]:
+def _free(keys: Sequence[str], taken: Mapping[str, str]) -> list[str]:
     """The headings that a form may look at: not those that the user maps, nor long ones, which take long."""
-    longest = _LONGEST_NAME if form is FORMS[-1] else LONGEST_HEADING
-    return [key for key in keys if key not in taken and len(key) <= longest]
+    return [key for key in keys if key not in taken and len(key) <= LONGEST_HEADING]
 
 
 def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -> list[Sensor]:
@@ -236,7 +231,7 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
         return []
     if form.file and form.file not in file.lower():
         return []
-    free = _free(form, keys, taken)
+    free = _free(keys, taken)
     axes: dict[str, dict[str, Meaning]] = {}
     for letter, key, match, stated in _axes(form, free):
         axis = _VEHICLE.get(match["axis"].lower(), match["axis"].lower())

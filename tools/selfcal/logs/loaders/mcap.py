@@ -32,8 +32,6 @@ _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs"
 #: The first and the last bytes of a file; a record's kind and length; the kind of a chunk.
 _MAGIC, _HEAD = b"\x89MCAP0\r\n", struct.Struct("<BQ")
 _CHUNK = b"\x06"
-#: Depth of a message's fields.
-_DEEPEST = 6
 #: What of a message's fields is a sensor's by convention.
 _BY_CONVENTION = ("angular_velocity/", "linear_acceleration/")
 
@@ -78,15 +76,13 @@ class _Fields:
         return of_arrays(topic, columns, notes=tuple(notes))
 
 
-def _flat(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, float | int]]:
+def _flat(value: Any, path: str = "") -> Iterator[tuple[str, float | int]]:
     """Numbers of a message by their paths."""
-    if isinstance(value, bool) or depth > _DEEPEST:
-        return
-    if isinstance(value, int | float):
+    if isinstance(value, int | float) and not isinstance(value, bool):
         yield path, value
     elif isinstance(value, Mapping):
         for name, inner in value.items():
-            yield from _flat(inner, f"{path}/{name}" if path else str(name), depth + 1)
+            yield from _flat(inner, f"{path}/{name}" if path else str(name))
 
 
 def _stamp(fields: Mapping[str, float | int]) -> int | None:
@@ -267,15 +263,15 @@ def _units_of(schema: Any) -> dict[str, str]:
         return {}
     found: dict[str, str] = {}
 
-    def look(node: Any, path: str, depth: int) -> None:
-        if not isinstance(node, dict) or depth > _DEEPEST:
+    def look(node: Any, path: str) -> None:
+        if not isinstance(node, dict):
             return
         unit = node.get("unit", node.get("units"))
         if isinstance(unit, str) and path:
             found[path] = unit
         properties = node.get("properties")
         for name, inner in properties.items() if isinstance(properties, dict) else ():
-            look(inner, f"{path}/{name}" if path else name, depth + 1)
+            look(inner, f"{path}/{name}" if path else name)
 
-    look(json.loads(schema.data), "", 0)
+    look(json.loads(schema.data), "")
     return found

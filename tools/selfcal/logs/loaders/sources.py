@@ -10,10 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from selfcal.base.errors import UserError, few, printable, short
-
-#: Sources that a message lists.
-_MOST_LISTED = 30
+from selfcal.base.errors import MOST_NAMED, UserError, few, printable, short
 
 
 @dataclass(frozen=True)
@@ -115,4 +112,4 @@ def _listed(sources: dict[str, list[Part]], axes: dict[str, frozenset[str]], nam
         part = max(sources[name], key=lambda own: (bool(own.axes), own.rate_hz))
         of = " ".join(sorted(axes[name], key=lambda axis: (axis[0] != "g", axis))) or "no axis"
         lines.append(f"--source '{printable(name)}' ({of}; {part.rate_hz:.4g} Hz, {part.span()[1]:.4g} s)")
-    return f"give {few(lines, _MOST_LISTED)}"
+    return f"give {few(lines, MOST_NAMED)}"

@@ -609,7 +609,7 @@ def _opened(path: Path, files: ExitStack) -> tuple[BinaryIO, int]:
         raise UserError(f"{path}: the file is empty")
     size = path.stat().st_size
     console = Console(stderr=True)
-    if size > (1 << 26) and console.is_terminal:
+    if size > BLOCK_BYTES and console.is_terminal:
         progress = wrap_file(raw, size, description="reading", console=console, transient=True)
         raw = files.enter_context(progress)
     if path.suffix.lower() == ".gz":
