@@ -56,7 +56,7 @@ def calibrated(
 
 
 def errors(accel: Accelerometer, gyro: Gyroscope | None, truth: Truth) -> tuple[Array, NDArray[np.bool_]]:
-    """Errors in sd of all parameters in the order of OF_ACCEL and OF_GYRO, and which are identified."""
+    """Errors in sd of all parameters in their order, and which are identified."""
     part = truth.part
     true = [np.concatenate([truth.bias, part.scale, part.angles])]
     fits = [(accel.fit, 0, accelerometer.GRAVITY)]

@@ -393,7 +393,10 @@ def document_of(batch: Batch) -> dict[str, Any]:
     for slope in batch.drifts:
         drift.setdefault(names[slope.of.at], {})[slope.of.quantity] = slope.entry()
         if slope.significant:
-            drifting.setdefault(names[slope.of.at], []).append(_drift_words(slope))
+            of, per_day = slope.of, slope.per_day
+            rate = f"{100.0 * math.expm1(per_day):+.3g} %" if of.logarithm else f"{per_day:+.3g} {of.unit}"
+            basis = f"{of.y.size} recordings in {slope.days:.3g} days, {sd_off(slope.log_p):.1f} sd"
+            drifting.setdefault(names[of.at], []).append(f"{of.quantity} {rate} a day, {basis}")
     return {
         "population": {population.measured.name: _entry(population, names) for population in batch.populations},
         "unlike": batch.unlike,
@@ -478,13 +481,6 @@ def seen_from_words(population: Population) -> str:
     if off is None:
         return f"more than {MOST_TIMES:.0f} times: too few units, or too short recordings"
     return f"{off:.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
-
-
-def _drift_words(drift: Drift) -> str:
-    of = drift.of
-    rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if of.logarithm else f"{drift.per_day:+.3g} {of.unit}"
-    basis = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
-    return f"{of.quantity} {rate} a day, {basis}"
 
 
 def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:

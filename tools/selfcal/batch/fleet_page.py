@@ -49,9 +49,7 @@ def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) ->
         "plain": plain,
         "seen_from": seen_from_words,
         "unidentified": list(unidentified_lines(batch)),
-        "distributions": _drawn(
-            _histogram(population, _limits(document, population.measured.name)) for population in histograms
-        ),
+        "distributions": _drawn(_histogram(population, document["limits"]) for population in histograms),
         "charts": _control(batch),
         "devices": len(batch.devices),
         "marked": marked,
@@ -65,15 +63,11 @@ def _drawn(figures: Iterable[Figure]) -> Markup:
     return Markup().join(map(draw, figures))
 
 
-def _limits(document: Mapping[str, Any], name: str) -> list[tuple[float, str]]:
-    """Value and unit of each limit of a data sheet on a quantity."""
-    limits = [limit for limit in document["limits"] if f"{limit['axis']}.{limit['parameter']}" == name]
-    return list(dict.fromkeys((limit["value"], limit["unit"]) for limit in limits))
-
-
-def _histogram(population: Population, limits: Sequence[tuple[float, str]]) -> Figure:
+def _histogram(population: Population, limits: Sequence[Mapping[str, Any]]) -> Figure:
+    """The distribution of a quantity, with the data sheet's `limits` that are on it."""
     measured = population.measured
-    marks = [value * unit_module.factor(unit, measured.unit) for value, unit in limits if unit != "1"]
+    own = [limit for limit in limits if limit["unit"] != "1" and measured.name == "{axis}.{parameter}".format(**limit)]
+    marks = sorted({limit["value"] * unit_module.factor(limit["unit"], measured.unit) for limit in own})
     y = measured.y
     reach = float(np.ptp(y)) or 1.0
     bins = int(np.clip(2.0 * y.size ** (1.0 / 3.0), 8, 60))

@@ -167,14 +167,9 @@ def _obedient(folder: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    threading.Thread(target=_end_with_the_command, daemon=True).start()
-
-
-def _end_with_the_command() -> None:
     command = multiprocessing.parent_process()
     if command is not None:
-        wait([command.sentinel])
-        os._exit(1)
+        threading.Thread(target=lambda: wait([command.sentinel]) and os._exit(1), daemon=True).start()
 
 
 @contextmanager

@@ -71,16 +71,12 @@ def _record(verbs: Verbs, options: Options, path: str) -> Row:
         "axes": {name: _of(axis, IDENTIFIED) | _looks(axis) for name, axis in document["axes"].items()},
     }
     if options.diagnose:
-        row["diagnosis"] = _diagnosis(verbs, path, list(document["axes"]), options.given)
+        try:
+            axes = verbs.diagnose(path, **options.given)["axes"]
+        except UserError as error:
+            axes = {name: {"error": str(error).removeprefix(f"{path}: ")} for name in document["axes"]}
+        row["diagnosis"] = {name: _of(axis, DIAGNOSED) for name, axis in axes.items()}
     return row
-
-
-def _diagnosis(verbs: Verbs, path: str, names: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
-    try:
-        axes = verbs.diagnose(path, **given)["axes"]
-    except UserError as error:
-        return {name: {"error": str(error).removeprefix(f"{path}: ")} for name in names}
-    return {name: _of(axis, DIAGNOSED) for name, axis in axes.items()}
 
 
 def own_pages(

@@ -70,7 +70,7 @@ class Recording:
     from_arrays: ClassVar[Callable[..., Recording]]
 
     def __repr__(self) -> str:
-        columns = ", ".join(f"{one.name}[{one.unit}]" for one in self.columns.values())
+        columns = ", ".join(f"{column.name}[{column.unit}]" for column in self.columns.values())
         return f"<Recording {self.path}: {self.samples} rows at {self.rate_hz:g} Hz, {self.duration_s:g} s: {columns}>"
 
     @property
@@ -126,18 +126,18 @@ class Recording:
         begin_s = float(at[where[0]] - at[0]) / self.rate_hz
         clock = self.clock.of_rows(where, begin_s, moving=moving)
 
-        def left(one: Column) -> Column:
+        def left(column: Column) -> Column:
             """An axis with a clock of its own keeps the samples that the row before them keeps."""
-            if one.clock is None:
-                return replace(one, values=one.values[kept])
-            time = one.clock.time_s
+            if column.clock is None:
+                return replace(column, values=column.values[kept])
+            time = column.clock.time_s
             rows = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, self.samples - 1)
             own = np.flatnonzero(kept[rows] & (rows >= where[0]) & (time < self.time_s[where[-1]] + 1.0 / self.rate_hz))
-            return replace(one, values=one.values[own], clock=one.clock.of_rows(own, begin_s, moving=moving))
+            return replace(column, values=column.values[own], clock=column.clock.of_rows(own, begin_s, moving=moving))
 
         return replace(
             self,
-            columns={name: left(one) for name, one in self.columns.items()},
+            columns={name: left(column) for name, column in self.columns.items()},
             missing_before=clock.missing_before,
             off_grid_s=clock.off_grid_s,
             start_s=self.start_s + begin_s,
@@ -209,15 +209,15 @@ class Recording:
         used = np.logical_or.reduce([np.isfinite(self.columns[name].values) for name in names])
         own_clock = self.columns[names[0]].clock
         others = [column for name, column in self.columns.items() if name not in names]
-        if used.all() and all(one.clock is own_clock and np.isfinite(one.values).all() for one in others):
+        if used.all() and all(column.clock is own_clock and np.isfinite(column.values).all() for column in others):
             columns = self.columns
         else:
             time = clock.time_s[used]
             columns = {
-                name: replace(one, values=one.values[used])
-                if name in names or (one.clock is own_clock and np.isfinite(one.values).all())
-                else replace(one, values=bridged_at(self.clock_of(name), one.values, time), clock=own_clock)
-                for name, one in self.columns.items()
+                name: replace(column, values=column.values[used])
+                if name in names or (column.clock is own_clock and np.isfinite(column.values).all())
+                else replace(column, values=bridged_at(self.clock_of(name), column.values, time), clock=own_clock)
+                for name, column in self.columns.items()
             }
         if own_clock is None and used.all():
             return self if columns is self.columns else replace(self, columns=columns)
@@ -227,7 +227,7 @@ class Recording:
         return replace(
             self,
             rate_hz=clock.rate_hz,
-            columns={name: replace(one, clock=None) for name, one in columns.items()},
+            columns={name: replace(column, clock=None) for name, column in columns.items()},
             missing_before=missing,
             off_grid_s=own_rows.off_grid_s,
             moving_before=own_rows.moving_before,
@@ -241,13 +241,13 @@ def bridged_at(clock: Clock, values: NDArray[np.float64], time: NDArray[np.float
     return np.interp(time, clock.time_s[known], values[known])
 
 
-def bridged(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Missing values by straight lines."""
-    good = np.isfinite(values)
-    if good.all():
+def bridged(values: NDArray[np.float64], time: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Missing values by straight lines over `time`, by default over the samples; as they are where all are missing."""
+    known = np.isfinite(values)
+    if known.all() or not known.any():
         return values
-    where = np.arange(values.size)
-    return np.interp(where, where[good], values[good])
+    time = np.arange(float(values.size)) if time is None else time
+    return np.interp(time, time[known], values[known])
 
 
 def as_float(values: NDArray[np.float64]) -> NDArray[np.float32]:

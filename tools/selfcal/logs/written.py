@@ -81,9 +81,8 @@ def _endings(clocks: int) -> list[str]:
 
 
 def marks_of(meta: Mapping[str, Any]) -> set[str]:
-    """Headings of the columns that are not the recording's in a table with this `meta`; empty without clocks."""
-    endings = _endings(len(meta["clocks"])) if stated(meta) else []
-    return {name + ending for ending in endings for name in (SAMPLE, LATE)}
+    """Headings of the columns that are not the recording's in a table whose `meta` states its clocks."""
+    return {name + ending for ending in _endings(len(meta["clocks"])) for name in (SAMPLE, LATE)}
 
 
 def stated(meta: Mapping[str, Any]) -> bool:

@@ -50,8 +50,8 @@ def show(
     )
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     numbered = {name: axis for name, axis in axes.items() if axis.get("summary")}
-    summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
-    laws = _fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
+    summary = fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
+    laws = fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
     first.title = title
     if numbered:
@@ -63,7 +63,7 @@ def show(
         print_line(console, line)
 
 
-def _fitting(console: Console, tables: Sequence[Table]) -> Table:
+def fitting(console: Console, tables: Sequence[Table]) -> Table:
     """The first of `tables` that the terminal is wide enough for, else the last; without a terminal the first."""
     if not console.is_terminal:
         return tables[0]

@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -31,14 +31,6 @@ _EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30
 
 class _Damaged(Exception):
     """The bytes are no frame."""
-
-
-@dataclass
-class _Frames:
-    """Fields of one kind of frame: predictors and encodings, a number each."""
-
-    predictors: list[int] = field(default_factory=list)
-    encodings: list[int] = field(default_factory=list)
 
 
 class _Bytes:
@@ -172,12 +164,12 @@ class _Log:
         self.names = self.headers.get("Field I name", "").split(",")
         if len(self.names) > MOST_COLUMNS or "time" not in self.names:
             raise ValueError("its headers describe no frames")
-        self.kinds = {}
+        #: Predictors and encodings of the fields, a number each, by the kind of frame.
+        self.kinds: dict[int, tuple[list[int], list[int]]] = {}
         for kind in "IPSGH":
-            if f"Field {kind} encoding" in self.headers:
-                parts = [self._numbers(f"Field {kind} {part}") for part in ("predictor", "encoding")]
-                if len(parts[0]) == len(parts[1]) <= MOST_COLUMNS:
-                    self.kinds[ord(kind)] = _Frames(*parts)
+            predictors, encodings = (self._numbers(f"Field {kind} {part}") for part in ("predictor", "encoding"))
+            if 0 < len(predictors) == len(encodings) <= MOST_COLUMNS:
+                self.kinds[ord(kind)] = predictors, encodings
         self.time = self.names.index("time")
         self.motor = self.names.index("motor[0]") if "motor[0]" in self.names else 0
         least = self._number("minthrottle", 1150)
@@ -204,21 +196,18 @@ class _Log:
             begin = data.at
             try:
                 kind = data.byte()
-                if kind == ord("E"):
-                    if self._event():
-                        size = data.at
+                if kind in b"E":
+                    size = data.at if self._event() else size
                     continue
                 if kind not in self.kinds:
                     raise _Damaged
-                frames = self.kinds[kind]
-                values = _values(data, frames.encodings)
+                predictors, encodings = self.kinds[kind]
+                values = _values(data, encodings)
                 if data.at < len(data.data) and data.data[data.at] not in b"IPSGHE":
                     raise _Damaged
-                if kind not in (ord("I"), ord("P")):
+                if kind not in b"IP" or (kind in b"P" and not history):
                     continue
-                if kind == ord("P") and not history:
-                    continue
-                values = self._predicted(values, frames.predictors, history if kind == ord("P") else [])
+                values = self._predicted(values, predictors, history if kind in b"P" else [])
                 # Of frames 10 s apart one is damaged.
                 if history and not 0 < values[self.time] - history[-1][self.time] < 10_000_000:
                     raise _Damaged
@@ -229,7 +218,7 @@ class _Log:
             if lost >= 0:
                 self.damaged += Damaged(begin - lost, 1)
                 lost = -1
-            history = [values, values] if kind == ord("I") else [history[-1], values]
+            history = [values, values] if kind in b"I" else [history[-1], values]
             yield values
         if lost >= 0:
             self.damaged += Damaged(size - lost, 1)
