@@ -379,14 +379,14 @@ def _unpacked(path: Path, body: bytes) -> tuple[bytes, bool]:
 
 def _check_objects(path: Path, data: bytes) -> bytes:
     """Walk through the objects of a container as python-can does; returns the beginning of one that goes on."""
-    at = 0
-    while (at := data.find(b"LOBJ", at, at + 8)) >= 0 and len(data) - at >= BLF_OBJECT.size:
-        _, size, _ = BLF_OBJECT.unpack_from(data, at)
+    begin = 0
+    while (begin := data.find(b"LOBJ", begin, begin + 8)) >= 0 and len(data) - begin >= BLF_OBJECT.size:
+        _, size, _ = BLF_OBJECT.unpack_from(data, begin)
         if not BLF_OBJECT.size <= size <= BLOCK_BYTES:
             raise UserError(f"{path}: damaged frame log: an object of {size} bytes")
-        if at + size > len(data):
-            return data[at:]
-        at += size
+        if begin + size > len(data):
+            return data[begin:]
+        begin += size
     return b""
 
 

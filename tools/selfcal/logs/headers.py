@@ -108,7 +108,7 @@ class Header:
 
     def sensors_of(self, keys: Sequence[str], file: str = "", before: Sequence[str] | None = None) -> list[Sensor]:
         """The sensors of a table with these headings, after the lines `before` of a text."""
-        found = []
+        sensors = []
         for sensor in sensors_of(file or self.path.name, keys, self.sensors, self.mapped(keys), before):
             meant = {
                 key: own
@@ -116,8 +116,8 @@ class Header:
                 if not own.optional or any(self._of(given, key, own.name) for given in (self.stated, self.scale))
             }
             if any(own.name in self.sensors for own in meant.values()) or len(meant) == len(sensor.meant):
-                found.append(replace(sensor, meant=meant))
-        return found
+                sensors.append(replace(sensor, meant=meant))
+        return sensors
 
     def mapped(self, keys: Sequence[str]) -> dict[str, str]:
         """The names here, by heading, that the user gives."""

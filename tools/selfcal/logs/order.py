@@ -47,8 +47,8 @@ def in_order(time: Array, tick_s: float, mend: bool) -> Order:
     if time.size > 2 and np.mean(np.diff(time) < 0.0) > 0.5 and time[-1] < time[0]:
         rows, time = rows[::-1], time[::-1]
         notes.append("the rows are newest first: read from the last one on")
-    time, told = unwrapped(time, tick_s)
-    order = Order(rows, time, (*notes, *told))
+    time, remark = unwrapped(time, tick_s)
+    order = Order(rows, time, (*notes, *remark))
     return _mended(order) if mend else order
 
 
@@ -76,12 +76,12 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
 
 def _spans(time: Array, steps: Array, tick_s: float) -> list[float]:
     """Spans, s, that a clock may have."""
-    found = [2.0**32 * tick for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))] + [*_CLOCKS]
+    spans = [2.0**32 * tick for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))] + [*_CLOCKS]
     usual = float(np.median(np.abs(steps)))
     counts = [common_step(np.abs(steps), 1e-9 * usual), *(10.0**-digits for digits in range(10))]
     fits = (count for count in counts if count > 0.0 and np.abs(time / count - np.rint(time / count)).max() < 0.01)
     step = next(fits, None)
-    return found if step is None else [*found, step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))]
+    return spans if step is None else [*spans, step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))]
 
 
 def broken(time: Array) -> tuple[int, str] | None:

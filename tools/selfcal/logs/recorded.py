@@ -121,9 +121,9 @@ class Recording:
     def with_rows(self, kept: NDArray[np.bool_], *, moving: bool = False) -> Recording:
         """The recording of the rows `kept` [n] alone, two or more. The others count as missing, and as `moving` where
         that is why they are left out. Rows before the first and after the last that is kept are cut off."""
-        at = self.clock.place
+        on_grid = self.clock.place
         where = np.flatnonzero(kept)
-        begin_s = float(at[where[0]] - at[0]) / self.rate_hz
+        begin_s = float(on_grid[where[0]] - on_grid[0]) / self.rate_hz
         clock = self.clock.of_rows(where, begin_s, moving=moving)
 
         def left(column: Column) -> Column:

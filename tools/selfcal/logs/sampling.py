@@ -465,7 +465,7 @@ def rhythm(gaps: Places) -> tuple[float, float]:
     if gaps.size < 2:
         return 0.0, 1.0
     gap, count = np.unique(gaps, return_counts=True)
-    found = (0.0, 1.0)
+    best = (0.0, 1.0)
     short, middle = np.quantile(gaps, [0.05, 0.5], method="lower")
     for start, part in ((middle, 1), (short, 1), (short, 2), (short, 3)):
         few, near = gap <= 3.5 * start, gap <= 1.5 * start
@@ -480,8 +480,8 @@ def rhythm(gaps: Places) -> tuple[float, float]:
         each = np.where(
             share > np.maximum(chance, 0.5), rel_entr(share, chance) + rel_entr(1.0 - share, 1.0 - chance), 0.0
         )
-        found = max(found, (float(each.max()) * gaps.size - math.log(4.0 * gaps.size), period))
-    return found
+        best = max(best, (float(each.max()) * gaps.size - math.log(4.0 * gaps.size), period))
+    return best
 
 
 def in_rhythm(rows: Places) -> bool:
@@ -577,7 +577,7 @@ def _changes(time: Floats, least: int) -> list[Change]:
     if min(np.diff(rows)) < 2 * _STEPS:
         return []
     intervals = [_interval(time[a:b][:_HEAD], lattice) for a, b in pairwise(rows)]
-    scatter, found = max(CHANGE, _scatter(value, parts)), list[Change]()
+    scatter, changes = max(CHANGE, _scatter(value, parts)), list[Change]()
     for row, (before, after) in zip(rows[1:-1], pairwise(intervals), strict=True):
         ratio = math.log(after / before)
         # A burst after a stall makes up for it: samples of one rate, stamped late.
@@ -585,8 +585,8 @@ def _changes(time: Floats, least: int) -> list[Change]:
         if late or abs(ratio) < 0.5 * CHANGE:
             return []
         nats = min(1e6, 0.5 * time.size * (ratio / scatter) ** 2)
-        found.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
-    return found
+        changes.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
+    return changes
 
 
 def _interval(time: Floats, lattice: float) -> float:

@@ -118,10 +118,10 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     if not time[-1] <= LONGEST_S:
         _too_long(time, fail)
     time = time - start if start else time
-    found, missing = _sampling(path, time, noise_s, rate, fail)
-    if rate is not None and not abs(found / rate - 1.0) < _AGREES:
+    sampled_hz, missing = _sampling(path, time, noise_s, rate, fail)
+    if rate is not None and not abs(sampled_hz / rate - 1.0) < _AGREES:
         raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
-    rate = found if rate is None else rate
+    rate = sampled_hz if rate is None else rate
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
         raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
@@ -165,26 +165,28 @@ def remarks(clock: Clock) -> list[str]:
     regular = in_rhythm(gaps) or in_pattern(np.add(missing, 1.0))
     changes = rate_changes(time)
     if changes and not (regular and np.ptp(gaps) > _NEARLY * time.size):
-        after = ", ".join(f"{one.after_hz:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
+        after = ", ".join(
+            f"{change.after_hz:.5g} Hz from {time[change.row]:.6g} s on" for change in changes[:_IN_WORDS]
+        )
         return [f"the sampling rate changes: {changes[0].before_hz:.5g} Hz, {after}"]
     if regular:
-        lost, every, told = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
+        lost, every, words = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
         other = float(f"{rate - rate * lost / every:.6g}")
-        told = f"{told} {'are' if lost > 1 else 'is'} missing, at regular intervals"
+        words = f"{words} {'are' if lost > 1 else 'is'} missing, at regular intervals"
         alike = lattice * rate > _NEARLY and np.ptp(time - np.arange(time.size) / other) * other < 1.0
-        return [told + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
+        return [words + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
     if gaps.size:
         return []
     if 0.0 < lattice * rate < 1.0 - SAME and steps.min() > 0.5 * lattice:
         turns = np.rint(steps / lattice)
         if turns.min() == 1.0 and (lattice * rate > _NEARLY or in_pattern(turns)):
             other = float(f"{1.0 / lattice:.6g}")
-            told = f"stamps of {lattice:.4g} s: {other:g} Hz that loses {_losses(float(turns.mean()))[2]} has the same"
-            return [f"{told}: --rate {other:g} states that"]
+            words = f"stamps of {lattice:.4g} s: {other:g} Hz that loses {_losses(float(turns.mean()))[2]} has the same"
+            return [f"{words}: --rate {other:g} states that"]
     if np.ptp(off_grid) * rate <= 1.0 or float(np.diff(off_grid).std()) * rate <= _NO_GRID:
         return []
-    told = f"the stamps lie on no grid: their mean rate, {rate:.4g} Hz, is taken; no lost sample shows"
-    return [f"{told}: --rate HZ states another"]
+    words = f"the stamps lie on no grid: their mean rate, {rate:.4g} Hz, is taken; no lost sample shows"
+    return [f"{words}: --rate HZ states another"]
 
 
 def _losses(step: float) -> tuple[int, int, str]:

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from selfcal.adequacy.document import as_typed, since
+from selfcal.adequacy.document import as_typed
 from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.bank.result import FAINT, likeliest
@@ -43,17 +43,12 @@ def show(
     recording's; of the laws that of 1/alpha, then N's, then K's.
     """
     console = console or console_of(to_stderr=to_stderr, fits=True)
-    recording = document["recording"]
-    title = (
-        f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s{since(recording)}"
-    )
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     numbered = {name: axis for name, axis in axes.items() if axis.get("summary")}
     summary = fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
     laws = fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
-    first.title = title
+    first.title = escape(heading(document["recording"]))
     if numbered:
         console.print(summary)
     console.print(laws)
@@ -61,6 +56,13 @@ def show(
         console.print(_regressor_table(axes))
     for line in _notes(document, axes):
         print_line(console, line)
+
+
+def heading(recording: Mapping[str, Any]) -> str:
+    """A recording's name and extent, and where a stretch of it begins."""
+    start = f" from {recording['start_s']:g} s on" if recording.get("start_s") else ""
+    extent = f"{recording['samples']} samples, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s"
+    return f"{printable(recording['path'])}: {extent}{start}"
 
 
 def fitting(console: Console, tables: Sequence[Table]) -> Table:

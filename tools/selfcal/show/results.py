@@ -13,7 +13,7 @@ from functools import lru_cache
 from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
-from typing import Any, ClassVar, get_args, get_origin, get_type_hints
+from typing import Any, get_args, get_origin, get_type_hints
 
 from selfcal.base.errors import UserError, install
 from selfcal.base.output import TABLE_WIDTH
@@ -166,7 +166,7 @@ class Picture:
 class Document(Object):
     """What a verb answers. Its repr is what the command prints: `show` of the module `_shown_by` beside this one."""
 
-    _shown_by: ClassVar[str] = ""
+    _shown_by = ""
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         """The rows of `to_frame`."""

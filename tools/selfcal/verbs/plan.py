@@ -225,8 +225,8 @@ def _response(
         **design,
     }
     if design["duration_s"] is not None:
-        at, points = experiment.set_points(design["bit_s"], design["duration_s"])
-        rows = [*zip(at.tolist(), points.tolist(), strict=True), (design["duration_s"], float(points[-1]))]
+        begins, points = experiment.set_points(design["bit_s"], design["duration_s"])
+        rows = [*zip(begins.tolist(), points.tolist(), strict=True), (design["duration_s"], float(points[-1]))]
         document["set_points"] = [{"time_s": time_s, "value": value} for time_s, value in rows]
         if drive is not None:
             text = "".join(f"{time_s:.10g},{value:.10g}\n" for time_s, value in rows)

@@ -94,7 +94,7 @@ def _four(data: _Bytes) -> list[int]:
     """Four numbers of one tag, of 0, 4, 8 or 16 bits each, packed by half bytes."""
     tag = data.byte()
     held = -1
-    found = []
+    numbers = []
 
     def half() -> int:
         nonlocal held
@@ -110,41 +110,41 @@ def _four(data: _Bytes) -> list[int]:
         value = 0
         for _ in range(count):
             value = value << 4 | half()
-        found.append(_sign(value, 4 * count) if count else 0)
-    return found
+        numbers.append(_sign(value, 4 * count) if count else 0)
+    return numbers
 
 
 def _values(data: _Bytes, encodings: Sequence[int]) -> list[int]:
     """The numbers of a frame before their prediction. Raises _Damaged and IndexError."""
-    found: list[int] = []
-    while len(found) < len(encodings):
-        place = len(found)
-        match encodings[place]:
+    numbers: list[int] = []
+    while len(numbers) < len(encodings):
+        column = len(numbers)
+        match encodings[column]:
             case 0:
-                found.append(data.signed())
+                numbers.append(data.signed())
             case 1:
-                found.append(data.unsigned())
+                numbers.append(data.unsigned())
             case 3:  # 14 bits, negative
-                found.append(-_sign(data.unsigned() & 0x3FFF, 14))
+                numbers.append(-_sign(data.unsigned() & 0x3FFF, 14))
             case 6:  # up to eight numbers, a tag says which are not 0
                 count = 1
-                while count < 8 and place + count < len(encodings) and encodings[place + count] == 6:
+                while count < 8 and column + count < len(encodings) and encodings[column + count] == 6:
                     count += 1
                 tag = data.byte() if count > 1 else 1
-                found += [data.signed() if tag >> k & 1 else 0 for k in range(count)]
+                numbers += [data.signed() if tag >> k & 1 else 0 for k in range(count)]
             case 7:
-                found += _three(data, ((2, 2, 2), (4, 4, 4), (6, 6, 6)))
+                numbers += _three(data, ((2, 2, 2), (4, 4, 4), (6, 6, 6)))
             case 8:
-                found += _four(data)
+                numbers += _four(data)
             case 9:
-                found.append(0)
+                numbers.append(0)
             case 10:
-                found += _three(data, ((2, 2, 2), (5, 5, 4), (8, 7, 7)))
+                numbers += _three(data, ((2, 2, 2), (5, 5, 4), (8, 7, 7)))
             case _:
                 raise _Damaged
-    if len(found) != len(encodings):
+    if len(numbers) != len(encodings):
         raise _Damaged
-    return found
+    return numbers
 
 
 class _Log:
@@ -225,16 +225,16 @@ class _Log:
 
     def _predicted(self, values: list[int], predictors: Sequence[int], history: Sequence[list[int]]) -> list[int]:
         """The values with what they are predicted by. Raises _Damaged."""
-        for place, predictor in enumerate(predictors):
-            before, last = (frame[place] for frame in history) if history else (0, 0)
+        for column, predictor in enumerate(predictors):
+            before, last = (frame[column] for frame in history) if history else (0, 0)
             if predictor in self.constants:
-                values[place] += self.constants[predictor]
+                values[column] += self.constants[predictor]
             elif predictor == 5:
-                values[place] += values[self.motor]
+                values[column] += values[self.motor]
             elif predictor == 6:
-                values[place] += last + self.step if history else 0
+                values[column] += last + self.step if history else 0
             elif history and predictor in (1, 2, 3):
-                values[place] += {1: last, 2: 2 * last - before, 3: int((last + before) / 2)}[predictor]
+                values[column] += {1: last, 2: 2 * last - before, 3: int((last + before) / 2)}[predictor]
             else:
                 raise _Damaged
         return values
@@ -291,20 +291,20 @@ def _table(log: _Log, source: str) -> Table | None:
     if one_g.isdigit() and int(one_g) > 0:
         sizes["accSmooth"] = 1.0 / int(one_g)
     for name, size in sizes.items():
-        for place, axis in enumerate("xyz"):
-            if size > 0.0 and f"{name}[{place}]" in log.names:
-                headings[f"{name}[{place}]"] = f"{_AXES[name]}{axis}[{'deg/s' if name == 'gyroADC' else 'g'}]"
+        for column, axis in enumerate("xyz"):
+            if size > 0.0 and f"{name}[{column}]" in log.names:
+                headings[f"{name}[{column}]"] = f"{_AXES[name]}{axis}[{'deg/s' if name == 'gyroADC' else 'g'}]"
     places = [log.names.index(name) for name in headings]
     values = array("q")
     for frame in log.frames():
-        values.extend(frame[place] for place in places)
+        values.extend(frame[column] for column in places)
     if "gyroADC[0]" not in headings or not values:
         return None
     rows = np.array(values).reshape(-1, len(places))
     columns: dict[str, NDArray[Any]] = {"t[us]": rows[:, 0]}
-    for place, (name, heading) in enumerate(headings.items()):
-        if place:
-            columns[heading] = rows[:, place] * sizes[name[:-3]]
+    for column, (name, heading) in enumerate(headings.items()):
+        if column:
+            columns[heading] = rows[:, column] * sizes[name[:-3]]
     return of_arrays(source, columns)
 
 

@@ -49,7 +49,7 @@ def _continuous(law: str, fitted: Floats, covariance: Floats, scale: float, dt_s
         variance, phi = p[1], p[2]
         return np.array([N, 0.5 * _ln(variance * scale**2 / (1.0 - phi**2)), _ln(-_ln(phi) / dt_s)])
 
-    slope = optimize.approx_fprime(fitted, ln_of, 1e-5 * np.abs(fitted) + 1e-12)
+    slope = np.atleast_2d(optimize.approx_fprime(fitted, ln_of, 1e-5 * np.abs(fitted) + 1e-12))
     return {
         name: value if math.isfinite(value.value) and value.value > 0.0 else Value(math.nan)
         for name, value in logarithmic(NAMED[law].parameters, ln_of(fitted), slope @ covariance @ slope.T).items()
