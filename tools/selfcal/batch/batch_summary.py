@@ -205,7 +205,7 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
         for device, units in devices.items():
             for unit in units:
                 if "error" not in unit.axes.get(axis, {"error": ""}):
-                    day = None if unit.moment is None else unit.moment.timestamp() / 86400.0
+                    day = None if unit.moment is None else unit.moment.timestamp() * unit_module.factor("s", "day")
                     known = _of_recording(unit.axes[axis], law, group, regressors)
                     known_of.setdefault(axis, {}).setdefault(device, []).append((day, known))
     return known_of

@@ -33,8 +33,6 @@ PLACES = ((0, 1), (0, 2), (1, 2))
 NONE = float(np.finfo(float).eps)
 #: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
 REACH = 10.0
-#: Fewest rests that give an answer.
-FEWEST = 3
 
 
 @dataclass(frozen=True)
@@ -118,11 +116,11 @@ def _problem(tumble: Tumble, place: Place, square_sd: float = SQUARE_SD) -> Prob
 
 
 def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
-    """The accelerometers by all rests. Raises UserError for fewer than FEWEST rests."""
-    if len(tumble.rests) < FEWEST:
+    """The accelerometers by all rests. Raises UserError for fewer rests than biases."""
+    if len(tumble.rests) < len(ACCEL):
         raise UserError(
-            f"{len(tumble.rests)} rests found, {FEWEST} are needed: rest the part {REST_S:g} s or longer in each of "
-            "six positions or more"
+            f"{len(tumble.rests)} rests found, {len(ACCEL)} are needed: rest the part {REST_S:g} s or longer in "
+            "each of six positions or more"
         )
     mean, prior = _prior(tumble, place)
     own, weighed = tumble.fitted(ACCEL, lambda weighed: _problem(weighed, place), mean, mean, prior)

@@ -67,7 +67,7 @@ _OF_DAY = re.compile(
     r"(?: ?(?:Z|UTC|[-+]\d\d:?\d\d))?",
     re.ASCII,
 )
-_DAY_S = 86400.0
+_DAY_S = units.factor("day", "s")
 #: Stamp that a serial monitor puts before a line.
 _MONITOR = re.compile(r"(\d\d:\d\d:\d\d\.\d{1,6}) -> ", re.ASCII)
 #: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
