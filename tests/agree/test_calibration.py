@@ -77,7 +77,7 @@ def records_of(law: str, samples: int) -> int:
 def simulated(model: Model, law: str, samples: int) -> list[Row]:
     """Reports of records whose parameters are drawn from the prior."""
     jobs = [(law, SEED + 1_000_003 * k) for k in range(records_of(law, samples))]
-    return spread(partial(rows_of, model, "gx", samples / model.bank_rate_hz), jobs, piece=4)
+    return spread(partial(rows_of, model, "gx", samples / model.bank_rate_hz), jobs)
 
 
 @pytest.mark.parametrize("samples", LENGTHS)

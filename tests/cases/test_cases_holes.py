@@ -47,8 +47,8 @@ def uneven(job: int) -> list[Row]:
 def test_rows_of_unequal_keys_are_read_back_as_they_were(tmp_path: Path) -> None:
     """Keys, their order and the kinds of their values, of a run that computes nothing."""
     jobs = range(case_records(25, 500))
-    first = spread(uneven, jobs, piece=4, results=tmp_path)
-    again = spread(uneven, jobs, piece=4, results=tmp_path)
+    first = spread(uneven, jobs, results=tmp_path)
+    again = spread(uneven, jobs, results=tmp_path)
     assert repr(again) == repr(first) == repr([row for job in jobs for row in uneven(job)])
 
 
@@ -98,7 +98,7 @@ def test_a_killed_worker_ends_the_command_in_one_line() -> None:
     """The out-of-memory killer ends a worker like this."""
     start = time.monotonic()
     with pytest.raises(UserError, match=r"^a worker process was killed.*--results DIR keeps finished records$"):
-        spread(deadly, range(12), piece=2)
+        spread(deadly, range(12))
     assert time.monotonic() - start < 60.0
 
 
@@ -126,7 +126,7 @@ from selfcal.base import ending
 from selfcal.batch.spread import spread
 from test_cases_holes import slow
 ending.install()
-spread(partial(slow, Path(sys.argv[1])), range(4), piece=1)
+spread(partial(slow, Path(sys.argv[1])), range(4))
 """
 
 

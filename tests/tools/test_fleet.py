@@ -337,7 +337,7 @@ def test_what_kills_its_worker_is_a_row(tmp_path: Path) -> None:
     from functools import partial
 
     log = tmp_path / "log"
-    rows = spread(partial(deadly, log), range(8), piece=1, count=2, lost=lambda job: [{"lost": job}])
+    rows = spread(partial(deadly, log), range(8), count=2, lost=lambda job: [{"lost": job}])
     assert rows == [{"lost": job} if job == 3 else {"job": job} for job in range(8)]
     assert len(log.read_text()) == DEATHS
 

@@ -28,8 +28,9 @@ from rich.console import Console
 from test_wire import with_bits
 
 from selfcal.base.errors import UserError
+from selfcal.logs.framelog import LONGEST_LINE
 from selfcal.verbs.monitor import monitor
-from selfcal.wire.frames import LINE_MAX, AxisReport, Decoder, Link, load_dbc, open_bus
+from selfcal.wire.frames import AxisReport, Decoder, Link, load_dbc, open_bus
 from selfcal.wire.live import Contact, View, most_probable
 
 from conftest import needs_multicast
@@ -148,7 +149,7 @@ def test_a_line_without_an_end_takes_no_memory() -> None:
             longest = max(longest, len(link.bus._buffer))  # type: ignore[attr-defined]
             if frame is not None:
                 decoder.feed(frame)
-        assert longest <= LINE_MAX
+        assert longest <= LONGEST_LINE
         assert link.malformed > 0
     assert decoder.statistics.received == len(sent)
 
@@ -415,7 +416,7 @@ def blf(*objects: tuple[int, int, bytes], packed: bytes | None = None) -> bytes:
 @pytest.mark.parametrize(
     ("content", "complaint"),
     [
-        (blf(packed=zlib.compress(bytes(1 << 30), 9)), "unpacks to more than 16 MB"),
+        (blf(packed=zlib.compress(bytes(1 << 30), 9)), "unpacks to more than 4 MB"),
         (
             blf(packed=zlib.compress(struct.pack("<4sHHLL", b"LOBJ", 32, 1, 0, 99).ljust(64, b"\0"))),
             "an object of 0 bytes",

@@ -25,10 +25,11 @@ from selfcal.bank.result import HALF_90
 from selfcal.base.units import factor
 from selfcal.batch.batch_summary import apart_words, seen_from_words
 from selfcal.batch.drift import Series, drifts_of
-from selfcal.batch.population import FALSE_ALARM, FALSE_NAME, TWO_GROUPS, Measured, Population, populations
+from selfcal.batch.population import FALSE_NAME, TWO_GROUPS, Measured, Population, populations
 from selfcal.logs.recording import save
 from selfcal.model.file import DEFAULT, Model, read_yaml
 from selfcal.model.tables import make_tables
+from selfcal.readings.budget import FALSE_ALARM
 from selfcal.verbs.fleet import fleet
 
 from conftest import CASE_RECORDS, case_records, run

@@ -37,37 +37,37 @@ EXPECTED = [{"job": job, "square": job**2, "text": "a" if job % 2 else None} for
 
 
 def test_rows_come_in_the_order_of_the_jobs() -> None:
-    assert spread(partial(squares, None), range(20), piece=3) == EXPECTED
+    assert spread(partial(squares, None), range(20)) == EXPECTED
 
 
 def test_finished_work_is_kept(tmp_path: Path) -> None:
-    """A run that lost a piece computes that piece alone. More jobs add to what is there."""
+    """A run that lost a job computes that job alone. More jobs add to what is there."""
     log, folder = tmp_path / "log", tmp_path / "kept"
     work = partial(squares, log)
-    assert spread(work, range(18), settings={"a": 1}, piece=4, results=folder) == EXPECTED[:18]
-    Kept(folder, {"a": 1}).place(range(8, 12)).unlink()
+    assert spread(work, range(18), settings={"a": 1}, results=folder) == EXPECTED[:18]
+    Kept(folder, {"a": 1}).place(8).unlink()
     log.write_text("")
-    assert spread(work, range(18), settings={"a": 1}, piece=4, results=folder) == EXPECTED[:18]
-    assert sorted(map(int, log.read_text().split())) == [8, 9, 10, 11]
+    assert spread(work, range(18), settings={"a": 1}, results=folder) == EXPECTED[:18]
+    assert log.read_text().split() == ["8"]
     log.write_text("")
-    assert spread(work, range(20), settings={"a": 1}, piece=4, results=folder) == EXPECTED
-    assert sorted(map(int, log.read_text().split())) == [16, 17, 18, 19]  # the last piece was of two
+    assert spread(work, range(20), settings={"a": 1}, results=folder) == EXPECTED
+    assert sorted(map(int, log.read_text().split())) == [18, 19]
 
 
-def test_other_settings_are_another_work_and_a_broken_piece_is_made_anew(tmp_path: Path) -> None:
-    """In one folder. A piece with an error is done again each time."""
+def test_other_settings_are_another_work_and_a_broken_job_is_made_anew(tmp_path: Path) -> None:
+    """In one folder. A job with an error is done again each time."""
     log, folder = tmp_path / "log", tmp_path / "kept"
     work = partial(squares, log)
     spread(work, range(4), settings={"a": 1}, results=folder)
     assert spread(work, range(4), settings={"a": 2}, results=folder) == EXPECTED[:4]
-    assert len(log.read_text().split()) == 8 and len(list(folder.iterdir())) == 2
-    for kept, text in zip(folder.iterdir(), ('[{"job": 0', '{"job": 0}'), strict=True):
-        kept.write_text(text)
+    assert len(log.read_text().split()) == 8 and len(list(folder.iterdir())) == 8
+    for job, text in ((0, '[{"job": 0'), (1, '{"job": 0}')):
+        Kept(folder, {"a": 2}).place(job).write_text(text)
     assert spread(work, range(4), settings={"a": 2}, results=folder) == EXPECTED[:4]
-    assert len(log.read_text().split()) == 12
+    assert len(log.read_text().split()) == 10
     for _ in range(2):
         assert spread(failing, range(2), results=folder) == [{"error": "0"}, {"error": "1"}]
-    assert len(list(folder.iterdir())) == 2
+    assert len(list(folder.iterdir())) == 8
 
 
 def failing(job: int) -> list[Row]:

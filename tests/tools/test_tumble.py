@@ -31,7 +31,6 @@ from selfcal.calibration.earth import gravity_at, place
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.noise import Noise, Term, drift
 from selfcal.calibration.rests import tumble_of
-from selfcal.calibration.tumble_document import OF_ACCEL, OF_GYRO
 from selfcal.calibration.tumble_export import FORMS
 from selfcal.calibration.tumble_plan import plan_of
 from selfcal.calibration.tumble_show import show
@@ -57,13 +56,13 @@ def calibrated(
 
 
 def errors(accel: Accelerometer, gyro: Gyroscope | None, truth: Truth) -> tuple[Array, NDArray[np.bool_]]:
-    """Errors in sd of all parameters in the order of OF_ACCEL and OF_GYRO, and which are identified."""
+    """Errors in sd of all parameters in their order, and which are identified."""
     part = truth.part
     true = [np.concatenate([truth.bias, part.scale, part.angles])]
-    fits = [(accel.fit, 0, len(OF_ACCEL))]
+    fits = [(accel.fit, 0, accelerometer.GRAVITY)]
     if gyro is not None:
         true.append(np.concatenate([truth.gyro_bias, part.G.ravel(), part.gyro_scale, part.gyro_angles]))
-        fits.append((gyro.fit, gyro.of_accel, len(OF_GYRO)))
+        fits.append((gyro.fit, gyro.of_accel, gyroscope.VERTICAL))
     z, known = [], []
     for values, (fit, start, size) in zip(true, fits, strict=True):
         own = slice(start, start + size)
@@ -424,7 +423,9 @@ def test_lost_samples_cost_little(twelve: tuple[Recording, Truth]) -> None:
     assert len(lost[1].turns) == 11
     for a, b in zip(whole, lost, strict=True):
         assert a is not None and b is not None
-        ratio = np.sqrt(np.diag(b.fit.covariance) / np.diag(a.fit.covariance))[: len(OF_ACCEL) + len(OF_GYRO)]
+        ratio = np.sqrt(np.diag(b.fit.covariance) / np.diag(a.fit.covariance))[
+            : accelerometer.GRAVITY + gyroscope.VERTICAL
+        ]
         assert (ratio > 0.9).all() and (ratio < 1.15).all()
     z, known = errors(*lost, truth)
     assert known.all() and np.abs(z).max() < 4.5
@@ -808,7 +809,7 @@ def test_the_public_recording_of_imu_tk() -> None:
     both = np.sqrt(sum(np.diag(one.covariance)[own] for one in halves))
     assert np.abs(apart / both).max() < 3.0
     gyro = gyroscope.calibrate(whole)
-    assert gyro.fit.identified[gyro.of_accel :][: len(OF_GYRO)].all()
+    assert gyro.fit.identified[gyro.of_accel :][: gyroscope.VERTICAL].all()
     print(f"\nscales {whole.fit.theta[3:6]} +- {1.645 * sd[3:6]}, halves apart by {apart / both} sd")
 
 

@@ -224,9 +224,3 @@ def regressors_entry(scored: Scored | None) -> dict[str, Any]:
             for choice, probability in zip(scored.choices, scored.probability, strict=True)
         ],
     }
-
-
-def since(recording: Mapping[str, Any]) -> str:
-    """Where a stretch of a recording begins, for its heading."""
-    start_s = recording.get("start_s", 0.0)
-    return f" from {start_s:g} s on" if start_s else ""

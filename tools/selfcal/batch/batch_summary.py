@@ -11,10 +11,9 @@ import numpy as np
 
 from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
-from selfcal.base.errors import UserError, few
+from selfcal.base.errors import MOST_NAMED, UserError, few
 from selfcal.batch.drift import Drift, Series, drifts_of
 from selfcal.batch.population import (
-    FALSE_ALARM,
     FEWEST,
     FEWEST_OF_GROUP,
     MOST_ODD,
@@ -28,18 +27,16 @@ from selfcal.batch.population import (
     sd_off,
 )
 from selfcal.batch.unit_table import Unit
+from selfcal.batch.verdicts import MOST_TIMES
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered
+from selfcal.readings.budget import FALSE_ALARM
 
-#: Least evidence of an odd unit's law over the batch's law, nats: at most 1 in e^12 by chance.
-OTHER_LAW = 12.0
+#: Least evidence of an odd unit's law over the batch's law, nats: chance reaches it in FALSE_ALARM at most.
+OTHER_LAW = -math.log(FALSE_ALARM)
 #: Kinds of groups: attributes of a source.
 KINDS = ("station", "day", "lot")
-#: Most devices that a line or a list names, and that have a page of their own.
-MOST_NAMED = 20
-#: Largest factor to the batch's median: a batch that sees only larger ones names no unit by the quantity.
-MOST_TIMES = 1000.0
 
 
 @dataclass(frozen=True)
@@ -208,7 +205,7 @@ def _known(devices: Mapping[str, Sequence[Unit]], laws: Mapping[str, str], model
         for device, units in devices.items():
             for unit in units:
                 if "error" not in unit.axes.get(axis, {"error": ""}):
-                    day = None if unit.moment is None else unit.moment.timestamp() / 86400.0
+                    day = None if unit.moment is None else unit.moment.timestamp() * unit_module.factor("s", "day")
                     known = _of_recording(unit.axes[axis], law, group, regressors)
                     known_of.setdefault(axis, {}).setdefault(device, []).append((day, known))
     return known_of
@@ -396,7 +393,10 @@ def document_of(batch: Batch) -> dict[str, Any]:
     for slope in batch.drifts:
         drift.setdefault(names[slope.of.at], {})[slope.of.quantity] = slope.entry()
         if slope.significant:
-            drifting.setdefault(names[slope.of.at], []).append(_drift_words(slope))
+            of, per_day = slope.of, slope.per_day
+            rate = f"{100.0 * math.expm1(per_day):+.3g} %" if of.logarithm else f"{per_day:+.3g} {of.unit}"
+            basis = f"{of.y.size} recordings in {slope.days:.3g} days, {sd_off(slope.log_p):.1f} sd"
+            drifting.setdefault(names[of.at], []).append(f"{of.quantity} {rate} a day, {basis}")
     return {
         "population": {population.measured.name: _entry(population, names) for population in batch.populations},
         "unlike": batch.unlike,
@@ -481,13 +481,6 @@ def seen_from_words(population: Population) -> str:
     if off is None:
         return f"more than {MOST_TIMES:.0f} times: too few units, or too short recordings"
     return f"{off:.3g} times" if measured.logarithm else f"{off:.3g} {measured.unit}"
-
-
-def _drift_words(drift: Drift) -> str:
-    of = drift.of
-    rate = f"{100.0 * math.expm1(drift.per_day):+.3g} %" if of.logarithm else f"{drift.per_day:+.3g} {of.unit}"
-    basis = f"{of.y.size} recordings in {drift.days:.3g} days, {sd_off(drift.log_p):.1f} sd"
-    return f"{of.quantity} {rate} a day, {basis}"
 
 
 def apart_words(measured: Measured, apart: Apart, names: Sequence[str] = ()) -> str:

@@ -14,12 +14,14 @@ from rich.markup import escape
 from selfcal.bank.result import bias_of, likeliest, sd_of
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, print_line, table_of
+from selfcal.batch.population import sd_off
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
+from selfcal.readings.budget import FALSE_ALARM
 
 SCHEMA = "selfcal.compare/1"
-#: Least difference that counts, in standard deviations: 1 in 1600 quantities exceeds it by chance.
-LIMIT = 3.4
+#: Least difference that counts, in standard deviations: one quantity in 1 / FALSE_ALARM exceeds it by chance.
+LIMIT = sd_off(math.log(FALSE_ALARM))
 #: Estimates that are sizes of a cause, the one that stands for it first; places in time belong to one recording alone.
 SIZES = ("coefficient", "slope", "amplitude", "frequency_hz", "B", "lag1", "ratio", "lsb", "limit")
 

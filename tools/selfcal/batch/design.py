@@ -23,7 +23,7 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
 from selfcal.base.output import print_lines
 from selfcal.base.units import duration_words
-from selfcal.batch.plan import LEAST, MOST, Wish, part_of
+from selfcal.batch.plan import LEAST, MOST, Wish, bracket, part_of
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.response import answer_of
 from selfcal.diagnosis.separate import SHARE
@@ -35,9 +35,8 @@ from selfcal.model.file import Model
 
 #: Number of stages of the register that makes the bits.
 STAGES = 9
-#: Records that a length is tried with, largest ratio of the predicted length to a shorter one that fails, and ratio of
-#: the next length to one that was too short.
-DRAWN, STEP, LONGER = 20, 1.1, 1.2
+#: Records that a length is tried with, and ratio of the next length to one that was too short.
+DRAWN, LONGER = 20, 1.2
 LAG = Structure("lag", ("gain",), ("lag_s",))
 
 
@@ -55,9 +54,9 @@ class Experiment:
         """Times [k] at which the set point changes, s, and the set points [k] from there on."""
         count = math.ceil(duration_s / bit_s)
         # The register begins with its longest run.
-        bits = np.resize(np.roll(max_len_seq(STAGES)[0], -STAGES), count).astype(bool)
-        kept = np.flatnonzero(np.append(True, np.diff(bits.astype(int)) != 0))
-        return np.asarray(kept * bit_s, np.float64), np.where(bits[kept], self.levels[1], self.levels[0])
+        bits = np.resize(np.roll(max_len_seq(STAGES)[0], -STAGES), count).astype(np.int64)
+        kept = np.flatnonzero(np.append(True, np.diff(bits) != 0))
+        return np.asarray(kept * bit_s, np.float64), np.array(self.levels)[bits[kept]]
 
     def input(self, bit_s: float, samples: int, dt: float) -> Array:
         """[samples]: the input about its middle."""
@@ -109,15 +108,7 @@ def designed(
 
     def length(bit_s: float) -> int | None:
         """Samples of the record."""
-        low, high = 0, max(LEAST, math.ceil(8.0 * bit_s / dt))
-        while lacks(bit_s, high):
-            low, high = high, 2 * high
-            if high > MOST:
-                return None
-        while low and high / low > STEP:
-            middle = int(math.sqrt(low * high))
-            low, high = (middle, high) if lacks(bit_s, middle) else (low, middle)
-        return high
+        return bracket(partial(lacks, bit_s), max(LEAST, math.ceil(8.0 * bit_s / dt)))[1]
 
     bits = [max(times * experiment.lag_s, 2.0 * dt) for times in (0.5, 1.0, 2.0, 4.0)]
     reached = {bit_s: samples for bit_s in bits if (samples := length(bit_s)) is not None}

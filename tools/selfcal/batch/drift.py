@@ -20,7 +20,7 @@ import numpy as np
 from scipy.special import chdtrc, stdtr
 
 from selfcal.base.grid import Array, bisected
-from selfcal.batch.population import FALSE_ALARM
+from selfcal.readings.budget import FALSE_ALARM
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from typing import Any
 
 from selfcal.base.errors import UserError, few, note, short
 from selfcal.base.limits import read_text
+from selfcal.logs.loaders.damage import bytes_of
 from selfcal.logs.recording import meta_place
 
 #: Columns of a table of units; the first two must be there.
@@ -55,13 +56,14 @@ def matching(patterns: Sequence[str], own: Sequence[Path]) -> list[str]:
     pattern does.
     Raises UserError for a pattern that matches none.
     """
+    outputs = {output.absolute() for output in own}
     recordings: dict[str, None] = {}
     skipped: dict[str, str] = {}
     for pattern in patterns:
         folder = Path(pattern)
         named = folder.exists() or folder.is_symlink()
         names = [pattern] if named else glob(pattern, recursive=True)  # noqa: PTH207
-        others = [name for name in names if not _within_any(Path(name), own)]
+        others = [name for name in names if outputs.isdisjoint((whole := Path(name).absolute(), *whole.parents))]
         kept = [name for name in others if _is_recording(Path(name))]
         if not kept and not named:
             raise _unmatched(pattern)
@@ -81,11 +83,6 @@ def _unmatched(*patterns: str) -> UserError:
     return UserError(
         f"no recording matches '{short(patterns[0])}'{more}: give files, or a pattern in quotes as 'logs/**/*.csv'"
     )
-
-
-def _within_any(path: Path, own: Sequence[Path]) -> bool:
-    whole = path.absolute()
-    return any(whole == output.absolute() or output.absolute() in whole.parents for output in own)
 
 
 def _no_file(path: Path) -> str:
@@ -117,10 +114,9 @@ def hashed(path: str) -> Source:
         of_file = digest(log)
         beside = meta_place(log)
         content = of_file if not beside.is_file() else hashlib.sha256((of_file + digest(beside)).encode()).hexdigest()
-        size = sum(file.stat().st_size for file in (log.iterdir() if log.is_dir() else [log]))
+        return Source(path, of_file, content, bytes_of(log))
     except OSError:
         return Source(path, content=f"unread {path}")
-    return Source(path, of_file, content, size)
 
 
 @dataclass(frozen=True)

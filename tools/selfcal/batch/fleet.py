@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from selfcal.base.errors import MOST_NAMED
 from selfcal.base.output import print_lines
-from selfcal.batch.batch_summary import MOST_NAMED
 from selfcal.batch.fail_on import outcome
 from selfcal.batch.unit_table import Unit
 from selfcal.batch.verdicts import FAIL, PASS, Judged, Limits, judge, unjudged

@@ -49,9 +49,7 @@ def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) ->
         "plain": plain,
         "seen_from": seen_from_words,
         "unidentified": list(unidentified_lines(batch)),
-        "distributions": _drawn(
-            _histogram(population, _limits(document, population.measured.name)) for population in histograms
-        ),
+        "distributions": _drawn(_histogram(population, document["limits"]) for population in histograms),
         "charts": _control(batch),
         "devices": len(batch.devices),
         "marked": marked,
@@ -65,15 +63,11 @@ def _drawn(figures: Iterable[Figure]) -> Markup:
     return Markup().join(map(draw, figures))
 
 
-def _limits(document: Mapping[str, Any], name: str) -> list[tuple[float, str]]:
-    """Value and unit of each limit of a data sheet on a quantity."""
-    limits = [limit for limit in document["limits"] if f"{limit['axis']}.{limit['parameter']}" == name]
-    return list(dict.fromkeys((limit["value"], limit["unit"]) for limit in limits))
-
-
-def _histogram(population: Population, limits: Sequence[tuple[float, str]]) -> Figure:
+def _histogram(population: Population, limits: Sequence[Mapping[str, Any]]) -> Figure:
+    """The distribution of a quantity, with the data sheet's `limits` that are on it."""
     measured = population.measured
-    marks = [value * unit_module.factor(unit, measured.unit) for value, unit in limits if unit != "1"]
+    own = [limit for limit in limits if limit["unit"] != "1" and measured.name == "{axis}.{parameter}".format(**limit)]
+    marks = sorted({limit["value"] * unit_module.factor(limit["unit"], measured.unit) for limit in own})
     y = measured.y
     reach = float(np.ptp(y)) or 1.0
     bins = int(np.clip(2.0 * y.size ** (1.0 / 3.0), 8, 60))
@@ -101,20 +95,15 @@ def _histogram(population: Population, limits: Sequence[tuple[float, str]]) -> F
 def _control(batch: Batch) -> Markup | None:
     """Control charts of N and of the bias in the order of the dates: individuals and moving ranges. None: no dates."""
     when = [units[-1].recorded_at for units in batch.devices.values()]
-    charts = [population for population in batch.populations if population.measured.name.endswith((".N", ".bias"))]
-    if len({date[:10] for date in when if date}) < 2 or not charts:
-        return None
     figures: list[Figure] = []
-    for chart in charts[:MOST_PICTURES]:
-        measured = chart.measured
-        order = sorted(
-            (k for k, device in enumerate(measured.at.tolist()) if when[device]),
-            key=lambda k: when[int(measured.at[k])],
-        )
-        if len(order) >= 3:
+    charts = [chart.measured for chart in batch.populations if chart.measured.name.endswith((".N", ".bias"))]
+    for measured in charts[:MOST_PICTURES]:
+        dated = sorted((when[device], k) for k, device in enumerate(measured.at.tolist()) if when[device])
+        if len({date[:10] for date, _ in dated}) > 1:
+            order = [k for _, k in dated]
             y = np.asarray(np.exp(measured.y[order]) if measured.logarithm else measured.y[order], np.float64)
             figures += _individuals(measured.name, unit_module.typeset(measured.unit), y)
-    return _drawn(figures)
+    return _drawn(figures) if figures else None
 
 
 def _individuals(name: str, unit: str, y: Array) -> list[Figure]:

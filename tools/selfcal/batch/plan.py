@@ -44,15 +44,11 @@ from selfcal.show.plot import COLORS
 SCHEMA = "selfcal.plan/1"
 #: Bank samples of the shortest record, and of the longest.
 LEAST, MOST = 64, 200_000
-#: Halvings of the last step of the length, in its logarithm.
-HALVINGS = 3
 #: Ratio of the rates of banks that a line compares, and largest ratio of the lengths that is worth a line: a slower
 #: bank may lengthen the record by the inverse.
 FASTER, WORTH = 10.0, 0.8
-#: Largest ratio of a bias' interval at half the length to the whole: it is in its steady state.
-STEADY = 1.1
-#: Length of a record without another wish, s.
-SWEEP_S = 3600.0
+#: Largest ratio of two lengths, or of a bias' interval at half the length to the whole, that counts as 1.
+ALIKE = 1.1
 #: Forms whose column is in proportion to the channel.
 LINEAR = ("static", "lag", "rate")
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
@@ -122,6 +118,20 @@ def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
     return made(sources_of(regressor, channels_of((regressor,))), 1.0 / rate_hz, channel[:, None])[:, 0]
 
 
+def bracket(lacks: Callable[[int], bool], least: int) -> tuple[int, int | None]:
+    """The bank samples of the longest record tried that lacks something, 0 for none, and of a shortest one that has it:
+    longer by ALIKE at most, None beyond MOST."""
+    low, high = 0, least
+    while lacks(high):
+        low, high = high, 2 * high
+        if high > MOST:
+            return low, None
+    while low and high > ALIKE * low:
+        middle = int(math.sqrt(low * high))
+        low, high = (middle, high) if lacks(middle) else (low, middle)
+    return low, high
+
+
 class Ensemble:
     """The records at each length that was asked for: metrics [records, wishes], NaN where a wish is not of the law."""
 
@@ -168,16 +178,9 @@ class Ensemble:
 
     def length(self, k: int) -> int | None:
         """Bank samples at which the wish is reached; None beyond MOST."""
-        low, high = 0, LEAST
-        while self.reached(k, high) > 0.0:
-            low, high = high, 2 * high
-            if high > MOST:
-                return None
-        if not low:
+        low, high = bracket(lambda samples: self.reached(k, samples) > 0.0, LEAST)
+        if high is None or not low:
             return high
-        for _ in range(HALVINGS):
-            middle = int(math.sqrt(low * high))
-            low, high = (middle, high) if self.reached(k, middle) > 0.0 else (low, middle)
         above, below = self.reached(k, low), self.reached(k, high)
         share = above / (above - below) if above > below else 1.0
         return math.ceil(low * math.exp(share * math.log(high / low)))
@@ -312,7 +315,7 @@ def _times(half: Callable[[float, float], float], own_hz: float, rate_hz: float,
 def _half_interval(law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float) -> float:
     """Half of the 90 % interval of ln of a parameter, by the Fisher information; infinite where the record has none."""
     n = duration_s * rate_hz
-    if n < 8:
+    if n < LEAST:
         return math.inf
     try:
         covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))
@@ -353,10 +356,10 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 
 
 def steady(curve: Sequence[Mapping[str, float]]) -> float | None:
-    """What nine records of ten keep at the longest length, if half of that length has it too, but for STEADY."""
+    """What nine records of ten keep at the longest length, if half of that length has it too, but for ALIKE."""
     longest = curve[-1]
     half = [point for point in curve if point["duration_s"] <= 0.5 * longest["duration_s"]]
-    return longest["q90"] if half and half[-1]["q90"] < STEADY * longest["q90"] else None
+    return longest["q90"] if half and half[-1]["q90"] < ALIKE * longest["q90"] else None
 
 
 def _swings(wish: Mapping[str, Any]) -> str:

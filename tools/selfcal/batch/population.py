@@ -23,10 +23,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import log_ndtr, logsumexp, ndtri
+from scipy.special import chdtri, log_ndtr, logsumexp, ndtri
 
 from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.grid import Array, weighted_quantiles
+from selfcal.readings.budget import FALSE_ALARM
 
 #: Fewest units of a population and of a group.
 FEWEST, FEWEST_OF_GROUP = 5, 3
@@ -34,14 +35,11 @@ FEWEST, FEWEST_OF_GROUP = 5, 3
 _POINTS, _LEAST, _MOST = 160, 1e-3, 100.0
 #: Probability that a quantity calls any unit of a sound batch unlike.
 FALSE_NAME = 0.03
-#: Probability of a false group in a batch, and of a false drift of a unit.
-FALSE_ALARM = 1e-3
 #: Largest share of odd units, and the most numbers of odd units that are tried.
 MOST_ODD, _TRIED = 1.0 / 3.0, 40
-#: Most rounds of fit and choice.
-_ROUNDS = 20
-#: Evidence of two groups over one, nats: 1 in 1000 normal batches of 8 to 24 units exceeds it.
-_SPLIT = 8.0
+#: Evidence of two groups over one, nats: normal batches of 8 to 24 units exceed it as if the second mean, the share and
+#: the cut were three numbers more.
+_SPLIT = 0.5 * float(chdtri(3, FALSE_ALARM))
 
 
 @dataclass(frozen=True)
@@ -213,8 +211,10 @@ def populations(
     group_limit = math.log(FALSE_ALARM / max(1, len(groups) * len(tested)))
     groups_of = {quantity.name: _apart(quantity, groups, limit, group_limit) for quantity in tested}
     by_name: dict[str, Population] = {}
-    for _ in range(_ROUNDS):
-        before = {name: {unit.at for unit in of.unlike} for name, of in by_name.items()}
+    before: dict[str, frozenset[int]] = {}
+    known: list[dict[str, frozenset[int]]] = []
+    while before not in known:  # until nothing changes, or a choice comes again
+        known.append(before)
         for quantity in tested:
             axis = quantity.name.split(".")[0]
             others = set((odd or {}).get(axis, ()))
@@ -222,8 +222,7 @@ def populations(
                 *(of for name, of in before.items() if name != quantity.name and name.split(".")[0] == axis)
             )
             by_name[quantity.name] = _population(quantity, groups_of[quantity.name], others, limit)
-        if before == {name: {unit.at for unit in of.unlike} for name, of in by_name.items()}:
-            break
+        before = {name: frozenset(unit.at for unit in of.unlike) for name, of in by_name.items()}
     return list(by_name.values())
 
 
@@ -252,13 +251,10 @@ def _groups(groupings: Sequence[Grouping]) -> Groups:
 def _apart(measured: Measured, groups: Groups, limit: float, group_limit: float) -> list[Apart]:
     """The groups of a quantity that differ, the largest difference first."""
     apart: list[Apart] = []
-    y = measured.y.copy()
-    for _ in range(_ROUNDS):
-        left = {members: labels for members, labels in groups.items() if members not in {of.members for of in apart}}
-        group = _most_apart(measured, y, left, limit, group_limit)
-        if group is None:
-            break
+    y, left = measured.y.copy(), dict(groups)
+    while group := _most_apart(measured, y, left, limit, group_limit):
         apart.append(group)
+        del left[group.members]
         y -= group.shift(measured.at)
     return apart
 

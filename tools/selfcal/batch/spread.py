@@ -1,8 +1,8 @@
 """Many records over many processors: this machine's, or a Dask cluster's; finished work is kept in a folder.
 
-A job's numbers depend on the job alone, so any number of workers gives the same rows. Jobs go out in pieces. With a
-folder each finished piece becomes a file there, and a later run reads it instead of computing it again. A worker that
-is killed costs the piece that it works at; another worker does it again.
+A job's numbers depend on the job alone, so any number of workers gives the same rows. With a folder each finished job
+becomes a file there, and a later run reads it instead of computing it again. A worker that is killed costs the job that
+it works at; another worker does it again.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from concurrent import futures
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
@@ -38,21 +37,19 @@ from selfcal.base.units import duration_words
 #: Argument of the function for a record; it is pickled.
 Job = Any
 Row = dict[str, Any]
-#: A piece: its place among the pieces, and its jobs.
-Work = tuple[int, list[Job]]
 #: Timeout of a scheduler, s.
 PATIENCE_S = 10.0
 #: Number of seeds that the simulator takes.
 SEEDS = 2**64
-#: Number of dead workers of a piece after which the piece is the reason.
+#: Number of dead workers of a job after which the job is the reason.
 DEATHS = 4
 _KILLED = "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"
 
 
 class Kept:
-    """A folder of finished pieces, a JSON file each, named by the hash of its jobs and of the settings.
+    """A folder of finished jobs, a JSON file each, named by the hash of the job and of the settings.
 
-    `settings`: everything that decides the rows apart from the jobs; `key`: what of a job decides them. A piece with an
+    `settings`: everything that decides the rows apart from the jobs; `key`: what of a job decides them. A job with an
     `error` is not kept: it is done again each time."""
 
     def __init__(
@@ -64,23 +61,23 @@ class Kept:
         except OSError as error:
             raise UserError(f"{printable(str(folder))}: cannot be made a folder: {error.strerror}") from error
 
-    def place(self, jobs: Sequence[Job]) -> Path:
-        """The file of a piece."""
-        named = json.dumps([self.settings, [self.key(job) for job in jobs]], sort_keys=True, default=repr)
+    def place(self, job: Job) -> Path:
+        """The file of a job."""
+        named = json.dumps([self.settings, [self.key(job)]], sort_keys=True, default=repr)
         return self.folder / f"{hashlib.sha256(named.encode()).hexdigest()}.json"
 
-    def read(self, jobs: Sequence[Job]) -> list[Row] | None:
-        """The rows of a piece, None if it is to be made: it is not there, or damaged."""
+    def read(self, job: Job) -> list[Row] | None:
+        """The rows of a job, None if it is to be made: it is not there, or damaged."""
         try:
-            rows = json.loads(self.place(jobs).read_text(encoding="utf-8"))
+            rows = json.loads(self.place(job).read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return None
         return rows if isinstance(rows, list) and all(isinstance(row, dict) for row in rows) else None
 
-    def write(self, jobs: Sequence[Job], rows: Sequence[Row]) -> None:
-        """Keep the rows of a piece."""
+    def write(self, job: Job, rows: Sequence[Row]) -> None:
+        """Keep the rows of a job."""
         if not any("error" in row for row in rows):
-            with whole(self.place(jobs)) as temporary:
+            with whole(self.place(job)) as temporary:
                 temporary.write_text(json.dumps(rows, default=lambda number: number.item()), encoding="utf-8")
 
 
@@ -103,7 +100,6 @@ def spread(
     jobs: Sequence[Job],
     *,
     settings: Mapping[str, Any] | None = None,
-    piece: int = 8,
     scheduler: str | None = None,
     results: Path | str | Kept | None = None,
     count: int | None = None,
@@ -113,31 +109,28 @@ def spread(
 ) -> list[Row]:
     """The rows of `function` for all `jobs`, in their order.
 
-    `piece`: jobs that go out, and are kept, together. `scheduler`: address of a Dask scheduler, whose workers have this
-    package. `results`: the folder that keeps finished pieces; `settings`: as `Kept` has them. `count`: workers here, by
-    default as many as processors. `lost`: the rows of a job whose workers die; without it such a job ends the work.
-    `weights` [jobs]: the work of each, for the remaining time. `verb`: who writes the progress on stderr where there is
-    no terminal; "": nobody.
+    `scheduler`: address of a Dask scheduler, whose workers have this package. `results`: the folder that keeps finished
+    jobs; `settings`: as `Kept` has them. `count`: workers here, by default as many as processors. `lost`: the rows of a
+    job whose workers die; without it such a job ends the work. `weights` [jobs]: the work of each, for the remaining
+    time. `verb`: who writes the progress on stderr where there is no terminal; "": nobody.
     Raises UserError for a package that is absent and a scheduler that does not answer.
     """
     if count is not None and count < 1:
         raise UserError("--workers must be at least 1")
     kept = Kept(results, settings or {}) if isinstance(results, Path | str) else results
-    pieces = [list(jobs[start : start + piece]) for start in range(0, len(jobs), piece)]
-    each = [1.0] * len(jobs) if weights is None else list(weights)
     finished: dict[int, list[Row]] = {}
     if kept is not None:
-        finished = {k: rows for k, work in enumerate(pieces) if (rows := kept.read(work)) is not None}
-    waiting = [(k, work) for k, work in enumerate(pieces) if k not in finished]
-    with _Remaining(verb, [sum(each[k * piece : (k + 1) * piece]) for k in range(len(pieces))], pieces) as remaining:
+        finished = {k: rows for k, job in enumerate(jobs) if (rows := kept.read(job)) is not None}
+    waiting = {k: job for k, job in enumerate(jobs) if k not in finished}
+    with _Remaining(verb, [1.0] * len(jobs) if weights is None else weights) as remaining:
         remaining.done(finished)
         done = _cluster(function, waiting, scheduler, lost) if scheduler else _here(function, waiting, count, lost)
         for k, rows in done:
             finished[k] = rows
             if kept is not None:
-                kept.write(pieces[k], rows)
+                kept.write(jobs[k], rows)
             remaining.advance(k)
-    return [row for k in range(len(pieces)) for row in finished[k]]
+    return [row for k in range(len(jobs)) for row in finished[k]]
 
 
 class _Remaining(Doing):
@@ -145,33 +138,27 @@ class _Remaining(Doing):
 
     The rest takes as long for its weight as the work of this run did."""
 
-    def __init__(self, verb: str, weights: Sequence[float], pieces: Sequence[Sequence[Job]]) -> None:
+    def __init__(self, verb: str, weights: Sequence[float]) -> None:
         columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[said]}"))
         super().__init__(verb, *columns, total=sum(weights))
-        self.weights, self.sizes = weights, [len(piece) for piece in pieces]
-        self.left, self.worked, self.jobs = sum(weights), 0.0, 0
+        self.weights, self.left, self.worked, self.jobs = weights, sum(weights), 0.0, 0
 
-    def done(self, pieces: Iterable[int]) -> None:
+    def done(self, jobs: Iterable[int]) -> None:
         """These were done by an earlier run."""
-        for k in pieces:
+        for k in jobs:
             self.left -= self.weights[k]
-            self.jobs += self.sizes[k]
+            self.jobs += 1
             self.progress.advance(self.task, self.weights[k])
 
     def advance(self, k: int) -> None:
-        """A piece is done now."""
+        """A job is done now."""
         self.worked += self.weights[k]
         self.left -= self.weights[k]
-        self.jobs += self.sizes[k]
+        self.jobs += 1
         rest_s = (time.monotonic() - self.began) * self.left / self.worked if self.worked else 0.0
-        said = f"{self.jobs} of {sum(self.sizes)}, {duration_words(rest_s)} more"
+        said = f"{self.jobs} of {len(self.weights)}, {duration_words(rest_s)} more"
         self.progress.update(self.task, advance=self.weights[k], said=said)
         self.tell(said)
-
-
-def _piece(function: Callable[[Job], list[Row]], work: Work) -> tuple[int, list[Row]]:
-    k, jobs = work
-    return k, [row for job in jobs for row in function(job)]
 
 
 def _obedient(folder: str) -> None:
@@ -180,14 +167,9 @@ def _obedient(folder: str) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_DFL)
-    threading.Thread(target=_end_with_the_command, daemon=True).start()
-
-
-def _end_with_the_command() -> None:
     command = multiprocessing.parent_process()
     if command is not None:
-        wait([command.sentinel])
-        os._exit(1)
+        threading.Thread(target=lambda: wait([command.sentinel]) and os._exit(1), daemon=True).start()
 
 
 @contextmanager
@@ -213,51 +195,51 @@ def workers(count: int | None = None) -> Iterator[ProcessPoolExecutor]:
 
 def _here(
     function: Callable[[Job], list[Row]],
-    waiting: Sequence[Work],
+    waiting: Mapping[int, Job],
     count: int | None,
     lost: Callable[[Job], list[Row]] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
-    """Each worker is a pool of its own: a dead one leaves the others at their work, and its own piece is known."""
-    todo, deaths = deque(waiting), dict.fromkeys((k for k, _ in waiting), 0)
+    """Each worker is a pool of its own: a dead one leaves the others at their work, and its own job is known."""
+    todo, deaths = deque(waiting), dict.fromkeys(waiting, 0)
     with ExitStack() as stack:
         slots: dict[int, ProcessPoolExecutor] = {}
-        running: dict[Future[tuple[int, list[Row]]], tuple[int, Work]] = {}
+        running: dict[Future[list[Row]], tuple[int, int]] = {}
 
         def start(slot: int) -> None:
             if not todo:
                 return
-            work = todo.popleft()
+            k = todo.popleft()
             try:
-                running[slots[slot].submit(_piece, function, work)] = (slot, work)
+                running[slots[slot].submit(function, waiting[k])] = slot, k
             except (KeyError, BrokenProcessPool):  # a new slot; a worker that was killed while it had nothing to do
                 slots[slot] = stack.enter_context(workers(1))
-                running[slots[slot].submit(_piece, function, work)] = (slot, work)
+                running[slots[slot].submit(function, waiting[k])] = slot, k
 
         for slot in range(min(count or os.cpu_count() or 1, len(waiting))):
             start(slot)
         while running:
             for future in futures.wait(running, return_when=futures.FIRST_COMPLETED).done:
-                slot, work = running.pop(future)
-                answer: tuple[int, list[Row]] | None = None
+                slot, k = running.pop(future)
+                rows: list[Row] | None = None
                 try:
-                    answer = future.result()
+                    rows = future.result()
                 except BrokenProcessPool as error:
                     del slots[slot]
-                    deaths[work[0]] += 1
-                    if deaths[work[0]] < DEATHS:
-                        todo.appendleft(work)
+                    deaths[k] += 1
+                    if deaths[k] < DEATHS:
+                        todo.appendleft(k)
                     elif lost is None:
                         raise UserError(_KILLED) from error
                     else:
-                        answer = work[0], [row for job in work[1] for row in lost(job)]
+                        rows = lost(waiting[k])
                 start(slot)
-                if answer is not None:
-                    yield answer
+                if rows is not None:
+                    yield k, rows
 
 
 def _cluster(
     function: Callable[[Job], list[Row]],
-    waiting: Sequence[Work],
+    waiting: Mapping[int, Job],
     scheduler: str,
     lost: Callable[[Job], list[Row]] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
@@ -271,17 +253,17 @@ def _cluster(
         said = f"--scheduler {printable(scheduler)}: no Dask scheduler answers ({first_line(error)})"
         raise UserError(f"{said}: start one with `dask scheduler`") from error
     with _silent(), client:
-        sent = client.map(partial(_piece, function), waiting, pure=False)
-        work_of = dict(zip((future.key for future in sent), waiting, strict=True))
+        sent = client.map(function, list(waiting.values()), pure=False)
+        place_of = dict(zip((future.key for future in sent), waiting, strict=True))
         try:
             for future in distributed.as_completed(sent):
-                k, jobs = work_of[future.key]
+                k = place_of[future.key]
                 try:
-                    yield future.result()
+                    yield k, future.result()
                 except distributed.KilledWorker as error:
                     if lost is None:
                         raise UserError(_KILLED) from error
-                    yield k, [row for job in jobs for row in lost(job)]
+                    yield k, lost(waiting[k])
         except (futures.CancelledError, OSError) as error:
             said = f"--scheduler {printable(scheduler)}: the Dask scheduler has gone"
             raise UserError(f"{said}: start it and this command again; --results DIR keeps finished records") from error

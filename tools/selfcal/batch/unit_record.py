@@ -11,20 +11,17 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from selfcal.base.errors import UserError, first_line
-from selfcal.batch.batch_summary import MOST_NAMED
+from selfcal.base.errors import MOST_NAMED, UserError, first_line
 from selfcal.batch.spread import Job, Kept, Row, spread
 from selfcal.batch.unit_table import Unit
-from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.readings.tests import TESTS
 
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
-#: Checks of the readings, and of the innovations; least deviation of a mark, sd.
+#: Checks of the readings, and of the innovations.
 READINGS = tuple(test.name for test in TESTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
-FAR = 8.0
 #: Characters that the name of a device's page lacks.
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")
 #: Error of a recording whose workers die.
@@ -74,16 +71,12 @@ def _record(verbs: Verbs, options: Options, path: str) -> Row:
         "axes": {name: _of(axis, IDENTIFIED) | _looks(axis) for name, axis in document["axes"].items()},
     }
     if options.diagnose:
-        row["diagnosis"] = _diagnosis(verbs, path, list(document["axes"]), options.given)
+        try:
+            axes = verbs.diagnose(path, **options.given)["axes"]
+        except UserError as error:
+            axes = {name: {"error": str(error).removeprefix(f"{path}: ")} for name in document["axes"]}
+        row["diagnosis"] = {name: _of(axis, DIAGNOSED) for name, axis in axes.items()}
     return row
-
-
-def _diagnosis(verbs: Verbs, path: str, names: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
-    try:
-        axes = verbs.diagnose(path, **given)["axes"]
-    except UserError as error:
-        return {name: {"error": str(error).removeprefix(f"{path}: ")} for name in names}
-    return {name: _of(axis, DIAGNOSED) for name, axis in axes.items()}
 
 
 def own_pages(
@@ -104,10 +97,10 @@ def own_pages(
     jobs = {}
     for name in [name for name in dict.fromkeys(names) if name in devices][:MOST_NAMED]:
         source = devices[name][-1].source
-        digest = kept.place([(source.path, source.content)]).stem[:12]
+        digest = kept.place((source.path, source.content)).stem[:12]
         jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{digest}.html"))
     todo = [job for job in jobs.values() if not Path(job[1]).exists()]
-    spread(partial(_paged, verbs, options), todo, piece=1, count=count, lost=lambda _: [{}], verb="pages")
+    spread(partial(_paged, verbs, options), todo, count=count, lost=lambda _: [{}], verb="pages")
     return {name: f"{pages.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
 
 
@@ -133,7 +126,7 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     marks += [
         name
         for name, check in failed.items()
-        if name in INNOVATIONS and abs(float(check["value"])) > FAR * float(check["limit"]) / CHECK_LIMIT
+        if name in INNOVATIONS and abs(float(check["value"])) > 2.0 * float(check["limit"])
     ]
     lattice = checks.get("lattice", {})
     stated = {"lattice": lattice["step"]} if lattice.get("distinct", 0) >= 8 else {}

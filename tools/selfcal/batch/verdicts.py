@@ -32,8 +32,10 @@ from selfcal.model.laws import PLACES, RATIOS
 
 SCHEMA = "selfcal.limits/1"
 PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
-#: Probability of a verdict after the rest that is asked for; longest such rest, in times the record.
-CHANCE, MOST_TIMES = 0.8, 1000.0
+#: Probability of a verdict after the rest that is asked for.
+CHANCE = 0.8
+#: Largest factor that is stated: of a rest to the record, of a unit's quantity to the batch's median.
+MOST_TIMES = 1000.0
 
 
 @dataclass(frozen=True)
@@ -266,18 +268,6 @@ _COLUMNS = (
 )
 
 
-def write_verdicts(path: Path | str, judged: Iterable[Judged]) -> None:
-    """Write a CSV of a row for each limit of each recording."""
-    from selfcal.batch.unit_table import write_csv
-
-    rows = (
-        {"device": device, "recording": recording, **verdict.entry()}
-        for device, recording, verdicts in judged
-        for verdict in verdicts
-    )
-    write_csv(path, _COLUMNS, rows)
-
-
 def write_junit(path: Path | str, judged: Sequence[Judged]) -> None:
     """Write JUnit's XML: a suite for each recording, a case for each limit.
 
@@ -327,14 +317,21 @@ def check_options(limits: Path | str | None, junit: Path | str | None, verdicts:
 
 
 def write(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | str | None) -> None:
-    """Write the files that are asked for. A recording without a device has its file's name."""
+    """Write the files that are asked for: JUnit, and a CSV of a row for each limit of each recording. A recording
+    without a device has its file's name."""
     from selfcal.batch.files import stem
+    from selfcal.batch.unit_table import write_csv
 
     named = [(device or stem(recording), recording, of_unit) for device, recording, of_unit in judged]
     if junit is not None:
         write_junit(junit, named)
     if verdicts is not None:
-        write_verdicts(verdicts, named)
+        rows = (
+            {"device": device, "recording": recording, **verdict.entry()}
+            for device, recording, of_unit in named
+            for verdict in of_unit
+        )
+        write_csv(verdicts, _COLUMNS, rows)
 
 
 def add_verdicts(

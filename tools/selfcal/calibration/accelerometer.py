@@ -16,7 +16,8 @@ from selfcal.base.grid import Array, Mask, slices
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import drift
 from selfcal.calibration.rests import ACCEL, REST_S, Tumble
-from selfcal.calibration.tumble_fit import FALSE_ALARM, Fit, Problem, fit
+from selfcal.calibration.tumble_fit import Fit, Problem, fit
+from selfcal.readings.budget import FALSE_ALARM
 
 #: Stated priors, sd: bias, m/s^2 (100 mg); scale; angle, rad; temperature coefficient, m/s^2/degC (1 mg/degC).
 BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
@@ -29,11 +30,9 @@ GRAVITY = ANGLE.stop
 #: Row and column of each angle.
 PLACES = ((0, 1), (0, 2), (1, 2))
 #: sd of a parameter that the logs do not have: not 0, so that the prior has an inverse.
-NONE = 1e-12
+NONE = float(np.finfo(float).eps)
 #: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
 REACH = 10.0
-#: Fewest rests that give an answer.
-FEWEST = 3
 
 
 @dataclass(frozen=True)
@@ -117,11 +116,11 @@ def _problem(tumble: Tumble, place: Place, square_sd: float = SQUARE_SD) -> Prob
 
 
 def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
-    """The accelerometers by all rests. Raises UserError for fewer than FEWEST rests."""
-    if len(tumble.rests) < FEWEST:
+    """The accelerometers by all rests. Raises UserError for fewer rests than biases."""
+    if len(tumble.rests) < len(ACCEL):
         raise UserError(
-            f"{len(tumble.rests)} rests found, {FEWEST} are needed: rest the part {REST_S:g} s or longer in each of "
-            "six positions or more"
+            f"{len(tumble.rests)} rests found, {len(ACCEL)} are needed: rest the part {REST_S:g} s or longer in "
+            "each of six positions or more"
         )
     mean, prior = _prior(tumble, place)
     own, weighed = tumble.fitted(ACCEL, lambda weighed: _problem(weighed, place), mean, mean, prior)

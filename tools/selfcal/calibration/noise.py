@@ -12,8 +12,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import hyp1f1
 
 from selfcal.adequacy.identify import identify_axis
+from selfcal.bank.blocks import FEWEST
 from selfcal.bank.priors import known, laid
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
@@ -24,8 +26,6 @@ from selfcal.model.laws import Law
 
 #: Shortest rest that identifies the law of the part, s.
 LONG_S = 1200.0
-#: Fewest differences of piece means that measure N: fewer leave it to the model.
-FEWEST = 30
 
 
 @dataclass(frozen=True)
@@ -68,11 +68,10 @@ def drift(noise: Noise, begin_s: Array, end_s: Array, reference_s: float) -> Arr
             continue
         x = term.alpha * length
         mean = -np.expm1(-x) / x
-        own = np.where(x > 1e-3, 2.0 * (x + np.expm1(-x)) / np.maximum(x, 1e-3) ** 2, 1.0 - x / 3.0)
         half = 0.5 * length
         gap = np.maximum(apart - half[:, None] - half[None, :], 0.0)
         between = np.exp(-term.alpha * gap) * mean[:, None] * mean[None, :]
-        between[same] = own
+        between[same] = hyp1f1(1.0, 3.0, -x)  # 2 (x - 1 + e^-x) / x^2
         to_end = np.exp(-term.alpha * (back - half)) * mean
         covariance += term.square * (between - to_end[:, None] - to_end[None, :] + 1.0)
     return covariance

@@ -15,7 +15,7 @@ from selfcal.base.grid import Array, Mask, block_means, runs
 from selfcal.base.units import factor
 from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
 from selfcal.calibration.tumble_fit import Fit, Problem, fit, linearized
-from selfcal.logs.recording import Recording, check_column
+from selfcal.logs.recording import Recording, bridged, check_column
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
 from selfcal.readings.rest import PIECE_S, rest_of
@@ -185,7 +185,7 @@ class _Log:
     recording: Recording
     begin_s: float
     own: dict[str, Array]
-    bridged: dict[str, Array]
+    whole: dict[str, Array]
     steps: dict[str, float]
     temp: Array
     rests: tuple[slice, ...]
@@ -207,7 +207,7 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     ranges = {name: _range(model, name) if part_stated else math.inf for name in axes}
     rows_of = [(log, rows) for log in logs for rows in log.rests]
     typical = {
-        name: float(np.median([np.std(log.bridged[name][rows]) for log, rows in rows_of])) if rows_of else 0.0
+        name: float(np.median([np.std(log.whole[name][rows]) for log, rows in rows_of])) if rows_of else 0.0
         for name in axes
     }
     rests: list[Rest] = []
@@ -234,19 +234,19 @@ def tumble_of(recordings: Sequence[Recording], model: Model, *, part_stated: boo
     return Tumble(tuple(rests), tuple(turns), noise, tuple(left_out), tuple(notes))
 
 
-def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
+def _log(logged: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
     """A log and its rests."""
     for name in ACCEL:
-        check_column(whole, name, needed=": tumble takes ax, ay, az")
-    clock = whole.columns[max(axes, key=lambda name: whole.clock_of(name).rate_hz)].clock
-    recording = whole.along(*(name for name in axes if whole.columns[name].clock is clock))
+        check_column(logged, name, needed=": tumble takes ax, ay, az")
+    clock = logged.columns[max(axes, key=lambda name: logged.clock_of(name).rate_hz)].clock
+    recording = logged.along(*(name for name in axes if logged.columns[name].clock is clock))
     own = {name: recording.in_unit(name, UNITS[name]) for name in axes}
     steps = {name: step_of(values[np.isfinite(values)])[0] for name, values in own.items()}
     has_temp = "temp" in recording.columns
     temp = recording.in_unit("temp", "degC") if has_temp else np.full(recording.samples, math.nan)
     time = recording.time_s + recording.start_s
-    bridged = {name: _over_lost(time, values) for name, values in own.items()}
-    columns = {name: replace(recording.columns[name], values=values) for name, values in bridged.items()}
+    whole = {name: bridged(values, time) for name, values in own.items()}
+    columns = {name: replace(recording.columns[name], values=values) for name, values in whole.items()}
     motion = rest_of(replace(recording, columns=columns), axes)
     still = motion.still or ((float(time[0]), float(time[-1])),)
     rests = []
@@ -254,9 +254,9 @@ def _log(whole: Recording, begin_s: float, axes: tuple[str, ...]) -> _Log:
         begin = begin_rest + SETTLE_S * (begin_rest > time[0])
         end = end_rest - SETTLE_S * any(abs(a - end_rest) < 0.5 / recording.rate_hz for a, _ in motion.moved)
         first, behind = (int(k) for k in np.searchsorted(time, [begin, end]))
-        if end - begin >= 2.0 and behind - first >= PIECES:
+        if end - begin >= 2.0 * PIECE_S and behind - first >= PIECES:
             rests.append(slice(first, behind))
-    return _Log(recording, begin_s, own, bridged, steps, temp, tuple(rests))
+    return _Log(recording, begin_s, own, whole, steps, temp, tuple(rests))
 
 
 def _long_rest(logs: Sequence[_Log]) -> Recording | None:
@@ -278,7 +278,7 @@ def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording |
     pieces = []
     for log in logs:
         size = max(1, round(PIECE_S * log.recording.rate_hz))
-        pieces += [block_means(log.bridged[name][rows], size) for rows in log.rests]
+        pieces += [block_means(log.whole[name][rows], size) for rows in log.rests]
     white = measured(pieces, PIECE_S)
     return of_model(model, name, UNITS[name], None if white is None else math.sqrt(white))
 
@@ -317,7 +317,7 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     rounded = []
     for name in ACCEL + GYRO:
         step = log.steps.get(name, 0.0)
-        scatter = float(np.var(log.bridged[name][rows])) if name in own else 0.0
+        scatter = float(np.var(log.whole[name][rows])) if name in own else 0.0
         rounded.append(rounding(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
     begin, end = float(time[rows.start]), float(time[rows.stop - 1]) + 1.0 / recording.rate_hz
     return Rest(
@@ -352,10 +352,10 @@ def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, 
     rows = slice(begin - 1, end + 1)
     place = log.recording.clock.place[rows]
     place = place - place[0]
-    columns, unsure, reasons = [], [], []
-    for k, name in enumerate(ACCEL + GYRO):
+    values, unsure = np.zeros((2, place[-1] + 1, len(UNITS)))
+    reasons = [f"{name} is not recorded" for name in GYRO if name not in log.own]
+    for k, name in enumerate(UNITS):
         if name not in log.own:
-            reasons.append(f"{name} is not recorded")
             continue
         part = log.own[name][rows]
         if np.nanmax(np.abs(part), initial=0.0) >= ranges[name] or _flat(part, log.own[name], log.steps[name]):
@@ -367,20 +367,9 @@ def _turn(log: _Log, begin: int, end: int, ends: tuple[Rest, Rest], first: int, 
         for edge, rest in zip((0, -1), ends, strict=True):
             if math.isnan(whole[edge]):
                 whole[edge] = (*rest.accel, *rest.gyro)[k]
-        values, variance = _bridged(whole)
-        columns.append(values)
-        unsure.append(variance)
-    none = np.zeros((1, 3))
-    accel, gyro = (none, none) if len(columns) < 6 else (np.column_stack(columns[a : a + 3]) for a in (0, 3))
-    temp = float(np.mean(log.temp[rows]))
-    reason = reasons[0] if reasons else ""
-    return Turn(first, 1.0 / log.recording.rate_hz, accel, gyro, np.column_stack(unsure[-3:]), temp, reason)
-
-
-def _over_lost(time: Array, values: Array) -> Array:
-    """Values [n] with straight lines over those that are NaN; as they are where all are."""
-    known = np.isfinite(values)
-    return np.interp(time, time[known], values[known]) if known.any() else values
+        values[:, k], unsure[:, k] = _bridged(whole)
+    dt, temp, reason = 1.0 / log.recording.rate_hz, float(np.mean(log.temp[rows])), next(iter(reasons), "")
+    return Turn(first, dt, values[:, :3], values[:, 3:], unsure[:, 3:], temp, reason)
 
 
 def _bridged(values: Array) -> tuple[Array, Array]:
@@ -388,7 +377,7 @@ def _bridged(values: Array) -> tuple[Array, Array]:
     [n], as if it were that of one sample of each gap. A line over a span misses a parabola by 2/3 of its sagitta; the
     mean square of the sagittas is that of all such spans of the turn, its noise included."""
     lost, variance = ~np.isfinite(values), np.zeros(values.size)
-    values = _over_lost(np.arange(float(values.size)), values)
+    values = bridged(values)
     for first, behind in runs(lost):
         span = behind - first + 1
         half = min((span + 1) // 2, (values.size - 1) // 2)

@@ -15,22 +15,28 @@ from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.rests import ACCEL, GYRO, Tumble
-from selfcal.calibration.tumble_fit import FALSE_ALARM, IDENTIFIED, Fit
+from selfcal.calibration.tumble_fit import IDENTIFIED, Fit
+from selfcal.calibration.tumble_plan import EDGES, FLATS, OPPOSITE
 from selfcal.logs.recording import Recording
+from selfcal.readings.budget import FALSE_ALARM
 
 SCHEMA = "selfcal.tumble/1"
 AXES = ("x", "y", "z")
-#: Names of parameters in the order of the fit: group, name, unit.
+#: Names of parameters in the order of the fit: group, empty for one of the surroundings, name, unit.
 OF_ACCEL = (
     *(("bias", name, "m/s^2") for name in ACCEL),
     *(("scale", name, "1") for name in ACCEL),
     *(("misalignment", AXES[row] + AXES[column], "rad") for row, column in accelerometer.PLACES),
+    ("", "gravity", ""),
+    *(("temperature", name, "m/s^2/degC") for name in ACCEL),
 )
 OF_GYRO = (
     *(("bias", name, "deg/s") for name in GYRO),
     *(("g_sensitivity", row + column, "deg/s/g") for row in AXES for column in AXES),
     *(("scale", name, "1") for name in GYRO),
     *(("misalignment", AXES[row] + AXES[column], "rad") for row, column in gyroscope.PLACES),
+    ("", "vertical rate of the Earth", ""),
+    *(("temperature", name, "deg/s/degC") for name in GYRO),
 )
 
 
@@ -64,8 +70,7 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
             for turn in tumble.turns
         ],
         "accelerometer": {
-            **_entries(accel.fit, 0, OF_ACCEL),
-            **_thermal(accel, accel.fit, accelerometer.THERMAL.start, ACCEL, "m/s^2/degC", 1.0),
+            **_entries(tumble, accel.fit, 0, OF_ACCEL),
             **_adequacy(accel.fit, accelerometer.causes(accel)),
             "would_mend": _positions(accel),
         },
@@ -74,8 +79,7 @@ def document_of(recordings: Sequence[Recording], accel: Accelerometer, gyro: Gyr
         else {"error": gyro}
         if isinstance(gyro, str)
         else {
-            **_entries(gyro.fit, gyro.of_accel, OF_GYRO),
-            **_thermal(accel, gyro.fit, gyro.of_accel + gyroscope.THERMAL.start, GYRO, "deg/s/degC", math.degrees(1.0)),
+            **_entries(tumble, gyro.fit, gyro.of_accel, OF_GYRO),
             **_adequacy(gyro.fit, gyroscope.causes(gyro, tumble)),
             "would_mend": _turns(gyro, tumble),
         },
@@ -92,24 +96,14 @@ def _entry(fit: Fit, k: int, unit: str, size: float) -> dict[str, Any]:
     return {**(numbers if identified else dict.fromkeys(numbers)), "unit": unit, "identified": identified}
 
 
-def _entries(fit: Fit, start: int, names: Sequence[tuple[str, str, str]]) -> dict[str, dict[str, Any]]:
-    """Parameters from `start` on by group and name."""
-    entries: dict[str, dict[str, Any]] = {}
-    for k, (group, name, unit) in enumerate(names):
-        size = math.degrees(1.0) if unit.startswith("deg/s") else 1.0
-        entries.setdefault(group, {})[name] = _entry(fit, start + k, unit, size)
-    return entries
-
-
-def _thermal(
-    accel: Accelerometer, fit: Fit, start: int, names: Sequence[str], unit: str, size: float
-) -> dict[str, Any]:
-    """Temperature coefficients, where the logs have a temperature."""
-    if not accel.tumble.has_temp:
-        return {}
-    mean = float(accel.tumble.temp.mean())
-    entries = {name: _entry(fit, start + k, unit, size) for k, name in enumerate(names)}
-    return {"temperature": entries, "bias_at_degC": mean}
+def _entries(tumble: Tumble, fit: Fit, start: int, names: Sequence[tuple[str, str, str]]) -> dict[str, Any]:
+    """Parameters from `start` on by group and name; temperature coefficients where the logs have a temperature."""
+    entries: dict[str, Any] = {}
+    for k, (group, name, unit) in enumerate(names, start):
+        if group and (group != "temperature" or tumble.has_temp):
+            size = math.degrees(1.0) if unit.startswith("deg/s") else 1.0
+            entries.setdefault(group, {})[name] = _entry(fit, k, unit, size)
+    return entries | ({"bias_at_degC": float(tumble.temp.mean())} if tumble.has_temp else {})
 
 
 def _adequacy(fit: Fit, causes: Sequence[tuple[str, float]]) -> dict[str, Any]:
@@ -151,7 +145,7 @@ def side_of(up: Array) -> str:
 
 def _positions(accel: Accelerometer) -> list[str]:
     """Further rests by which every parameter would be identified, the most informative one first."""
-    fit, place, own = accel.fit, accel.place, slice(0, len(OF_ACCEL))
+    fit, place, own = accel.fit, accel.place, slice(0, accelerometer.GRAVITY)
     if fit.identified[own].all():
         return []
     rests = accel.tumble.rests
@@ -160,12 +154,11 @@ def _positions(accel: Accelerometer) -> list[str]:
     noise = white + max(np.diag(accel.fit.root @ accel.fit.root.T).mean(), 0.0)
     covariance, named = fit.widened(), []
     inverse = np.linalg.inv(accel.matrix)
-    candidates = [np.array(c, float) for c in np.ndindex(3, 3, 3) if 1 <= sum(abs(digit - 1) for digit in c) <= 2]
+    sides = [np.array(up) / np.linalg.norm(up) for up in FLATS + EDGES + OPPOSITE]
     for _ in range(4):
         best, gained = None, 0.0
         weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
-        for c in candidates:
-            up = (c - 1.0) / np.linalg.norm(c - 1.0)
+        for up in sides:
             reading = inverse @ (up * place.gravity) + fit.theta[accelerometer.BIAS]
             row = up @ accelerometer.forces(fit.theta, reading[None], np.zeros(1))[1][0]
             row[accelerometer.GRAVITY] = -place.gravity

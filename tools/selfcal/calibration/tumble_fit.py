@@ -12,6 +12,7 @@ from scipy.stats import chi2
 
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask
+from selfcal.readings.budget import FALSE_ALARM
 
 #: Residuals [m], their derivatives [m, n] and their covariance [m, m] at parameters [n].
 Problem = Callable[[Array], tuple[Array, Array, Array]]
@@ -24,10 +25,6 @@ NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not
 #: Largest share of its prior variance that the data leave an identified parameter, and the factor by which priors are
 #: wider then.
 IDENTIFIED, WIDER = 0.2, 8.0
-#: Probability that a right model's residuals are called too large, and that a cause is named, a calibration each.
-FALSE_ALARM = 0.005
-#: Fewest residuals beyond the parameters that are checked.
-FREE_LEAST = 0.5
 
 
 @dataclass(frozen=True)
@@ -85,13 +82,13 @@ class Fit:
 
     @property
     def excess(self) -> float:
-        """Probability that residuals are as large as these by chance; NaN where too few are left to say."""
-        return float(chi2.sf(self.white @ self.white, self.free)) if self.free > FREE_LEAST else math.nan
+        """Probability that residuals are as large as these by chance; NaN where none is left over."""
+        return float(chi2.sf(self.white @ self.white, self.free)) if self.free >= 1.0 else math.nan
 
     @property
     def ratio(self) -> float:
         """rms of the residuals in their own sd; NaN where too few are left to say."""
-        return math.sqrt(float(self.white @ self.white) / self.free) if self.free > FREE_LEAST else math.nan
+        return math.sqrt(float(self.white @ self.white) / self.free) if self.free >= 1.0 else math.nan
 
     def surest(self, tried: Sequence[tuple[str, Array]]) -> list[tuple[str, float]]:
         """Causes that explain more than chance, each in words and by its columns [m, k] of the residuals, the surest

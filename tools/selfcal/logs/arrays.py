@@ -16,8 +16,8 @@ from selfcal.logs.loaders.table import Table, of_arrays
 from selfcal.logs.loaders.text_table import LOOKED_AT, in_turn
 from selfcal.logs.recorded import SIDE_UNITS
 
-#: Axes of an array by its columns.
-_COLUMNS = {1: SENSORS[:1], 3: SENSORS[:3], 6: SENSORS}
+#: Axes of an array by the shape of its rows.
+_COLUMNS = {(count,): SENSORS[:count] for count in (1, 3, 6)}
 #: Names of the three axes of a sensor.
 _THREE = {"gyro": SENSORS[:3], "accel": SENSORS[3:]}
 #: Whole numbers of the time stamps of a data frame are so long.
@@ -75,7 +75,7 @@ def tables_of(
 def _columns(data: Any) -> Iterator[tuple[str, NDArray[Any]]]:
     """Headings and arrays [n]."""
     if hasattr(data, "to_frame") and not _is_frame(data):  # a series
-        data = data.to_frame(_COLUMNS[1][0] if data.name is None else data.name)
+        data = data.to_frame(SENSORS[0] if data.name is None else data.name)
     if not isinstance(data, Mapping) and not _is_frame(data):
         yield from _axes("", _numbers("an array", data))
         return
@@ -111,9 +111,9 @@ def _numbers(what: str, values: Any) -> NDArray[Any]:
 def _axes(name: str, array: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any]]]:
     """The columns of a matrix, one row a sample."""
     own, unit = split(name) if name else ("", None)
-    columns = array.reshape(-1, 1) if array.ndim == 1 else array
-    axes = _THREE.get(own) if own else _COLUMNS.get(columns.shape[1])
-    if columns.ndim != 2 or axes is None or len(axes) != columns.shape[1]:
+    columns = array[:, None] if array.ndim == 1 else array
+    axes = _THREE.get(own) if own else _COLUMNS.get(columns.shape[1:])
+    if axes is None or columns.shape[1:] != (len(axes),):
         wanted = "takes 'gyro' or 'accel' of three columns" if name else "takes 1, 3 or 6 columns (gx gy gz ax ay az)"
         what = f"'{short(name)}'" if name else "an array"
         raise UserError(f"arrays: {what} of shape {array.shape}: {wanted}, a row a sample; name others one by one")

@@ -141,13 +141,13 @@ def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: He
         )
     _, main, main_rows = clocks[0]
     of: dict[str, tuple[Clock | None, Places]] = dict.fromkeys(named.values(), (None, main_rows))
-    for names, clock, at in clocks[1:]:
+    for names, clock, sampled in clocks[1:]:
         other = replace(clock, start_s=clock.start_s - main.start_s)
-        of.update({named[name]: (other, at) for name in names if name in named})
+        of.update({named[name]: (other, sampled) for name in names if name in named})
     made: dict[str, Column] = {}
     for name in named.values():
-        own, at = of[name]
-        values = _at(columns[name].values, at)
+        own, sampled = of[name]
+        values = _at(columns[name].values, sampled)
         if not np.isfinite(values).any():
             header.notes.append(f"column '{name}' holds no number and is left out")
             continue
@@ -184,8 +184,8 @@ def _on_clocks(
     axes = {name: has for name, has in known.items() if name in header.sensors and has.any()}
     if not axes:
         raise UserError(f"{rows.path}: no sensor column holds a number")
-    at, own = _sampled(rows.path, axes)
-    main = _clock_at(rows, rate, at, stamps, count)
+    sampled, own = _sampled(rows.path, axes)
+    main = _clock_at(rows, rate, sampled, stamps, count)
     clocks: dict[int, Clock] = {}
     made: dict[str, Column] = {}
     missing: dict[str, int] = {}
@@ -197,15 +197,15 @@ def _on_clocks(
                 clocks[key] = replace(clock, start_s=clock.start_s - main.start_s)
             made[name] = replace(column, values=column.values[has], clock=clocks[key])
         elif name in axes:
-            made[name] = replace(column, values=_at(column.values, at))
+            made[name] = replace(column, values=_at(column.values, sampled))
             missing[name] = count - int(has.sum())
         elif has.any():
-            place = np.arange(count, dtype=np.float64) if stamps is None else stamps.time
-            values = column.values if has.all() else np.interp(place, place[has], column.values[has])
-            made[name] = replace(column, values=_at(values, at))
-    told = ", ".join(f"{name} {cells}" for name, cells in missing.items() if cells)
-    if told:
-        header.notes.append(f"of {count} rows cells without a number, taken as missing samples: {told}")
+            abscissa = np.arange(count, dtype=np.float64) if stamps is None else stamps.time
+            values = column.values if has.all() else np.interp(abscissa, abscissa[has], column.values[has])
+            made[name] = replace(column, values=_at(values, sampled))
+    listed = ", ".join(f"{name} {cells}" for name, cells in missing.items() if cells)
+    if listed:
+        header.notes.append(f"of {count} rows cells without a number, taken as missing samples: {listed}")
     return Recording(
         rows.path,
         main.rate_hz,
@@ -242,23 +242,25 @@ def _sampled(path: Path, axes: Mapping[str, NDArray[np.bool_]]) -> tuple[Places,
     return at, own
 
 
-def _clock_at(rows: Rows, rate: float | None, at: Places, stamps: _Stamps | None, count: int) -> Clock:
-    """The clock of the samples in the rows `at` of so many."""
+def _clock_at(rows: Rows, rate: float | None, sampled: Places, stamps: _Stamps | None, count: int) -> Clock:
+    """The clock of the samples in the rows `sampled` of so many."""
     if stamps is None:
         assert rate is not None
-        lines = at if rows.places is None else rows.places[at]
+        lines = sampled if rows.places is None else rows.places[sampled]
         if lines[-1] / rate > LONGEST_S:
             what = f"{lines[-1] + 1} rows at {rate:g} Hz: a recording spans at most {LONGEST_S:g} s"
             raise UserError(f"{rows.path}: {what}")
         return clock_of_rows(lines, rate)
     time = stamps.time
-    if count - at.size > 0 and few(count - at.size, count):
-        empty = np.setdiff1d(np.arange(1, count - 1), at)
+    if count - sampled.size > 0 and few(count - sampled.size, count):
+        empty = np.setdiff1d(np.arange(1, count - 1), sampled)
         steps = np.diff(time)
         if empty.size and np.median(np.minimum(steps[empty - 1], steps[empty])) > 0.75 * np.median(steps):
             # Rows without a sample are of the same clock: their stamps show that a sample is missing.
-            return clock_of(rows.path, time, stamps.noise_s, rate, stamps.fail).of_rows(at, 0.0)
-    return clock_of(rows.path, _at(time, at), stamps.noise_s, rate, lambda row, what: stamps.fail(int(at[row]), what))
+            return clock_of(rows.path, time, stamps.noise_s, rate, stamps.fail).of_rows(sampled, 0.0)
+    return clock_of(
+        rows.path, _at(time, sampled), stamps.noise_s, rate, lambda row, what: stamps.fail(int(sampled[row]), what)
+    )
 
 
 def _at(values: Floats, rows: Places) -> Floats:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from selfcal.base.errors import UserError, install
+from selfcal.base.limits import BLOCK_BYTES
 from selfcal.logs.loaders.damage import SOUND, Damaged
 
 if TYPE_CHECKING:
@@ -30,9 +31,6 @@ BINARY = (".blf", ".mcap")
 #: container's own header.
 BLF_HEADER, BLF_OBJECT = struct.Struct("<4sL8xQ"), struct.Struct("<4s4xLL")
 BLF_CONTAINER, BLF_CONTAINER_HEAD, BLF_ZLIB = 10, 16, b"\x02\x00"
-#: Bytes that a container may unpack to; python-can and Vector write 128 KB.
-BLF_CONTAINER_MAX = 16 << 20
-
 
 #: A line of `candump` without -l, and the first line of the CSV files of GVRET and SavvyCAN.
 CANDUMP = re.compile(
@@ -40,9 +38,8 @@ CANDUMP = re.compile(
     r"\[(?P<length>\d+)\](?P<data>\s+remote request|(?:\s+[0-9A-F]{2})*)\s*(?:'.*'?)?\s*"
 )
 GVRET = "Time Stamp,ID,Extended,"
-#: Lines that are looked at for candump's screen form: the first may be damaged.
-CANDUMP_WITHIN = 20
-#: Characters of a line, and bytes of an MCAP record, at most: the rest of a longer line counts as another line.
+#: Characters of a line, and bytes of an MCAP record and of a serial line without an end, at most: the rest of a longer
+#: line counts as another line.
 LONGEST_LINE = 1 << 16
 #: Sound lines without a frame, by suffix.
 PASSED = {
@@ -284,8 +281,8 @@ def _reader_of(lines: _Lines) -> Any:
 
     suffix = lines.path.suffix.lower()
     with lines.path.open("rb") as file:
-        first = [file.readline(LONGEST_LINE).decode("ascii", "replace") for _ in range(CANDUMP_WITHIN)]
-    if suffix == ".csv" and first[0].startswith(GVRET):
+        first = file.read(LONGEST_LINE).decode("ascii", "replace").splitlines()  # a line of it may be damaged
+    if suffix == ".csv" and "".join(first[:1]).startswith(GVRET):
         return _Foreign(lines, _of_gvret)
     if suffix == ".log" and any(CANDUMP.fullmatch(line) for line in first):
         return _Foreign(lines, _of_candump)
@@ -371,25 +368,25 @@ def _unpacked(path: Path, body: bytes) -> tuple[bytes, bool]:
     if body[:2] == BLF_ZLIB:
         packed = zlib.decompressobj()
         try:
-            data = packed.decompress(data, BLF_CONTAINER_MAX + 1)
+            data = packed.decompress(data, BLOCK_BYTES + 1)
             sound = packed.eof
         except zlib.error:
             data, sound = b"", False
-    if len(data) > BLF_CONTAINER_MAX:
-        raise UserError(f"{path}: a part of this frame log unpacks to more than {BLF_CONTAINER_MAX >> 20} MB")
+    if len(data) > BLOCK_BYTES:
+        raise UserError(f"{path}: a part of this frame log unpacks to more than {BLOCK_BYTES >> 20} MB")
     return data, sound
 
 
 def _check_objects(path: Path, data: bytes) -> bytes:
     """Walk through the objects of a container as python-can does; returns the beginning of one that goes on."""
-    at = 0
-    while (at := data.find(b"LOBJ", at, at + 8)) >= 0 and len(data) - at >= BLF_OBJECT.size:
-        _, size, _ = BLF_OBJECT.unpack_from(data, at)
-        if not BLF_OBJECT.size <= size <= BLF_CONTAINER_MAX:
+    begin = 0
+    while (begin := data.find(b"LOBJ", begin, begin + 8)) >= 0 and len(data) - begin >= BLF_OBJECT.size:
+        _, size, _ = BLF_OBJECT.unpack_from(data, begin)
+        if not BLF_OBJECT.size <= size <= BLOCK_BYTES:
             raise UserError(f"{path}: damaged frame log: an object of {size} bytes")
-        if at + size > len(data):
-            return data[at:]
-        at += size
+        if begin + size > len(data):
+            return data[begin:]
+        begin += size
     return b""
 
 

@@ -108,12 +108,16 @@ class Header:
 
     def sensors_of(self, keys: Sequence[str], file: str = "", before: Sequence[str] | None = None) -> list[Sensor]:
         """The sensors of a table with these headings, after the lines `before` of a text."""
-        found = []
+        sensors = []
         for sensor in sensors_of(file or self.path.name, keys, self.sensors, self.mapped(keys), before):
-            meant = {key: own for key, own in sensor.meant.items() if not own.optional or self._asks(key, own.name)}
+            meant = {
+                key: own
+                for key, own in sensor.meant.items()
+                if not own.optional or any(self._of(given, key, own.name) for given in (self.stated, self.scale))
+            }
             if any(own.name in self.sensors for own in meant.values()) or len(meant) == len(sensor.meant):
-                found.append(replace(sensor, meant=meant))
-        return found
+                sensors.append(replace(sensor, meant=meant))
+        return sensors
 
     def mapped(self, keys: Sequence[str]) -> dict[str, str]:
         """The names here, by heading, that the user gives."""
@@ -227,10 +231,6 @@ class Header:
                 self.decided.add(name)
                 return options[given]
         return None
-
-    def _asks(self, key: str, name: str) -> bool:
-        """Whether the user states a unit or a size of a column."""
-        return self._of(self.stated, key, name) is not None or self._of(self.scale, key, name) is not None
 
     def _own_names(self, key: str) -> list[str]:
         """A heading, without its unit, and the matrix that it is a column of; none that means a column here."""

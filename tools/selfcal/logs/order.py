@@ -47,8 +47,8 @@ def in_order(time: Array, tick_s: float, mend: bool) -> Order:
     if time.size > 2 and np.mean(np.diff(time) < 0.0) > 0.5 and time[-1] < time[0]:
         rows, time = rows[::-1], time[::-1]
         notes.append("the rows are newest first: read from the last one on")
-    time, told = unwrapped(time, tick_s)
-    order = Order(rows, time, (*notes, *told))
+    time, remark = unwrapped(time, tick_s)
+    order = Order(rows, time, (*notes, *remark))
     return _mended(order) if mend else order
 
 
@@ -67,7 +67,7 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
             continue
         again = time + np.concatenate(([0.0], np.cumsum(np.where(begins, span, 0.0))))
         times = f"{count} time{'s' if count > 1 else ''}"
-        bits = [bits for bits in _BITS for tick in (tick_s, *_TICKS) if abs(span / tick / 2.0**bits - 1.0) < 1e-9]
+        bits = [bits for bits in _BITS for tick in (tick_s, *_TICKS) if math.isclose(span / tick, 2.0**bits)]
         if bits:
             return again, [f"column 't' wraps {times} like a {bits[0]}-bit counter: undone"]
         return again, [f"column 't' goes back {times} by {_CLOCKS.get(span, f'{span:.10g} s')}: undone"]
@@ -76,12 +76,12 @@ def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
 
 def _spans(time: Array, steps: Array, tick_s: float) -> list[float]:
     """Spans, s, that a clock may have."""
-    found = [2.0**32 * tick for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))] + [*_CLOCKS]
+    spans = [2.0**32 * tick for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))] + [*_CLOCKS]
     usual = float(np.median(np.abs(steps)))
     counts = [common_step(np.abs(steps), 1e-9 * usual), *(10.0**-digits for digits in range(10))]
     fits = (count for count in counts if count > 0.0 and np.abs(time / count - np.rint(time / count)).max() < 0.01)
     step = next(fits, None)
-    return found if step is None else [*found, step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))]
+    return spans if step is None else [*spans, step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))]
 
 
 def broken(time: Array) -> tuple[int, str] | None:
@@ -115,11 +115,10 @@ def _mended(order: Order) -> Order:
     """Without damaged stamps, sorted where rows are near their place, without stamps that repeat; the order as it was
     where that takes too many rows."""
     time, n, notes = order.time, order.time.size, list(order.notes)
-    if n < 2 or broken(time) is None:
+    if broken(time) is None:
         return order
-    kept = np.arange(n)
     far = _far(time)
-    kept = np.delete(kept, far)
+    kept = np.delete(np.arange(n), far)
     sort = np.argsort(time[kept], kind="stable")
     moved = int(np.count_nonzero(np.diff(time[kept]) < 0.0))
     if not few(int(np.abs(sort - np.arange(sort.size)).max(initial=0)), n):
@@ -129,7 +128,7 @@ def _mended(order: Order) -> Order:
     if repeats.any() and not _coarse(np.diff(time[kept])):
         kept = kept[~repeats]
     left_out = n - kept.size
-    if not few(left_out, n) or kept.size < 2:
+    if not few(left_out, n):
         return order
     if left_out:
         were = "s were" if left_out > 1 else " was"

@@ -15,11 +15,10 @@ from numpy.typing import NDArray
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.limits import LONGEST_S
 from selfcal.logs.loaders.damage import SOUND, Damaged
 from selfcal.logs.timebase import Clock
 
-#: s from power-on to a recording's beginning, at most: a year.
-LONGEST_POWERED_S = 3.2e7
 #: Columns that are no axis but may explain one, by cause: name and unit.
 SIDE_CHANNELS = MappingProxyType({"temperature": ("temp", "degC"), "supply": ("supply", "V")})
 #: Their units, by name.
@@ -71,7 +70,7 @@ class Recording:
     from_arrays: ClassVar[Callable[..., Recording]]
 
     def __repr__(self) -> str:
-        columns = ", ".join(f"{one.name}[{one.unit}]" for one in self.columns.values())
+        columns = ", ".join(f"{column.name}[{column.unit}]" for column in self.columns.values())
         return f"<Recording {self.path}: {self.samples} rows at {self.rate_hz:g} Hz, {self.duration_s:g} s: {columns}>"
 
     @property
@@ -122,23 +121,23 @@ class Recording:
     def with_rows(self, kept: NDArray[np.bool_], *, moving: bool = False) -> Recording:
         """The recording of the rows `kept` [n] alone, two or more. The others count as missing, and as `moving` where
         that is why they are left out. Rows before the first and after the last that is kept are cut off."""
-        at = self.clock.place
+        on_grid = self.clock.place
         where = np.flatnonzero(kept)
-        begin_s = float(at[where[0]] - at[0]) / self.rate_hz
+        begin_s = float(on_grid[where[0]] - on_grid[0]) / self.rate_hz
         clock = self.clock.of_rows(where, begin_s, moving=moving)
 
-        def left(one: Column) -> Column:
+        def left(column: Column) -> Column:
             """An axis with a clock of its own keeps the samples that the row before them keeps."""
-            if one.clock is None:
-                return replace(one, values=one.values[kept])
-            time = one.clock.time_s
+            if column.clock is None:
+                return replace(column, values=column.values[kept])
+            time = column.clock.time_s
             rows = np.clip(np.searchsorted(self.time_s, time, side="right") - 1, 0, self.samples - 1)
             own = np.flatnonzero(kept[rows] & (rows >= where[0]) & (time < self.time_s[where[-1]] + 1.0 / self.rate_hz))
-            return replace(one, values=one.values[own], clock=one.clock.of_rows(own, begin_s, moving=moving))
+            return replace(column, values=column.values[own], clock=column.clock.of_rows(own, begin_s, moving=moving))
 
         return replace(
             self,
-            columns={name: left(one) for name, one in self.columns.items()},
+            columns={name: left(column) for name, column in self.columns.items()},
             missing_before=clock.missing_before,
             off_grid_s=clock.off_grid_s,
             start_s=self.start_s + begin_s,
@@ -148,10 +147,10 @@ class Recording:
 
     def later(self, since_power_on_s: float) -> Recording:
         """The recording with its distance from power-on, s. Raises UserError for one that is none."""
-        if not 0.0 <= since_power_on_s <= LONGEST_POWERED_S:
+        if not 0.0 <= since_power_on_s <= LONGEST_S:
             raise UserError(
                 f"--since-power-on {since_power_on_s:g}: takes the seconds from power-on to the recording's beginning, "
-                f"0 to {LONGEST_POWERED_S:g}"
+                f"0 to {LONGEST_S:g}"
             )
         return replace(self, since_power_on_s=since_power_on_s)
 
@@ -210,15 +209,15 @@ class Recording:
         used = np.logical_or.reduce([np.isfinite(self.columns[name].values) for name in names])
         own_clock = self.columns[names[0]].clock
         others = [column for name, column in self.columns.items() if name not in names]
-        if used.all() and all(one.clock is own_clock and np.isfinite(one.values).all() for one in others):
+        if used.all() and all(column.clock is own_clock and np.isfinite(column.values).all() for column in others):
             columns = self.columns
         else:
             time = clock.time_s[used]
             columns = {
-                name: replace(one, values=one.values[used])
-                if name in names or (one.clock is own_clock and np.isfinite(one.values).all())
-                else replace(one, values=bridged_at(self.clock_of(name), one.values, time), clock=own_clock)
-                for name, one in self.columns.items()
+                name: replace(column, values=column.values[used])
+                if name in names or (column.clock is own_clock and np.isfinite(column.values).all())
+                else replace(column, values=bridged_at(self.clock_of(name), column.values, time), clock=own_clock)
+                for name, column in self.columns.items()
             }
         if own_clock is None and used.all():
             return self if columns is self.columns else replace(self, columns=columns)
@@ -228,7 +227,7 @@ class Recording:
         return replace(
             self,
             rate_hz=clock.rate_hz,
-            columns={name: replace(one, clock=None) for name, one in columns.items()},
+            columns={name: replace(column, clock=None) for name, column in columns.items()},
             missing_before=missing,
             off_grid_s=own_rows.off_grid_s,
             moving_before=own_rows.moving_before,
@@ -242,13 +241,13 @@ def bridged_at(clock: Clock, values: NDArray[np.float64], time: NDArray[np.float
     return np.interp(time, clock.time_s[known], values[known])
 
 
-def bridged(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Missing values by straight lines."""
-    good = np.isfinite(values)
-    if good.all():
+def bridged(values: NDArray[np.float64], time: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+    """Missing values by straight lines over `time`, by default over the samples; as they are where all are missing."""
+    known = np.isfinite(values)
+    if known.all() or not known.any():
         return values
-    where = np.arange(values.size)
-    return np.interp(where, where[good], values[good])
+    time = np.arange(float(values.size)) if time is None else time
+    return np.interp(time, time[known], values[known])
 
 
 def as_float(values: NDArray[np.float64]) -> NDArray[np.float32]:

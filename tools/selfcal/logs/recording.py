@@ -104,13 +104,13 @@ def load(
         raise UserError("several files are joined by their time stamps: leave --rate and --no-time out")
     asked = Asked(rate, columns, units, by_name, sensors, no_time, skip_bad, sources, dbc)
     headers = [Header(file, asked, len(paths) > 1) for file in paths]
-    found = [part for header in headers for part in _load(header, tables)]
+    recordings = [part for header in headers for part in _load(header, tables)]
     there = {text for header in headers for key in header.seen for text in (key, split(key)[0])}
     for name, wanted in columns.items():
         if wanted not in there:
             what = f"there is no column '{wanted}' for --column {name}={wanted}"
             raise UserError(f"{' '.join(map(str, paths))}: {what}")
-    recording = found[0] if len(found) == 1 else _joined(paths, found, headers[0])
+    recording = recordings[0] if len(recordings) == 1 else _joined(paths, recordings, headers[0])
     _check_gravity(recording, headers[0])
     recording = replace(
         recording,
@@ -191,8 +191,8 @@ def _load(header: Header, there: Sequence[Table] | None) -> list[Recording]:
             )
         if wanted and not any(part.source for part in parts):
             raise UserError(f"{path}: it has one source alone: leave --source out")
-        found, sides, notes = chosen(path, parts, wanted)
-        recordings = [part.read(len(found) > 1, part in sides) for part in found]
+        parts_meant, sides, notes = chosen(path, parts, wanted)
+        recordings = [part.read(len(parts_meant) > 1, part in sides) for part in parts_meant]
     sound = [part for part in recordings if part is not None]
     damaged = sum((part.damaged for part in [*tables[:1], *sound]), SOUND)
     if damaged:
@@ -285,13 +285,15 @@ def _span(stamps: NDArray[Any], unit: str | None) -> tuple[int, float]:
     return stamps.size, float(int(stamps[-1]) - int(stamps[0]) if stamps.dtype.kind in "iu" else np.ptp(stamps)) * size
 
 
-def _joined(files: Sequence[Path], found: Sequence[Recording], header: Header) -> Recording:
+def _joined(files: Sequence[Path], recordings: Sequence[Recording], header: Header) -> Recording:
     """Parts of one recording as one: the columns of the fastest sensor keep its clock, others have their own."""
-    sensors = [part for part in found if not header.sensors or any(name in header.sensors for name in part.columns)]
+    sensors = [
+        part for part in recordings if not header.sensors or any(name in header.sensors for name in part.columns)
+    ]
     main = max(sensors, key=lambda part: part.rate_hz)
     paths = Path(" ".join(map(str, files)))
-    header.check_options([name for part in found for name in part.columns])
-    for part in found:
+    header.check_options([name for part in recordings for name in part.columns])
+    for part in recordings:
         if part.started_s is None or main.started_s is None:
             raise UserError(f"{part.path}: there is no time column: several files are joined by their time stamps")
         shift = part.started_s - main.started_s
@@ -299,7 +301,7 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: Header) -
             raise UserError(f"{paths}: the files do not overlap in time: are they of one recording?")
     columns: dict[str, Column] = dict(main.columns)
     notes = [*main.notes]
-    for part in found:
+    for part in recordings:
         if part is main:
             continue
         assert part.started_s is not None and main.started_s is not None
@@ -324,7 +326,7 @@ def _joined(files: Sequence[Path], found: Sequence[Recording], header: Header) -
         path=paths,
         columns=columns,
         notes=tuple(dict.fromkeys(notes)),
-        damaged=sum((part.damaged for part in found), SOUND),
+        damaged=sum((part.damaged for part in recordings), SOUND),
         paths=tuple(files) if len(files) > 1 else (),
     )
 
@@ -336,8 +338,8 @@ def _rates(recording: Recording) -> list[str]:
     alike: dict[tuple[int, float], list[str]] = {}
     for name, column in recording.columns.items():
         alike.setdefault((id(column.clock), recording.clock_of(name).rate_hz), []).append(name)
-    told = "; ".join(f"{', '.join(names)} at {rate:.6g} Hz" for (_, rate), names in alike.items())
-    return [f"columns sampled at different times: {told}"]
+    groups = "; ".join(f"{', '.join(names)} at {rate:.6g} Hz" for (_, rate), names in alike.items())
+    return [f"columns sampled at different times: {groups}"]
 
 
 def _check_gravity(recording: Recording, header: Header) -> None:

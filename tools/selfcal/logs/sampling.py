@@ -28,8 +28,8 @@ from scipy.fft import rfft
 from scipy.ndimage import grey_closing, uniform_filter1d
 from scipy.special import betaln, rel_entr
 
-#: Intervals of a record at most.
-_LONGEST = 2.0**53
+from selfcal.base.limits import LONGEST
+
 #: Rows that decide on the law, and that show the phase of the first.
 _HEAD, _NEAR_FIRST = 4000, 512
 #: Places of a histogram in one of its cells.
@@ -56,6 +56,8 @@ _ONES, _TOO_SHORT = 0.05, 0.01
 _FEW, _BAND_OF_FEW = 64, (0.95, 1.4)
 #: Steps of which one interval is taken, so that bursts of stamps and single gaps do not matter; pieces of a record.
 _STEPS, _PIECES = 20, 500
+#: Share of an interval or a rate below which two count as one.
+SAME = 1e-6
 #: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
 CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
@@ -121,12 +123,11 @@ class _Stamps:
 
     def multiple(self, dt: float) -> bool:
         """Whether an interval is a multiple of the lattice."""
-        times = dt / self.lattice if self.lattice else 0.5
-        return abs(times - max(1, round(times))) < 1e-6
+        return self.lattice > 0.0 and _is_multiple(dt, self.lattice)
 
     def whole(self, dt: float) -> bool:
         """Whether an interval is a multiple of the lattice, or the lattice one of it."""
-        return self.multiple(dt) or abs(self.lattice / dt - max(1, round(self.lattice / dt))) < 1e-6
+        return self.multiple(dt) or _is_multiple(self.lattice, dt)
 
     def fit(self, dt: float, missing: Places, errors: Floats, patterned: bool = True) -> _Fit:
         """A law of the interval about `dt` with its errors, s, [n] or [n - 1], and the samples missing while awake."""
@@ -169,6 +170,16 @@ class _Stamps:
         return _Fit(_slope(np.arange(missing.size) + np.cumsum(missing), self.time), missing, fit.nats)
 
 
+def _is_whole(value: float) -> bool:
+    """Whether a value is a whole number."""
+    return abs(value - round(value)) < SAME
+
+
+def _is_multiple(length: float, unit: float) -> bool:
+    """Whether a length is a whole multiple of another, 1 or more."""
+    return round(length / unit) > 0 and _is_whole(length / unit)
+
+
 def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, Places]:
     """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing but where
     batches of one length overlap).
@@ -199,7 +210,7 @@ def _stamps(time: Floats, noise_s: float) -> _Stamps:
     """Stamps with what one look shows of them. Raises Ambiguous."""
     time, steps = time - time[0], np.diff(time)
     usual = _usual(steps)
-    if not time[-1] < _LONGEST * usual:
+    if not time[-1] < LONGEST * usual:
         raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {usual:.3g} s")
     asleep = _asleep(time, steps)
     pieces = np.linspace(0, steps.size, max(1, min(_AWAKE, steps.size // _AWAKE)) + 1).astype(int)
@@ -244,7 +255,7 @@ def _tried(law: _Law, stamps: _Stamps, dt: float, rate: float | None) -> list[tu
         nats += min(_STATED, 0.5 * (math.log(fit.dt * rate) / _STATED_SD) ** 2)
     elif stamps.coarse and law is not _counted and not stamps.whole(fit.dt):
         # A lattice that is no tick of a clock is the interval.
-        tick = any(abs(exp - round(exp)) < 1e-6 for exp in (math.log10(q), math.log2(q))) or abs(q - _JIFFY) < 1e-9
+        tick = abs(q / _JIFFY - 1.0) < SAME or any(map(_is_whole, (math.log10(q), math.log2(q))))
         nats += 0.0 if tick else _COINCIDENCE
     return [(nats, fit)]
 
@@ -454,7 +465,7 @@ def rhythm(gaps: Places) -> tuple[float, float]:
     if gaps.size < 2:
         return 0.0, 1.0
     gap, count = np.unique(gaps, return_counts=True)
-    found = (0.0, 1.0)
+    best = (0.0, 1.0)
     short, middle = np.quantile(gaps, [0.05, 0.5], method="lower")
     for start, part in ((middle, 1), (short, 1), (short, 2), (short, 3)):
         few, near = gap <= 3.5 * start, gap <= 1.5 * start
@@ -469,8 +480,8 @@ def rhythm(gaps: Places) -> tuple[float, float]:
         each = np.where(
             share > np.maximum(chance, 0.5), rel_entr(share, chance) + rel_entr(1.0 - share, 1.0 - chance), 0.0
         )
-        found = max(found, (float(each.max()) * gaps.size - math.log(4.0 * gaps.size), period))
-    return found
+        best = max(best, (float(each.max()) * gaps.size - math.log(4.0 * gaps.size), period))
+    return best
 
 
 def in_rhythm(rows: Places) -> bool:
@@ -485,7 +496,7 @@ def in_pattern(steps: NDArray[np.floating[Any]] | Places) -> bool:
 
 def _periods(steps: NDArray[np.floating[Any]] | Places) -> list[tuple[int, NDArray[np.bool_]]]:
     """By the number of gaps in a period, which of the steps of more than one interval are as a period before."""
-    rows = np.flatnonzero(steps > 1.5)
+    rows = np.flatnonzero(steps > 1.0)
     each = np.stack([np.diff(rows), steps[rows[1:]]]) if rows.size > _AWAKE else np.zeros((2, 0))
     periods = range(1, 1 + min(_OF_PATTERN, each.shape[1] - 1))
     return [(k, (each[:, k:] == each[:, :-k]).all(axis=0)) for k in periods]
@@ -566,7 +577,7 @@ def _changes(time: Floats, least: int) -> list[Change]:
     if min(np.diff(rows)) < 2 * _STEPS:
         return []
     intervals = [_interval(time[a:b][:_HEAD], lattice) for a, b in pairwise(rows)]
-    scatter, found = max(CHANGE, _scatter(value, parts)), list[Change]()
+    scatter, changes = max(CHANGE, _scatter(value, parts)), list[Change]()
     for row, (before, after) in zip(rows[1:-1], pairwise(intervals), strict=True):
         ratio = math.log(after / before)
         # A burst after a stall makes up for it: samples of one rate, stamped late.
@@ -574,8 +585,8 @@ def _changes(time: Floats, least: int) -> list[Change]:
         if late or abs(ratio) < 0.5 * CHANGE:
             return []
         nats = min(1e6, 0.5 * time.size * (ratio / scatter) ** 2)
-        found.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
-    return found
+        changes.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
+    return changes
 
 
 def _interval(time: Floats, lattice: float) -> float:
@@ -666,10 +677,7 @@ def followed_phase(x: Floats, time: Floats, frequency: float, block: int) -> tup
     for _ in range(3):
         line = np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)
         turns = np.unwrap(np.angle(line)) / (2.0 * math.pi)
-        if edges.size < 2:
-            phase = phase + turns[0]
-            continue
-        slope = np.diff(turns) / np.diff(middle)
+        slope = np.diff(turns) / np.diff(middle) if edges.size > 1 else np.zeros(1)
         phase = phase + np.interp(time, middle, turns)
         phase += slope[0] * np.minimum(time - middle[0], 0.0) + slope[-1] * np.maximum(time - middle[-1], 0.0)
     return phase, float(np.abs(np.add.reduceat(x * np.exp(-2j * math.pi * phase), edges)).sum())

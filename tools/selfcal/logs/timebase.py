@@ -17,8 +17,12 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, rhythm, sampling
+from selfcal.logs.sampling import SAME, Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, rhythm, sampling
 
+#: Share of an interval between the samples of one instant, at most.
+ONE_INSTANT = 0.01
+#: Largest difference of the stamps' rate from a stated one, as a share.
+_AGREES = 0.1
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
 #: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost. Regular losses
@@ -88,8 +92,8 @@ class Clock:
     def alike(self, other: Clock) -> bool:
         """Whether both are one clock."""
         return (
-            abs(self.rate_hz / other.rate_hz - 1.0) < 1e-6
-            and abs(self.start_s - other.start_s) * self.rate_hz < 0.01
+            abs(self.rate_hz / other.rate_hz - 1.0) < SAME
+            and abs(self.start_s - other.start_s) * self.rate_hz < ONE_INSTANT
             and np.array_equal(self.missing_before, other.missing_before)
         )
 
@@ -114,10 +118,10 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     if not time[-1] <= LONGEST_S:
         _too_long(time, fail)
     time = time - start if start else time
-    found, missing = _sampling(path, time, noise_s, rate, fail)
-    if rate is not None and not 0.9 < found / rate < 1.1:
+    sampled_hz, missing = _sampling(path, time, noise_s, rate, fail)
+    if rate is not None and not abs(sampled_hz / rate - 1.0) < _AGREES:
         raise UserError(f"{path}: column 't' does not agree with --rate {rate:g}: leave it out with --no-time")
-    rate = found if rate is None else rate
+    rate = sampled_hz if rate is None else rate
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
         raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
@@ -152,7 +156,7 @@ def _sampling(
 def remarks(clock: Clock) -> list[str]:
     """A line on stamps that another clock explains as well, or that show no lost sample."""
     rate, missing, off_grid = clock.rate_hz, clock.missing_before, clock.off_grid_s
-    if off_grid is None or off_grid.size < 3:
+    if off_grid is None:
         return []
     time = clock.time_s + off_grid
     steps = np.diff(time)
@@ -161,26 +165,28 @@ def remarks(clock: Clock) -> list[str]:
     regular = in_rhythm(gaps) or in_pattern(np.add(missing, 1.0))
     changes = rate_changes(time)
     if changes and not (regular and np.ptp(gaps) > _NEARLY * time.size):
-        after = ", ".join(f"{one.after_hz:.5g} Hz from {time[one.row]:.6g} s on" for one in changes[:_IN_WORDS])
+        after = ", ".join(
+            f"{change.after_hz:.5g} Hz from {time[change.row]:.6g} s on" for change in changes[:_IN_WORDS]
+        )
         return [f"the sampling rate changes: {changes[0].before_hz:.5g} Hz, {after}"]
     if regular:
-        lost, every, told = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
+        lost, every, words = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
         other = float(f"{rate - rate * lost / every:.6g}")
-        told = f"{told} {'are' if lost > 1 else 'is'} missing, at regular intervals"
+        words = f"{words} {'are' if lost > 1 else 'is'} missing, at regular intervals"
         alike = lattice * rate > _NEARLY and np.ptp(time - np.arange(time.size) / other) * other < 1.0
-        return [told + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
+        return [words + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
     if gaps.size:
         return []
-    if 0.0 < lattice * rate < 1.0 - 1e-6 and steps.min() > 0.5 * lattice:
+    if 0.0 < lattice * rate < 1.0 - SAME and steps.min() > 0.5 * lattice:
         turns = np.rint(steps / lattice)
         if turns.min() == 1.0 and (lattice * rate > _NEARLY or in_pattern(turns)):
             other = float(f"{1.0 / lattice:.6g}")
-            told = f"stamps of {lattice:.4g} s: {other:g} Hz that loses {_losses(float(turns.mean()))[2]} has the same"
-            return [f"{told}: --rate {other:g} states that"]
+            words = f"stamps of {lattice:.4g} s: {other:g} Hz that loses {_losses(float(turns.mean()))[2]} has the same"
+            return [f"{words}: --rate {other:g} states that"]
     if np.ptp(off_grid) * rate <= 1.0 or float(np.diff(off_grid).std()) * rate <= _NO_GRID:
         return []
-    told = f"the stamps lie on no grid: their mean rate, {rate:.4g} Hz, is taken; no lost sample shows"
-    return [f"{told}: --rate HZ states another"]
+    words = f"the stamps lie on no grid: their mean rate, {rate:.4g} Hz, is taken; no lost sample shows"
+    return [f"{words}: --rate HZ states another"]
 
 
 def _losses(step: float) -> tuple[int, int, str]:

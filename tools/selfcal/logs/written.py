@@ -27,12 +27,10 @@ from selfcal.base.output import together, whole
 from selfcal.logs.loaders import WRITTEN
 from selfcal.logs.loaders.table import heading, meta_place
 from selfcal.logs.recorded import Recording
-from selfcal.logs.timebase import Clock
+from selfcal.logs.timebase import ONE_INSTANT, Clock
 
 #: Headings, without a unit, of the columns that are not the recording's.
 SAMPLE, LATE = "sample", "late"
-#: Stamps of several clocks closer than this, as a share of the fastest axes' interval, are one row.
-_ONE_ROW = 0.01
 #: Lines that are written at once; signs that separate columns, and so are none of a heading.
 _LINES, _SIGNS = 10_000, re.compile(r'[,;\t"]')
 #: What `meta` of the log says of the log's own table.
@@ -55,7 +53,7 @@ def laid_out(recording: Recording) -> Laid:
         of.setdefault(id(column.clock), []).append(name)
     clocks = [recording.clock_of(names[0]) for names in of.values()]
     stamps = [clock.time_s if clock.off_grid_s is None else clock.time_s + clock.off_grid_s for clock in clocks]
-    t, rows = _rows(stamps, _ONE_ROW / recording.rate_hz)
+    t, rows = _rows(stamps, ONE_INSTANT / recording.rate_hz)
 
     def cells(values: NDArray[Any], at: Rows) -> Array:
         full = np.full(t.size, np.nan)
@@ -83,9 +81,8 @@ def _endings(clocks: int) -> list[str]:
 
 
 def marks_of(meta: Mapping[str, Any]) -> set[str]:
-    """Headings of the columns that are not the recording's in a table with this `meta`; empty without clocks."""
-    endings = _endings(len(meta["clocks"])) if stated(meta) else []
-    return {name + ending for ending in endings for name in (SAMPLE, LATE)}
+    """Headings of the columns that are not the recording's in a table whose `meta` states its clocks."""
+    return {name + ending for ending in _endings(len(meta["clocks"])) for name in (SAMPLE, LATE)}
 
 
 def stated(meta: Mapping[str, Any]) -> bool:
@@ -120,12 +117,12 @@ def clocks_of(
     """Of each clock that `meta` states the columns' names, the clock and the rows of its samples in a table with the
     stamps `t` [n], s, and the further columns `marks`. `places` [n]: lines of the rows, some of which
     were skipped. Raises UserError."""
-    found = []
+    clocks = []
     for number, (entry, ending) in enumerate(zip(meta["clocks"], _endings(len(meta["clocks"])), strict=True)):
         mark = marks.get(SAMPLE + ending)
         rows = np.arange(t.size) if mark is None else np.flatnonzero(np.isfinite(mark))
         lines = rows if places is None else places - places[:1]
-        place = lines if mark is None else mark[rows]
+        on_grid = lines if mark is None else mark[rows]
         late = marks.get(LATE + ending)
         stamps = t[rows] if late is None else late[rows]
         try:
@@ -135,9 +132,9 @@ def clocks_of(
                 float(entry["start_s"]),
             )
             sound = LEAST_RATE_HZ <= rate <= MOST_RATE_HZ and abs(start) < LONGEST_S and rows.size > 1
-            sound &= bool(place[0] >= 0 and place[-1] < min(LONGEST, LONGEST_S * rate))
-            sound &= bool((place == np.rint(place)).all())
-            sound &= bool((np.diff(place) > 0).all() and np.isfinite(stamps).all())
+            sound &= bool(on_grid[0] >= 0 and on_grid[-1] < min(LONGEST, LONGEST_S * rate))
+            sound &= bool((on_grid == np.rint(on_grid)).all())
+            sound &= bool((np.diff(on_grid) > 0).all() and np.isfinite(stamps).all())
             stamped = bool(entry["stamped"])
         except (TypeError, KeyError, ValueError, OverflowError, IndexError):
             sound = False
@@ -146,12 +143,12 @@ def clocks_of(
                 f"{path}: meta: clock {number + 1} does not fit the table, which was changed: convert the log again, "
                 "or give --rate HZ"
             )
-        at: Rows = np.asarray(place, np.int64)
+        at: Rows = np.asarray(on_grid, np.int64)
         clock = Clock(rate, np.diff(at, prepend=np.int64(-1)) - 1, start_s=start)
         if stamped:
             clock = replace(clock, off_grid_s=stamps - clock.time_s if late is None else stamps)
-        found.append((names, clock, rows))
-    return found
+        clocks.append((names, clock, rows))
+    return clocks
 
 
 def save(

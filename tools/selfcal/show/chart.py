@@ -259,8 +259,8 @@ def strips(figure: Figure, marks: Sequence[tuple[float, float, str]]) -> Markup:
         rows.append((replace(panel, curves=curves, bands=bands), y))
     above: dict[float, list[str]] = {}  # a text that has no room of its own goes to its left neighbour
     for value, _, text in sorted(marks):
-        place = x.place(value)
-        above.setdefault(next((other for other in above if place - other < 14.0), place), []).append(text)
+        line = x.place(value)
+        above.setdefault(next((other for other in above if line - other < 14.0), line), []).append(text)
     return render(
         "strips.html",
         figure=figure,

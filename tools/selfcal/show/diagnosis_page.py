@@ -23,6 +23,7 @@ from selfcal.diagnosis.events import parted, times_of
 from selfcal.diagnosis.extend import fitted_law
 from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
 from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.response import RECORDS
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outside_of, strips
@@ -84,7 +85,7 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "log": shlex.join(recording.get("paths", [recording["path"]])),
         "given": partial(_given, options),
         "model": _model(document),
-        "records": pictures.RECORDS,
+        "records": RECORDS,
         "id": lambda axis, k: f"f-{''.join(c if c.isalnum() else '-' for c in axis)}-{k + 1}",
         "whole": _whole,
         "gained": _gained,

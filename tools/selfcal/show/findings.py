@@ -11,13 +11,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from selfcal.adequacy.document import since
 from selfcal.adequacy.summary import noisier
 from selfcal.base import units
-from selfcal.base.errors import printable
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
+from selfcal.show.identification import heading
 
 #: Width of a line without a terminal, characters.
 WIDTH = 114
@@ -27,18 +26,14 @@ def show(
     document: Mapping[str, Any], *, to_stderr: bool = False, details: bool = False, console: Console | None = None
 ) -> None:
     """Print the events and the numbers. `details`: each finding of each axis, with its evidence and gain, below."""
-    recording, findings = document["recording"], document["findings"]
     if console is None:
         console = console_of(to_stderr=to_stderr)
         if not console.is_terminal:  # its cells wrap and lose nothing
             console.width = WIDTH
 
     say = partial(print_line, console)
-    say(
-        f"{printable(recording['path'])}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s{since(recording)}"
-    )
-    shown, less = parted(findings)
+    say(heading(document["recording"]))
+    shown, less = parted(document["findings"])
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     if shown:
         console.print(_events(shown))

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from selfcal.adequacy.document import as_typed, since
+from selfcal.adequacy.document import as_typed
 from selfcal.adequacy.summary import MOST_REST, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.bank.result import FAINT, likeliest
@@ -29,8 +29,6 @@ _Event = tuple[str, list[str], list[Mapping[str, Any]]]
 
 #: Prefixes of checks that state no cause.
 STATISTICS = ("innovation_", "allan_")
-#: Largest distance of jumps of one event, s.
-ONE_EVENT_S = 30.0
 
 
 def show(
@@ -44,17 +42,12 @@ def show(
     recording's; of the laws that of 1/alpha, then N's, then K's.
     """
     console = console or console_of(to_stderr=to_stderr, fits=True)
-    recording = document["recording"]
-    title = (
-        f"{escape(printable(recording['path']))}: {recording['samples']} samples, {recording['rate_hz']:g} Hz, "
-        f"{recording['duration_s']:g} s{since(recording)}"
-    )
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     numbered = {name: axis for name, axis in axes.items() if axis.get("summary")}
-    summary = _fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
-    laws = _fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
+    summary = fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
+    laws = fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
-    first.title = title
+    first.title = escape(heading(document["recording"]))
     if numbered:
         console.print(summary)
     console.print(laws)
@@ -64,7 +57,14 @@ def show(
         print_line(console, line)
 
 
-def _fitting(console: Console, tables: Sequence[Table]) -> Table:
+def heading(recording: Mapping[str, Any]) -> str:
+    """A recording's name and extent, and where a stretch of it begins."""
+    start = f" from {recording['start_s']:g} s on" if recording.get("start_s") else ""
+    extent = f"{recording['samples']} samples, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s"
+    return f"{printable(recording['path'])}: {extent}{start}"
+
+
+def fitting(console: Console, tables: Sequence[Table]) -> Table:
     """The first of `tables` that the terminal is wide enough for, else the last; without a terminal the first."""
     if not console.is_terminal:
         return tables[0]
@@ -358,6 +358,8 @@ def _same(check: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     """Whether two axes fail a check by the same event or source."""
     match check:
         case "jump":
+            from selfcal.diagnosis.causes.step import ONE_EVENT_S  # it takes a second
+
             return bool(abs(a["time_s"] - b["time_s"]) < ONE_EVENT_S)
         case "turn_on":
             return True

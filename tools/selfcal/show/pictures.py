@@ -14,6 +14,7 @@ from selfcal.base.grid import runs
 from selfcal.diagnosis.causes import CAUSES, shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
+from selfcal.diagnosis.response import RECORDS
 from selfcal.diagnosis.statistics import Indices, allan_deviation, simulated, whitened_of
 from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import State
@@ -21,8 +22,6 @@ from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope, means_of
 
-#: Number of simulated records of a band.
-RECORDS = 20
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
 LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
 

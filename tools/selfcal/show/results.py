@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Mapping
 from functools import lru_cache
+from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
@@ -163,11 +164,9 @@ class Picture:
 
 
 class Document(Object):
-    """What a verb answers. Its repr is what the command prints."""
+    """What a verb answers. Its repr is what the command prints: `show` of the module `_shown_by` beside this one."""
 
-    def _print(self, console: Any) -> None:
-        """Print it as the command does."""
-        raise NotImplementedError
+    _shown_by = ""
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         """The rows of `to_frame`."""
@@ -185,7 +184,9 @@ class Document(Object):
         from rich.console import Console
 
         console = Console(file=io.StringIO(), width=TABLE_WIDTH, **more)
-        self._print(console)
+        if not self._shown_by:
+            raise NotImplementedError
+        import_module(f"selfcal.show.{self._shown_by}").show(self, console=console)
         return console
 
     def __repr__(self) -> str:
@@ -205,11 +206,7 @@ class Identification(Document):
     schema: str
     recording: Recording
     axes: dict[str, IdentifiedAxis]
-
-    def _print(self, console: Any) -> None:
-        from selfcal.show.identification import show
-
-        show(self, console=console)
+    _shown_by = "identification"
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         """Axis, law and parameter with the posterior; of an axis without a result the reason."""
@@ -337,11 +334,7 @@ class Diagnosis(Document):
     axes: dict[str, DiagnosedAxis]
     model: dict[str, Any]
     navigation: dict[str, Any] | None
-
-    def _print(self, console: Any) -> None:
-        from selfcal.show.findings import show
-
-        show(self, console=console)
+    _shown_by = "findings"
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         """Axis, cause, evidence and each number of its estimate, of what acts on all axes too; `value`: no number. Of

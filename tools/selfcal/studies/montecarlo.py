@@ -21,8 +21,6 @@ from selfcal.model.file import Model
 from selfcal.model.tables import bank_block, make_tables
 
 SCHEMA = "selfcal.montecarlo/1"
-#: Fewest bank samples.
-MIN_SAMPLES = 10
 #: Samples drawn of a bank interval and averaged as the intake does, where the sensor gives as many: their drift's mean
 #: is that of infinitely many to a hundredth of the averaging's effect.
 BLOCK = 10

@@ -162,8 +162,8 @@ def _flown(rng: np.random.Generator, rest: Floats, errors: Floats, bias: Floats,
     still = np.concatenate([np.zeros(3), truth.attitude[0].T @ _UP])
     true = np.concatenate([truth.rate, truth.force], axis=1)[: len(errors)]
     latency = noise * LATENCY_SD_S * rng.standard_normal()
-    at, t = np.arange(GPS_S) - latency, np.arange(len(truth.position)) / RATE_HZ
-    heard = np.stack([np.interp(at, t, axis) for axis in truth.position.T], axis=1)
+    fixes, t = np.arange(GPS_S) - latency, np.arange(len(truth.position)) / RATE_HZ
+    heard = np.stack([np.interp(fixes, t, axis) for axis in truth.position.T], axis=1)
     return {
         "rest": rest + still,
         "readings": errors + true,

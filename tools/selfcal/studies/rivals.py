@@ -22,6 +22,7 @@ from rich.table import Table
 
 from selfcal.adequacy.document import recording_entry
 from selfcal.adequacy.identify import chosen_axes
+from selfcal.bank.blocks import MOST_DENSE
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
@@ -32,6 +33,7 @@ from selfcal.batch.spread import record_seeds, spread, workers
 from selfcal.logs.recording import Recording
 from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
+from selfcal.show.identification import fitting
 from selfcal.studies.methods import RIVALS, Rival
 from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
 from selfcal.studies.methods.problem import Answer, Problem
@@ -41,12 +43,8 @@ ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
 #: The model of the ensemble, and its default numbers of samples.
 ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
 SAMPLES = (150, 600)
-#: Samples of a record of the ensemble at most: the slowest method takes eight minutes then.
-MOST_ENSEMBLE = 100_000
 #: Bank samples that every method can work with: five points of an Allan curve.
 FEWEST = 50
-#: Columns of a terminal that the table takes with the intervals; without them it takes 110.
-WHOLE_WIDTH = 190
 
 
 def of_recording(
@@ -104,8 +102,8 @@ class Ensemble:
         seeds = record_seeds(self.records, self.seed)
         if self.truth not in ("middle", "prior"):
             raise UserError(f"--truth is middle or prior, not '{self.truth}'")
-        if not all(FEWEST <= n <= MOST_ENSEMBLE for n in self.samples):
-            raise UserError(f"--samples must be {FEWEST} to {MOST_ENSEMBLE}")
+        if not all(FEWEST <= n <= MOST_DENSE for n in self.samples):
+            raise UserError(f"--samples must be {FEWEST} to {MOST_DENSE}")
         if not set(self.model.hypotheses) <= set(PLAIN):
             raise UserError(f"{self.model.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
         given = {"axis": self.axis, "truth": self.truth, "seed": self.seed}
@@ -209,10 +207,8 @@ def entry_of(answer: Answer, unit: str, to: str) -> dict[str, Any]:
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table an axis: a row for each method and law."""
     console = console_of(to_stderr=to_stderr)
-    brief = console.is_terminal and console.width < WHOLE_WIDTH
-    console.width = max(console.width, 110 if brief else WHOLE_WIDTH)
     for name, axis in document["axes"].items():
-        console.print(_table(name, axis, brief=brief))
+        console.print(fitting(console, [_table(name, axis, brief=brief) for brief in (False, True)]))
         if axis["samples_left_out"]:
             print_line(
                 console, f"left out: {axis['samples_left_out']} averages outside the longest stretch without a gap"
@@ -260,7 +256,6 @@ def _table(name: str, axis: Mapping[str, Any], *, brief: bool) -> Table:
 def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     """A table for each number of samples and law, then the choice of a law over all laws."""
     console = console_of(to_stderr=to_stderr)
-    console.width = max(console.width, WHOLE_WIDTH)
     cells: dict[tuple[int, str], list[Mapping[str, Any]]] = {}
     for entry in document["cells"]:
         cells.setdefault((entry["samples"], entry["law"]), []).append(entry)
@@ -271,23 +266,28 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
         table = table_of(("method", *errors, "90 % intervals hold", "none", "time"), title)
         for entry in entries:
             p = entry["parameters"]
+            shares = [p[name]["coverage_90"] for name in names]
+            covered = ["none" if math.isnan(share) else f"{100 * share:.1f}" for share in shares]
             table.add_row(
                 entry["rival"],
                 *(_ratio(p[name]) for name in names),
-                _covered([p[name]["coverage_90"] for name in names]),
+                "" if all(map(math.isnan, shares)) else " ".join(covered),
                 f"{100 * max(p[name]['no_answer'] for name in names):.0f} %",
                 _seconds(entry["seconds"]),
             )
         console.print(table)
-    headings = ("samples", "method", "by", "right", *document_laws(document), "log score")
+    laws = list(dict.fromkeys(law for _, law in cells))
+    choice_of = {(entry["samples"], entry["rival"], entry["law"]): entry["choice"] for entry in document["cells"]}
+    headings = ("samples", "method", "by", "right", *laws, "log score")
     table = table_of(headings, "choice of the law, mean over the laws")
     for entry in document["choice"]:
+        samples, rival, criterion = entry["samples"], entry["rival"], entry["criterion"]
         table.add_row(
-            str(entry["samples"]),
-            entry["rival"],
-            entry["criterion"],
+            str(samples),
+            rival,
+            criterion,
             f"{entry['hit_rate']:.3f}",
-            *(f"{_hit(document, entry, law):.3f}" for law in document_laws(document)),
+            *(f"{choice_of[samples, rival, law][criterion]['hit_rate']:.3f}" for law in laws),
             f"{entry['log_score']:.4f} ± {entry['log_score_sd']:.4f}",
         )
     console.print(table)
@@ -297,25 +297,6 @@ def show_ensemble(document: Mapping[str, Any], *, to_stderr: bool = False) -> No
         "ekf, ukf: begin at the priors' middle and leave N, K and sigma_m there: their errors are the start's",
     ):
         print_line(console, line)
-
-
-def document_laws(document: Mapping[str, Any]) -> list[str]:
-    """The laws of an ensemble, in order."""
-    return list(dict.fromkeys(entry["law"] for entry in document["cells"]))
-
-
-def _hit(document: Mapping[str, Any], choice: Mapping[str, Any], law: str) -> float:
-    for entry in document["cells"]:
-        if (entry["samples"], entry["rival"], entry["law"]) == (choice["samples"], choice["rival"], law):
-            return float(entry["choice"][choice["criterion"]]["hit_rate"])
-    return math.nan
-
-
-def _covered(shares: Sequence[float]) -> str:
-    """A share for each parameter; nothing if the method states no interval at all."""
-    if all(math.isnan(share) for share in shares):
-        return ""
-    return " ".join("none" if math.isnan(share) else f"{100 * share:.1f}" for share in shares)
 
 
 def _ratio(parameter: Mapping[str, Any]) -> str:
@@ -332,9 +313,7 @@ def _shown(value: Mapping[str, Any] | None, *, inverse: bool = False, brief: boo
     if value is None:
         return ""
     middle, low, high = value["value"], value["q05"], value["q95"]
-    if not math.isfinite(middle):
-        return "none"
-    if inverse and not (low > 0.0 and middle > 0.0):
+    if not math.isfinite(middle) or (inverse and not (low > 0.0 and middle > 0.0)):
         return "none"
     if inverse:
         middle, low, high = 1.0 / middle, 1.0 / high, 1.0 / low

@@ -68,8 +68,10 @@ Scheduler = Annotated[
 Workers = Annotated[
     int | None, option("Processes on this machine; default: one for each processor", metavar="N", min=1)
 ]
-#: Default number of simulated parts.
+#: Default number of simulated parts, or records of each law.
 PARTS = 200
+#: Length of a record that nobody states, s.
+RECORD_S = 3600.0
 Results = Annotated[
     Path | str | None,
     option("Folder that keeps finished records: a later run continues from them", metavar="DIR"),

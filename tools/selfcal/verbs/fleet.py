@@ -112,7 +112,6 @@ def fleet(
     records = spread(
         partial(examined, verbs, options),
         [(str(Path(source.path).absolute()), source.content) for source in sources],
-        piece=1,
         scheduler=scheduler,
         results=kept,
         count=workers,

@@ -20,9 +20,6 @@ if TYPE_CHECKING:
     from selfcal.model.file import Model
     from selfcal.show.results import Identification
 
-#: Probability of an overbound at most: at four degrees of freedom that is already 27 times the deviation.
-LARGEST_OVERBOUND = 0.99999
-
 #: Checks whose readings are left out already: what is left is judged, and suspected.
 LEFT_OUT = {"motion"}
 
@@ -103,8 +100,8 @@ def identify(
         raise UserError(f"--export: there is no format '{export[0]}' ({', '.join(FORMS)})")
     if overbound is not None and export is None:
         raise UserError("--overbound is for --export FORMAT FILE: give that too")
-    if overbound is not None and not 0.5 <= overbound <= LARGEST_OVERBOUND:
-        raise UserError(f"--overbound must be 0.5 to {LARGEST_OVERBOUND:g}, not {overbound:g}")
+    if overbound is not None and not 0.5 <= overbound < 1.0:
+        raise UserError(f"--overbound must be 0.5 or more, and below 1, not {overbound:g}")
     if engine not in ("library", "reference", "fixed"):
         raise UserError(f"there is no engine '{engine}' (library, reference, fixed)")
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):

@@ -6,14 +6,14 @@ from typing import Annotated, Any
 
 from selfcal.base.errors import UserError
 from selfcal.base.options import option
-from selfcal.verbs._shared import Json, ModelFile, Results, Scheduler, Workers, shown_by
+from selfcal.verbs._shared import PARTS, RECORD_S, Json, ModelFile, Results, Scheduler, Workers, shown_by
 
 
 def montecarlo(
     model: ModelFile = None,
     *,
-    records: Annotated[int, option("Records per law", metavar="N")] = 400,
-    duration_s: Annotated[float, option("Length of each, s", "--duration", metavar="S")] = 3600.0,
+    records: Annotated[int, option("Records per law", metavar="N")] = PARTS,
+    duration_s: Annotated[float, option("Length of each, s", "--duration", metavar="S")] = RECORD_S,
     axis: Annotated[str, option("Axis whose priors are drawn from", metavar="NAME")] = "gx",
     seed: Annotated[int, option("Same seed, same records", metavar="N", min=0)] = 1,
     json: Json = None,
@@ -31,19 +31,18 @@ def montecarlo(
     """
     from functools import partial
 
-    from selfcal.bank.blocks import MOST_DENSE
+    from selfcal.bank.blocks import FEWEST, MOST_DENSE
     from selfcal.base.output import check_writable, write_json
     from selfcal.batch.spread import record_seeds, spread
     from selfcal.model.file import Model, settings_of
-    from selfcal.studies.montecarlo import MIN_SAMPLES, SCHEMA, rows_of, summary
+    from selfcal.studies.montecarlo import SCHEMA, rows_of, summary
 
     check_writable(json)
     loaded = Model.load(model)
     seeds = record_seeds(records, seed)
-    if not duration_s * loaded.bank_rate_hz >= MIN_SAMPLES:
-        raise UserError(f"--duration must be at least {MIN_SAMPLES / loaded.bank_rate_hz:g} s")
-    if not duration_s * loaded.bank_rate_hz <= MOST_DENSE:
-        raise UserError(f"--duration must be at most {MOST_DENSE / loaded.bank_rate_hz:g} s")
+    least_s, most_s = FEWEST / loaded.bank_rate_hz, MOST_DENSE / loaded.bank_rate_hz
+    if not least_s <= duration_s <= most_s:
+        raise UserError(f"--duration must be {least_s:g} to {most_s:g} s")
     if loaded.regressors:
         raise UserError(f"{loaded.path}: the ensemble has no regressors: leave them out of the model")
     loaded.group_of(axis)

@@ -33,7 +33,7 @@ def navigate(
     check_writable(json)
     seeds = record_seeds(records, seed)
     jobs = [Job(law, tuple(seeds[k : k + TOGETHER])) for law in LAWS for k in range(0, records, TOGETHER)]
-    rows = spread(rows_of, jobs, settings={"schema": SCHEMA}, piece=1, scheduler=scheduler, results=results)
+    rows = spread(rows_of, jobs, settings={"schema": SCHEMA}, scheduler=scheduler, results=results)
     band = stats.chi2.ppf([0.025, 0.975], JUDGED * records) / records
     document = {
         "schema": SCHEMA,

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Unpack
 from selfcal.base.errors import UserError
 from selfcal.base.options import argument, option
 from selfcal.logs.loaders import Reading
-from selfcal.verbs._shared import PARTS, Json, Scheduler, to_stderr
+from selfcal.verbs._shared import PARTS, RECORD_S, Json, Scheduler, to_stderr
 
 if TYPE_CHECKING:
     from selfcal.logs.recording import Data
@@ -69,7 +69,7 @@ def plan(
     `tumble`: how many rests of which length `selfcal tumble` takes: document `selfcal.plan_tumble/1`; wishes are those
     of `calibration/tumble_plan.py`.
     A wish of a coefficient, whose column is in proportion to its channel, has `cycling`: the swing of the channel that
-    it takes over the longest of the other lengths, SWEEP_S without any. A coefficient to 10 % is to a tenth of its
+    it takes over the longest of the other lengths, RECORD_S without any. A coefficient to 10 % is to a tenth of its
     prior's sd.
     With `response`: the shortest record in which SHARE of the parts have a gain and a lag as wanted, its input switched
     between the `levels`. The document has `bit_s`, `duration_s` and `set_points` then.
@@ -77,7 +77,7 @@ def plan(
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.batch.plan import SCHEMA, SWEEP_S, Ensemble, Wish, cycling, picture, rates, refusal
+    from selfcal.batch.plan import SCHEMA, Ensemble, Wish, cycling, picture, rates, refusal
     from selfcal.batch.spread import record_seeds
     from selfcal.diagnosis.separate import SHARE
     from selfcal.logs.recording import list_of
@@ -119,7 +119,7 @@ def plan(
     plain = replace(loaded, regressors=())
     ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
     lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
-    samples = max((known for known in lengths if known is not None), default=round(SWEEP_S * loaded.bank_rate_hz))
+    samples = max((known for known in lengths if known is not None), default=round(RECORD_S * loaded.bank_rate_hz))
     entries = []
     for k, wish in enumerate(wishes):
         column = columns.get(wish.parameter)
@@ -225,8 +225,8 @@ def _response(
         **design,
     }
     if design["duration_s"] is not None:
-        at, points = experiment.set_points(design["bit_s"], design["duration_s"])
-        rows = [*zip(at.tolist(), points.tolist(), strict=True), (design["duration_s"], float(points[-1]))]
+        begins, points = experiment.set_points(design["bit_s"], design["duration_s"])
+        rows = [*zip(begins.tolist(), points.tolist(), strict=True), (design["duration_s"], float(points[-1]))]
         document["set_points"] = [{"time_s": time_s, "value": value} for time_s, value in rows]
         if drive is not None:
             text = "".join(f"{time_s:.10g},{value:.10g}\n" for time_s, value in rows)

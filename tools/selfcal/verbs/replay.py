@@ -68,8 +68,8 @@ def replay(
         raise UserError("--transport can: an emulated board has a serial line alone; take --target host")
     if channel and transport != "can":
         raise UserError(f"--channel {channel}: goes with --transport can")
-    if report_every is not None and not 0.001 <= report_every <= LONGEST_PERIOD_S:
-        raise UserError(f"--report-every must be 0.001 to {LONGEST_PERIOD_S:g} s, not {report_every:g}")
+    if report_every is not None and not 0.0 < report_every <= LONGEST_PERIOD_S:
+        raise UserError(f"--report-every must be above 0 s, {LONGEST_PERIOD_S:g} s at most, not {report_every:g}")
     check_picture(plot)
     check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)

@@ -53,9 +53,7 @@ def worth(
     else:
         jobs = [study.Job(law, rest, record_seed) for law in LAWS for rest in study.RESTS_S for record_seed in seeds]
         settings = {"schema": study.SCHEMA, "model": repr(replace(loaded, path=Path(), name="")), "seed": seed}
-        rows = spread(
-            partial(study.simulated, loaded), jobs, settings=settings, piece=32, scheduler=scheduler, results=results
-        )
+        rows = spread(partial(study.simulated, loaded), jobs, settings=settings, scheduler=scheduler, results=results)
     cases = study.summary(rows)
     document = {
         "schema": study.SCHEMA,

@@ -25,7 +25,7 @@ from selfcal import _firmware, _library32
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, few, install
 from selfcal.base.units import SENSOR_UNITS, SENSORS
-from selfcal.logs.framelog import LONGEST_FRAME
+from selfcal.logs.framelog import LONGEST_FRAME, LONGEST_LINE
 from selfcal.model.file import Model
 from selfcal.wire.dbc_file import BASE, BY_PLACE, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, Names
 
@@ -39,8 +39,10 @@ STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 #: Moduli of the counter and of the time, s. Beyond half of them forward and backward are alike.
 COUNTER, SECONDS = (1 << COMMON[name][1] for name in ("counter", "time"))
-FOREIGN_STATUSES = 2  # whole statuses in a row with another version, of a module that stated this version before
-RESYNC = 3  # frames in a row, counted up, that restart the counter; a stream is no stranger's from then
+#: Whole statuses in a row with another version, of a module that stated this version before.
+FOREIGN_STATUSES = 2
+#: Frames in a row, counted up, that restart the counter; a stream is no stranger's from then. Statuses of two modules.
+RESYNC = 3
 
 
 #: The part of the source tree that an installed wheel has, and the root of the tree itself where it is used in place.
@@ -394,7 +396,7 @@ class Decoder:
     def twins(self) -> str:
         """What is wrong if two modules send as this node; empty if they do not. Their reports are of neither."""
         # A restart within a status looks like one.
-        return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= 3 else ""
+        return f"two modules send as node {self.node}: build one with another NODE" if self._twins >= RESYNC else ""
 
     @property
     def surely_foreign(self) -> bool:
@@ -692,10 +694,6 @@ class Streams:
         return Statistics(**total)
 
 
-#: Most bytes of a serial line without an end that are kept: a frame's line has 22.
-LINE_MAX = 4096
-
-
 class Link:
     """A python-can bus whose `recv` survives what a damaged line does to it.
 
@@ -730,7 +728,7 @@ class Link:
             except (OSError, can.CanError):
                 self.closed = True
             finally:
-                self._shorten(LINE_MAX)
+                self._shorten(LONGEST_LINE)
             if time.monotonic() >= end:
                 break
         return None

@@ -423,7 +423,11 @@ class View:
     ) -> list[list[Text]]:
         """An axis's lines: the probabilities; bias, its course and N; what else there is."""
         cells, contact = _bar_cells(hypotheses, width), self._contact_of(module)
-        bias = {axis: _bias(report) for axis, (report, _) in last.items()}
+        bias = {
+            axis: f"bias {_number(report, 'bias_mean', '%.5g')} ± {_number(report, 'bias_sd', '%.2g')} "
+            f"{typeset(axis_unit(axis))}"
+            for axis, (report, _) in last.items()
+        }
         parameters = {axis: _parameters(report, names, named=not cells) for axis, (report, _) in last.items()}
         bias_width = max(map(len, bias.values()))
         spark = min(SPARK[1], width - INDENT - bias_width - 2 - max(len(texts[0]) for texts in parameters.values()))
@@ -543,11 +547,6 @@ def _number(report: AxisReport, signal: str, form: str, *, inverse: bool = False
     if value is None or math.isnan(value):
         return "?" if value is None else "-"
     return form % (value if not inverse else 1.0 / value if value else math.inf)
-
-
-def _bias(report: AxisReport) -> str:
-    mean, sd = _number(report, "bias_mean", "%.5g"), _number(report, "bias_sd", "%.2g")
-    return f"bias {mean} ± {sd} {typeset(axis_unit(report.axis))}"
 
 
 def _bar(report: AxisReport, k: int, cells: int) -> str:

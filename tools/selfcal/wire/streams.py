@@ -16,8 +16,9 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from typing import TYPE_CHECKING, Any, BinaryIO, Protocol
+from urllib.parse import urlsplit
 
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError, install
@@ -200,18 +201,20 @@ class _Foxglove:
 def check(wanted: str) -> tuple[str, str, int]:
     """Kind, host and port of an option `KIND[:HOST:PORT]`; of `ros:HZ` the rate in place of a port. Raises
     UserError."""
-    kind, *where = wanted.split(":")
+    kind, _, where = wanted.partition(":")
     if kind not in KINDS:
         raise UserError(f"--stream {wanted}: there is no such stream ({', '.join(KINDS)})")
     if kind == "ros":
-        if len(where) != 1 or not where[0].isdecimal() or not 0 < int(where[0]) <= MOST_RATE_HZ:
+        if not where.isdecimal() or not 0 < int(where) <= MOST_RATE_HZ:
             raise UserError(f"--stream {wanted}: write ros:HZ, the rate of the readings that the covariances are of")
-        return kind, "", int(where[0])
+        return kind, "", int(where)
     if not where:
         return kind, HOST, PORTS.get(kind, 0)
-    if kind == "jsonl" or len(where) != 2 or not where[0] or not where[1].isdecimal() or not 0 < int(where[1]) < 65536:
-        raise UserError(f"--stream {wanted}: write {' or '.join(f'{kind}:HOST:PORT' for kind in PORTS)}, or jsonl")
-    return kind, where[0], int(where[1])
+    address = urlsplit(f"//{where}")
+    with suppress(ValueError):  # a port that no number of 16 bits is
+        if kind in PORTS and address.hostname and address.port:
+            return kind, address.hostname, address.port
+    raise UserError(f"--stream {wanted}: write {' or '.join(f'{kind}:HOST:PORT' for kind in PORTS)}, or jsonl")
 
 
 def open_streams(wanted: Sequence[str], stack: ExitStack) -> list[Stream]:

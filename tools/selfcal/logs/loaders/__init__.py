@@ -148,7 +148,7 @@ def format_of(path: Path, *, frames: bool = False) -> Format | None:
         head = stream.read(_HEAD)
     suffix = path.suffix.lower()
     for form in FORMATS:
-        if any(head[at : at + len(sign)] == sign for at, sign in form.magic):
+        if any(head[offset : offset + len(sign)] == sign for offset, sign in form.magic):
             return form
     for form in FORMATS:
         if suffix in form.suffixes:

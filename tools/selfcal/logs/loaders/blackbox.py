@@ -10,7 +10,7 @@ from __future__ import annotations
 import struct
 from array import array
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,28 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.limits import MOST_COLUMNS
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.table import Hints, Table, of_arrays
 
 BEGIN = b"H Product:Blackbox"
 #: Columns that are read: letter of the axes here by the name in the headers.
 _AXES = {"gyroADC": "g", "accSmooth": "a"}
-#: Fields of a frame at most.
-_MOST_FIELDS = 256
 #: Bytes of an event's data, by its number; a log's end is known by its text.
 _EVENTS = {0: "v", 10: "vv", 11: "vv", 12: "vv", 13: "b4", 14: "vv", 15: "v", 30: "vv", 40: "v"}
 
 
 class _Damaged(Exception):
     """The bytes are no frame."""
-
-
-@dataclass
-class _Frames:
-    """Fields of one kind of frame: predictors and encodings, a number each."""
-
-    predictors: list[int] = field(default_factory=list)
-    encodings: list[int] = field(default_factory=list)
 
 
 class _Bytes:
@@ -103,7 +94,7 @@ def _four(data: _Bytes) -> list[int]:
     """Four numbers of one tag, of 0, 4, 8 or 16 bits each, packed by half bytes."""
     tag = data.byte()
     held = -1
-    found = []
+    numbers = []
 
     def half() -> int:
         nonlocal held
@@ -119,41 +110,41 @@ def _four(data: _Bytes) -> list[int]:
         value = 0
         for _ in range(count):
             value = value << 4 | half()
-        found.append(_sign(value, 4 * count) if count else 0)
-    return found
+        numbers.append(_sign(value, 4 * count) if count else 0)
+    return numbers
 
 
 def _values(data: _Bytes, encodings: Sequence[int]) -> list[int]:
     """The numbers of a frame before their prediction. Raises _Damaged and IndexError."""
-    found: list[int] = []
-    while len(found) < len(encodings):
-        place = len(found)
-        match encodings[place]:
+    numbers: list[int] = []
+    while len(numbers) < len(encodings):
+        column = len(numbers)
+        match encodings[column]:
             case 0:
-                found.append(data.signed())
+                numbers.append(data.signed())
             case 1:
-                found.append(data.unsigned())
+                numbers.append(data.unsigned())
             case 3:  # 14 bits, negative
-                found.append(-_sign(data.unsigned() & 0x3FFF, 14))
+                numbers.append(-_sign(data.unsigned() & 0x3FFF, 14))
             case 6:  # up to eight numbers, a tag says which are not 0
                 count = 1
-                while count < 8 and place + count < len(encodings) and encodings[place + count] == 6:
+                while count < 8 and column + count < len(encodings) and encodings[column + count] == 6:
                     count += 1
                 tag = data.byte() if count > 1 else 1
-                found += [data.signed() if tag >> k & 1 else 0 for k in range(count)]
+                numbers += [data.signed() if tag >> k & 1 else 0 for k in range(count)]
             case 7:
-                found += _three(data, ((2, 2, 2), (4, 4, 4), (6, 6, 6)))
+                numbers += _three(data, ((2, 2, 2), (4, 4, 4), (6, 6, 6)))
             case 8:
-                found += _four(data)
+                numbers += _four(data)
             case 9:
-                found.append(0)
+                numbers.append(0)
             case 10:
-                found += _three(data, ((2, 2, 2), (5, 5, 4), (8, 7, 7)))
+                numbers += _three(data, ((2, 2, 2), (5, 5, 4), (8, 7, 7)))
             case _:
                 raise _Damaged
-    if len(found) != len(encodings):
+    if len(numbers) != len(encodings):
         raise _Damaged
-    return found
+    return numbers
 
 
 class _Log:
@@ -163,7 +154,7 @@ class _Log:
         """Read the headers. Raises ValueError where they describe no frames."""
         self.data = _Bytes(data)
         self.headers: dict[str, str] = {}
-        while data[self.data.at : self.data.at + 2] == b"H " and self.data.at < 1 << 18:
+        while data[self.data.at : self.data.at + 2] == b"H ":
             end = data.find(b"\n", self.data.at)
             if end < 0:
                 break
@@ -171,14 +162,14 @@ class _Log:
             self.headers[name] = value
             self.data.at = end + 1
         self.names = self.headers.get("Field I name", "").split(",")
-        if not 2 < len(self.names) <= _MOST_FIELDS or "time" not in self.names:
+        if len(self.names) > MOST_COLUMNS or "time" not in self.names:
             raise ValueError("its headers describe no frames")
-        self.kinds = {}
+        #: Predictors and encodings of the fields, a number each, by the kind of frame.
+        self.kinds: dict[int, tuple[list[int], list[int]]] = {}
         for kind in "IPSGH":
-            if f"Field {kind} encoding" in self.headers:
-                parts = [self._numbers(f"Field {kind} {part}") for part in ("predictor", "encoding")]
-                if len(parts[0]) == len(parts[1]) <= _MOST_FIELDS:
-                    self.kinds[ord(kind)] = _Frames(*parts)
+            predictors, encodings = (self._numbers(f"Field {kind} {part}") for part in ("predictor", "encoding"))
+            if 0 < len(predictors) == len(encodings) <= MOST_COLUMNS:
+                self.kinds[ord(kind)] = predictors, encodings
         self.time = self.names.index("time")
         self.motor = self.names.index("motor[0]") if "motor[0]" in self.names else 0
         least = self._number("minthrottle", 1150)
@@ -205,21 +196,18 @@ class _Log:
             begin = data.at
             try:
                 kind = data.byte()
-                if kind == ord("E"):
-                    if self._event():
-                        size = data.at
+                if kind in b"E":
+                    size = data.at if self._event() else size
                     continue
                 if kind not in self.kinds:
                     raise _Damaged
-                frames = self.kinds[kind]
-                values = _values(data, frames.encodings)
+                predictors, encodings = self.kinds[kind]
+                values = _values(data, encodings)
                 if data.at < len(data.data) and data.data[data.at] not in b"IPSGHE":
                     raise _Damaged
-                if kind not in (ord("I"), ord("P")):
+                if kind not in b"IP" or (kind in b"P" and not history):
                     continue
-                if kind == ord("P") and not history:
-                    continue
-                values = self._predicted(values, frames.predictors, history if kind == ord("P") else [])
+                values = self._predicted(values, predictors, history if kind in b"P" else [])
                 # Of frames 10 s apart one is damaged.
                 if history and not 0 < values[self.time] - history[-1][self.time] < 10_000_000:
                     raise _Damaged
@@ -230,23 +218,23 @@ class _Log:
             if lost >= 0:
                 self.damaged += Damaged(begin - lost, 1)
                 lost = -1
-            history = [values, values] if kind == ord("I") else [history[-1], values]
+            history = [values, values] if kind in b"I" else [history[-1], values]
             yield values
         if lost >= 0:
             self.damaged += Damaged(size - lost, 1)
 
     def _predicted(self, values: list[int], predictors: Sequence[int], history: Sequence[list[int]]) -> list[int]:
         """The values with what they are predicted by. Raises _Damaged."""
-        for place, predictor in enumerate(predictors):
-            before, last = (frame[place] for frame in history) if history else (0, 0)
+        for column, predictor in enumerate(predictors):
+            before, last = (frame[column] for frame in history) if history else (0, 0)
             if predictor in self.constants:
-                values[place] += self.constants[predictor]
+                values[column] += self.constants[predictor]
             elif predictor == 5:
-                values[place] += values[self.motor]
+                values[column] += values[self.motor]
             elif predictor == 6:
-                values[place] += last + self.step if history else 0
+                values[column] += last + self.step if history else 0
             elif history and predictor in (1, 2, 3):
-                values[place] += {1: last, 2: 2 * last - before, 3: int((last + before) / 2)}[predictor]
+                values[column] += {1: last, 2: 2 * last - before, 3: int((last + before) / 2)}[predictor]
             else:
                 raise _Damaged
         return values
@@ -303,20 +291,20 @@ def _table(log: _Log, source: str) -> Table | None:
     if one_g.isdigit() and int(one_g) > 0:
         sizes["accSmooth"] = 1.0 / int(one_g)
     for name, size in sizes.items():
-        for place, axis in enumerate("xyz"):
-            if size > 0.0 and f"{name}[{place}]" in log.names:
-                headings[f"{name}[{place}]"] = f"{_AXES[name]}{axis}[{'deg/s' if name == 'gyroADC' else 'g'}]"
+        for column, axis in enumerate("xyz"):
+            if size > 0.0 and f"{name}[{column}]" in log.names:
+                headings[f"{name}[{column}]"] = f"{_AXES[name]}{axis}[{'deg/s' if name == 'gyroADC' else 'g'}]"
     places = [log.names.index(name) for name in headings]
     values = array("q")
     for frame in log.frames():
-        values.extend(frame[place] for place in places)
+        values.extend(frame[column] for column in places)
     if "gyroADC[0]" not in headings or not values:
         return None
     rows = np.array(values).reshape(-1, len(places))
     columns: dict[str, NDArray[Any]] = {"t[us]": rows[:, 0]}
-    for place, (name, heading) in enumerate(headings.items()):
-        if place:
-            columns[heading] = rows[:, place] * sizes[name[:-3]]
+    for column, (name, heading) in enumerate(headings.items()):
+        if column:
+            columns[heading] = rows[:, column] * sizes[name[:-3]]
     return of_arrays(source, columns)
 
 

@@ -76,11 +76,11 @@ def tables_of(path: Path, form: Format, hints: Hints, start: Start | None = None
 
 def _answered(pipe: int, ends: float) -> list[Table]:
     """The tables that a child sends. Raises UserError; EOFError where it ended, TimeoutError at the time `ends`."""
-    found = json.loads(_received(pipe, _SIZE.unpack(_received(pipe, _SIZE.size, ends))[0], ends))
-    if "error" in found:
-        raise UserError(found["error"])
+    message = json.loads(_received(pipe, _SIZE.unpack(_received(pipe, _SIZE.size, ends))[0], ends))
+    if "error" in message:
+        raise UserError(message["error"])
     tables = []
-    for table in found["tables"]:
+    for table in message["tables"]:
         arrays = {}
         for name, kind, shape in table["columns"]:
             dtype = np.dtype(kind)
@@ -148,10 +148,10 @@ def answer(module: str, path: Path, hints: Hints, to: int) -> None:
     try:
         with reading(path, "cannot be read"):
             read = import_module(f"selfcal.logs.loaders.{module}").read
-            found: dict[str, Any] = {"tables": [_entry(path, table, arrays) for table in read(path, hints)]}
+            content: dict[str, Any] = {"tables": [_entry(path, table, arrays) for table in read(path, hints)]}
     except UserError as error:
-        found, arrays = {"error": str(error)}, []
-    head = json.dumps(found).encode()
+        content, arrays = {"error": str(error)}, []
+    head = json.dumps(content).encode()
     with open(to, "wb") as pipe:
         pipe.write(_SIZE.pack(len(head)) + head)
         for array in arrays:

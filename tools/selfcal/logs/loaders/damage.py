@@ -33,11 +33,9 @@ class Damaged:
     @property
     def words(self) -> str:
         """One line."""
-        share = 100.0 * self.bytes / max(self.whole, 1)
-        of = f"{share:.2g} %" if share >= 0.01 else "less than 0.01 %"
-        return (
-            f"{of} of the file could not be read: {self.messages:,} message{'s' if self.messages > 1 else ''} or more"
-        )
+        share = f"{100.0 * self.bytes / max(self.whole, 1):.2g} %"
+        more = f"{self.messages:,} message{'s' if self.messages > 1 else ''} or more"
+        return f"{share} of the file could not be read: {more}"
 
 
 def parts_of(path: Path) -> list[Path]:

@@ -53,27 +53,27 @@ class _Rows:
     def table(self, source: str) -> Table:
         """The table. Drop a temperature that is 0 throughout."""
         values = np.array(self.values).reshape(-1, len(self.headings))
-        columns = {name: values[:, place] for place, name in enumerate(self.headings)}
+        columns = {name: values[:, column] for column, name in enumerate(self.headings)}
         return of_arrays(source, {name: part for name, part in columns.items() if name[:4] != "temp" or part.any()})
 
 
 def read(path: Path, _: Hints) -> list[Table]:
     """The tables of a .bin or a .tlog. Raises UserError and what pymavlink raises."""
-    found: dict[str, dict[str, _Rows]] = {}
+    sources: dict[str, dict[str, _Rows]] = {}
     with mapped(path) as data:
         binary = data[:2] == _HEAD
         damaged, sound = sifted(data, 0, _ends(data)) if binary else (Damaged(), None)
         lost = list[Damaged]()
         for source, kind, headings, values in _bin(path, sound) if binary else _tlog(data, lost):
-            rows = found.setdefault(source, {})
+            rows = sources.setdefault(source, {})
             if kind not in rows:
                 rows[kind] = _Rows(headings)
             if rows[kind].headings == headings:
                 rows[kind].values.extend(values)
-    if not found:
+    if not sources:
         raise UserError(f"{path}: no message {', '.join(_SOURCES if binary else _TLOG)}")
     order = list(_DATAFLASH if binary else _TLOG)
-    tables = [rows[kind].table(source) for source, rows in found.items() for kind in sorted(rows, key=order.index)]
+    tables = [rows[kind].table(source) for source, rows in sources.items() for kind in sorted(rows, key=order.index)]
     return [replace(part, damaged=sum(lost, damaged)) for part in tables]
 
 
@@ -88,14 +88,14 @@ def _ends(data: Bytes) -> Callable[[int], int]:
     written = max(0, written - BLOCK_BYTES) + len(block) if written else 0
     lengths = {_FMT: 89}
 
-    def end_of(at: int) -> int:
-        if at >= written:
+    def end_of(begin: int) -> int:
+        if begin >= written:
             return size
-        end = at + lengths.get(data[at + 2], 0) if data[at : at + 2] == _HEAD and at + 2 < size else 0
-        if not at + 2 < end <= size:
+        end = begin + lengths.get(data[begin + 2], 0) if data[begin : begin + 2] == _HEAD and begin + 2 < size else 0
+        if not begin + 2 < end <= size:
             return 0
-        if data[at + 2] == _FMT:
-            lengths[data[at + 3]] = data[at + 4]
+        if data[begin + 2] == _FMT:
+            lengths[data[begin + 3]] = data[begin + 4]
         return end
 
     return end_of

@@ -13,13 +13,9 @@ from functools import lru_cache
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
-from selfcal.base.limits import (
-    LONGEST_HEADING,
-)
+from selfcal.base.limits import LONGEST_HEADING
 from selfcal.base.options import Scale, parse_pairs
 
-#: Characters of a heading of no program that is known.
-_LONGEST_NAME = 120
 #: Headings of a time column that states its unit, or holds dates.
 TIMES = ("time", "timestamp")
 #: Name here of a second column of the time, which is added to the first.
@@ -191,14 +187,14 @@ def sensors_of(
     """
     native = [key for key in keys if key not in taken and split(key)[0] in own]
     if native or any(name in own for name in taken.values()):
-        warm = {} if "temp" in taken.values() else _temperature(FORMS[-1], _free(FORMS[-1], keys, taken), "")
+        warm = {} if "temp" in taken.values() else _temperature(FORMS[-1], _free(keys, taken), "")
         return [Sensor("", warm | _native_time(keys, taken))]
     for form in FORMS:
         if form.before and before is not None and not any(line.startswith(form.before) for line in before):
             continue
-        found = _by(form, file, keys, taken)
-        if found:
-            return found
+        sensors = _by(form, file, keys, taken)
+        if sensors:
+            return sensors
     return []
 
 
@@ -221,13 +217,12 @@ def _native_time(keys: Sequence[str], taken: Mapping[str, str]) -> dict[str, Mea
     times = [key for key, name in zip(keys, names, strict=True) if name.lower() in TIMES and key not in taken]
     if "t" not in names and len(times) == 1:
         return {times[0]: Meaning("t", split(times[0])[1])}
-    return {} if "t" in names else _time(FORMS[-1], _free(FORMS[-1], keys, taken), taken, "")
+    return {} if "t" in names else _time(FORMS[-1], _free(keys, taken), taken, "")
 
 
-def _free(form: _Form, keys: Sequence[str], taken: Mapping[str, str]) -> list[str]:
+def _free(keys: Sequence[str], taken: Mapping[str, str]) -> list[str]:
     """The headings that a form may look at: not those that the user maps, nor long ones, which take long."""
-    longest = _LONGEST_NAME if form is FORMS[-1] else LONGEST_HEADING
-    return [key for key in keys if key not in taken and len(key) <= longest]
+    return [key for key in keys if key not in taken and len(key) <= LONGEST_HEADING]
 
 
 def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -> list[Sensor]:
@@ -236,7 +231,7 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
         return []
     if form.file and form.file not in file.lower():
         return []
-    free = _free(form, keys, taken)
+    free = _free(keys, taken)
     axes: dict[str, dict[str, Meaning]] = {}
     for letter, key, match, stated in _axes(form, free):
         axis = _VEHICLE.get(match["axis"].lower(), match["axis"].lower())
@@ -248,31 +243,33 @@ def _by(form: _Form, file: str, keys: Sequence[str], taken: Mapping[str, str]) -
             1.0,
             unit is None and form is not FORMS[-1],
         )
-    found = []
+    sensors = []
     for source, meant in axes.items():
         named = [meaning.name for meaning in meant.values()]
         if len(set(named)) < len(named):
             return []  # not this form's
-        found.append(Sensor(source, {**meant, **_time(form, free, taken, source), **_temperature(form, free, source)}))
-    return found
+        sensors.append(
+            Sensor(source, {**meant, **_time(form, free, taken, source), **_temperature(form, free, source)})
+        )
+    return sensors
 
 
 def _axes(form: _Form, keys: Sequence[str]) -> Iterator[tuple[str, str, re.Match[str], str | None]]:
     """Letter, heading, match and stated unit of a form's axes. In the last form a stated unit decides the sensor, and
     where no name is a gyro's or an accelerometer's, the unit alone does."""
-    found = [
+    matches = [
         (letter, *own) for pattern, letter in ((form.gyro, "g"), (form.accel, "a")) for own in _matching(pattern, keys)
     ]
     if form is not FORMS[-1]:
-        yield from found
+        yield from matches
         return
-    told = [(_kind(stated) or letter, key, match, stated) for letter, key, match, stated in found if _fits(stated)]
-    named = {letter for letter, *_ in told}
-    known = {key for _, key, *_ in told}
+    axes = [(_kind(stated) or letter, key, match, stated) for letter, key, match, stated in matches if _fits(stated)]
+    named = {letter for letter, *_ in axes}
+    known = {key for _, key, *_ in axes}
     for key, match, stated in _matching(_ANY, keys):
         if key not in known and (kind := _kind(stated)) and kind not in named:
-            told.append((kind, key, match, stated))
-    yield from told
+            axes.append((kind, key, match, stated))
+    yield from axes
 
 
 def _kind(unit: str | None, kinds: Sequence[tuple[str, str]] = (("g", "rad/s"), ("a", "m/s^2"))) -> str | None:
@@ -315,11 +312,11 @@ def _in_two(keys: Sequence[str], source: str) -> dict[str, Meaning]:
 
 def _temperature(form: _Form, keys: Sequence[str], source: str) -> dict[str, Meaning]:
     """The temperature of a source, else the only one that there is."""
-    found = [
+    matches = [
         ((match.groupdict().get("source") or "").strip("/. "), key, stated)
         for key, match, stated in _matching(form.temperature, keys)
     ]
-    of = [entry for entry in found if entry[0] == source] or (found if len(found) == 1 else [])
+    of = [entry for entry in matches if entry[0] == source] or (matches if len(matches) == 1 else [])
     return {key: Meaning("temp", stated or (None if form is FORMS[-1] else "degC")) for _, key, stated in of[:1]}
 
 

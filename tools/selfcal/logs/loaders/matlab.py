@@ -49,18 +49,18 @@ def read(path: Path, _: Hints) -> list[Table]:
 
 def _mat4(data: bytes) -> _Variables:
     """Variables of a file of version 4. Raises ValueError, and EOFError where it is cut off."""
-    at = 0
-    while at < len(data):
-        order = next((sign for sign in "<>" if 0 <= struct.unpack_from(f"{sign}i", data, at)[0] < 5000), "")
-        kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, at)
-        place = kind // 10 % 10
-        if not order or min(rows, columns, length) < 0 or place >= len(_MAT4_TYPES):
+    begin = 0
+    while begin < len(data):
+        order = next((sign for sign in "<>" if 0 <= struct.unpack_from(f"{sign}i", data, begin)[0] < 5000), "")
+        kind, rows, columns, imaginary, length = struct.unpack_from(f"{order}5i", data, begin)
+        number = kind // 10 % 10
+        if not order or min(rows, columns, length) < 0 or number >= len(_MAT4_TYPES):
             raise ValueError("a variable's header is invalid")
-        name = bytes(_piece(data, at + 20, length)).rstrip(b"\0").decode("latin-1")
-        dtype = np.dtype(order + _MAT4_TYPES[place])
+        name = bytes(_piece(data, begin + 20, length)).rstrip(b"\0").decode("latin-1")
+        dtype = np.dtype(order + _MAT4_TYPES[number])
         size = rows * columns * dtype.itemsize
-        values = np.frombuffer(_piece(data, at + 20 + length, size), dtype).reshape((rows, columns), order="F")
-        at += 20 + length + size * (2 if imaginary else 1)
+        values = np.frombuffer(_piece(data, begin + 20 + length, size), dtype).reshape((rows, columns), order="F")
+        begin += 20 + length + size * (2 if imaginary else 1)
         if kind % 10 == 0:
             yield name, values.astype(np.complex128 if imaginary else dtype.newbyteorder("="), copy=False)
         elif kind % 10 == 1 and name == "meta":
@@ -69,25 +69,25 @@ def _mat4(data: bytes) -> _Variables:
 
 def _mat5(data: memoryview, order: str) -> _Variables:
     """Variables of a file of version 5 to 7, unpacked. Raises ValueError, and EOFError where it is cut off."""
-    at = _MAT_HEADER
-    while at + 8 <= len(data):
-        kind, size = struct.unpack_from(f"{order}II", data, at)
-        body = _piece(data, at + 8, size)
-        at += 8 + size
+    begin = _MAT_HEADER
+    while begin + 8 <= len(data):
+        kind, size = struct.unpack_from(f"{order}II", data, begin)
+        body = _piece(data, begin + 8, size)
+        begin += 8 + size
         if kind == 14 and size:  # an array
             yield from _array(body, order)
 
 
 def _array(body: memoryview, order: str) -> _Variables:
     """The variable of an array's element, if it is one of numbers, or `meta`."""
-    flags, at = _element(body, 0, order)[1:]
+    flags, behind = _element(body, 0, order)[1:]
     flag = struct.unpack_from(f"{order}I", flags)[0]
     of = flag & 0xFF
     if flag & 0x200 or (of != _MAT_CHAR and of not in _MAT_CLASSES):  # logical, or a class that has other parts
         return
-    extents, at = _element(body, at, order)[1:]
-    letters, at = _element(body, at, order)[1:]
-    kind, content, _ = _element(body, at, order)
+    extents, behind = _element(body, behind, order)[1:]
+    letters, behind = _element(body, behind, order)[1:]
+    kind, content, _ = _element(body, behind, order)
     name = bytes(letters).decode("latin-1")
     if of == _MAT_CHAR:
         if name == "meta":
@@ -103,29 +103,29 @@ def _array(body: memoryview, order: str) -> _Variables:
     yield name, values.astype(whole, copy=False).reshape(shape, order="F")
 
 
-def _element(data: memoryview, at: int, order: str) -> tuple[int, memoryview, int]:
+def _element(data: memoryview, begin: int, order: str) -> tuple[int, memoryview, int]:
     """Kind and content of the element at a place, and the place behind it. Small ones have both in eight bytes."""
-    kind = struct.unpack_from(f"{order}I", data, at)[0]
+    kind = struct.unpack_from(f"{order}I", data, begin)[0]
     if kind >> 16:
-        return kind & 0xFFFF, _piece(data, at + 4, kind >> 16), at + 8
-    size = struct.unpack_from(f"{order}I", data, at + 4)[0]
-    return kind, _piece(data, at + 8, size), at + 8 + size + -size % 8
+        return kind & 0xFFFF, _piece(data, begin + 4, kind >> 16), begin + 8
+    size = struct.unpack_from(f"{order}I", data, begin + 4)[0]
+    return kind, _piece(data, begin + 8, size), begin + 8 + size + -size % 8
 
 
-def _piece(data: memoryview | bytes, at: int, size: int) -> memoryview:
-    if not 0 <= size <= len(data) - at:
+def _piece(data: memoryview | bytes, begin: int, size: int) -> memoryview:
+    if not 0 <= size <= len(data) - begin:
         raise EOFError("it is cut off")
-    return memoryview(data)[at : at + size]
+    return memoryview(data)[begin : begin + size]
 
 
 def _unpacked(path: Path, data: bytes, order: str) -> memoryview:
     """A MATLAB file with its packed variables unpacked, so that its size is known before it is read."""
-    parts, size, at, most = [data[:_MAT_HEADER]], _MAT_HEADER, _MAT_HEADER, room(data)
-    while at + 8 <= len(data):
-        kind, length = struct.unpack_from(f"{order}II", data, at)
-        part = data[at : at + 8 + length]
+    parts, size, begin, most = [data[:_MAT_HEADER]], _MAT_HEADER, _MAT_HEADER, room(data)
+    while begin + 8 <= len(data):
+        kind, length = struct.unpack_from(f"{order}II", data, begin)
+        part = data[begin : begin + 8 + length]
         if kind == 15:  # packed
             part = inflated(path, zlib.decompressobj(), part[8:], most, size)
         parts.append(part)
-        size, at = size + len(part), at + 8 + length
+        size, begin = size + len(part), begin + 8 + length
     return memoryview(bounded(path, b"".join(parts), most))

@@ -32,8 +32,6 @@ _SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nsec", "nanosec", "nsecs"
 #: The first and the last bytes of a file; a record's kind and length; the kind of a chunk.
 _MAGIC, _HEAD = b"\x89MCAP0\r\n", struct.Struct("<BQ")
 _CHUNK = b"\x06"
-#: Depth of a message's fields.
-_DEEPEST = 6
 #: What of a message's fields is a sensor's by convention.
 _BY_CONVENTION = ("angular_velocity/", "linear_acceleration/")
 
@@ -72,21 +70,19 @@ class _Fields:
         columns: dict[str, Any] = {}
         if not counted:
             columns["t[ns]"] = np.array(self.stamps if self.stamped else self.published)
-        for place, (name, unit) in enumerate(units.items()):
+        for column, (name, unit) in enumerate(units.items()):
             if counted or name.lower() not in ("t", *TIMES):
-                columns[name if unit is None else f"{name}[{unit}]"] = values[:, place]
+                columns[name if unit is None else f"{name}[{unit}]"] = values[:, column]
         return of_arrays(topic, columns, notes=tuple(notes))
 
 
-def _flat(value: Any, path: str = "", depth: int = 0) -> Iterator[tuple[str, float | int]]:
+def _flat(value: Any, path: str = "") -> Iterator[tuple[str, float | int]]:
     """Numbers of a message by their paths."""
-    if isinstance(value, bool) or depth > _DEEPEST:
-        return
-    if isinstance(value, int | float):
+    if isinstance(value, int | float) and not isinstance(value, bool):
         yield path, value
     elif isinstance(value, Mapping):
         for name, inner in value.items():
-            yield from _flat(inner, f"{path}/{name}" if path else str(name), depth + 1)
+            yield from _flat(inner, f"{path}/{name}" if path else str(name))
 
 
 def _stamp(fields: Mapping[str, float | int]) -> int | None:
@@ -101,7 +97,7 @@ def _stamp(fields: Mapping[str, float | int]) -> int | None:
 
 def read(path: Path, _: Hints) -> list[Table]:
     """The tables of an MCAP file. Raises UserError and what mcap raises."""
-    found: dict[str, Topic | _Fields] = {}
+    topics: dict[str, Topic | _Fields] = {}
     kinds: set[str] = set()
     decoders: dict[int, Callable[[bytes], Mapping[str, Any]]] = {}
     lost = list[Damaged]()
@@ -113,7 +109,7 @@ def read(path: Path, _: Hints) -> list[Table]:
             if channel.message_encoding in ("cdr", "ros1"):
                 kind = kind if "/msg/" in kind else kind.replace("/", "/msg/", 1)
                 if kind in LAYOUTS:
-                    table = found.setdefault(topic, Topic(kind))
+                    table = topics.setdefault(topic, Topic(kind))
                     if isinstance(table, Topic) and table.kind == kind:
                         table.take(message.data, cdr=channel.message_encoding == "cdr")
                 continue
@@ -121,17 +117,17 @@ def read(path: Path, _: Hints) -> list[Table]:
                 continue
             if channel.id not in decoders:
                 decoders[channel.id] = _decoder(schema, channel)
-            if topic not in found:
-                found[topic] = _Fields({**_units_of(schema), **channel.metadata})
-            fields = found[topic]
+            if topic not in topics:
+                topics[topic] = _Fields({**_units_of(schema), **channel.metadata})
+            fields = topics[topic]
             if isinstance(fields, _Fields):
                 fields.take(decoders[channel.id](message.data), message.publish_time)
     damaged = sum(lost, Damaged())
-    if damaged and not found:
+    if damaged and not topics:
         raise UserError(f"{path}: damaged: {replace(damaged, whole=bytes_of(path)).words}, and no other is a sensor's")
-    if not found:
+    if not topics:
         raise no_topic(path, kinds)
-    return [replace(table.table(topic), damaged=damaged) for topic, table in found.items()]
+    return [replace(table.table(topic), damaged=damaged) for topic, table in topics.items()]
 
 
 def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple[Any, Any, Any]]:
@@ -175,7 +171,7 @@ def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple
         lost.append(Damaged(0, stated - count - sum(record.messages for record in lost)))
 
 
-def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
+def _records(data: Bytes, begin: int) -> tuple[int, list[Any], bool]:
     """The end of the record at a place, the record, or those of a chunk, and whether it has a checksum, which fits.
     Raises what mcap raises."""
     from mcap import records as of
@@ -191,42 +187,42 @@ def _records(data: Bytes, at: int) -> tuple[int, list[Any], bool]:
         Opcode.DATA_END: of.DataEnd,
         Opcode.FOOTER: of.Footer,
     }
-    if not (end := _end(data, at)):
+    if not (end := _end(data, begin)):
         raise ValueError("no record")
-    stream, kind = ReadDataStream(BytesIO(data[at + _HEAD.size : end])), data[at]
+    stream, kind = ReadDataStream(BytesIO(data[begin + _HEAD.size : end])), data[begin]
     if kind == Opcode.MESSAGE:
-        return end, [of.Message.read(stream, end - at - _HEAD.size)], False
+        return end, [of.Message.read(stream, end - begin - _HEAD.size)], False
     record = kinds[kind].read(stream) if kind in kinds else None
     if isinstance(record, of.Chunk):
         return end, breakup_chunk(record, validate_crc=True), record.uncompressed_crc != 0
     return end, [record], False
 
 
-def _end(data: Bytes, at: int) -> int:
+def _end(data: Bytes, begin: int) -> int:
     """The end that a record at a place states; 0 without a record."""
-    if at + _HEAD.size > len(data):
+    if begin + _HEAD.size > len(data):
         return 0
-    kind, length = _HEAD.unpack_from(data, at)
-    end = at + _HEAD.size + length
+    kind, length = _HEAD.unpack_from(data, begin)
+    end = begin + _HEAD.size + length
     return end if (0 < kind < 16 or kind > 127) and end <= len(data) else 0
 
 
-def _next(data: Bytes, at: int) -> int:
+def _next(data: Bytes, begin: int) -> int:
     """Where to go on after a damaged record: at its end where a record or the file's end is there, else at the next
     sound chunk."""
-    end = _end(data, at)
+    end = _end(data, begin)
     if end and (_end(data, end) or data[end:] == _MAGIC):
         return end
-    while (at := data.find(_CHUNK, at + 1)) >= 0:
+    while (begin := data.find(_CHUNK, begin + 1)) >= 0:
         with suppress(Exception):
-            if _records(data, at)[2]:
-                return at
+            if _records(data, begin)[2]:
+                return begin
     return len(data)
 
 
 def _summary(data: Bytes) -> list[Any]:
     """The records of the summary, none where it is absent or damaged."""
-    found: list[Any] = []
+    records: list[Any] = []
     at = len(data) - (_HEAD.size + 20) - len(_MAGIC)  # of the footer
     with suppress(Exception):
         end, (footer,), _ = _records(data, at)
@@ -234,8 +230,8 @@ def _summary(data: Bytes) -> list[Any]:
         if not footer.summary_crc or zlib.crc32(data[start : end - 4]) == footer.summary_crc:
             while 0 < start < at:
                 start, more, _ = _records(data, start)
-                found += more
-    return found
+                records += more
+    return records
 
 
 def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
@@ -251,31 +247,31 @@ def _decoder(schema: Any, channel: Any) -> Callable[[bytes], Mapping[str, Any]]:
 
 def _messages(message: Any) -> dict[str, Any]:
     """The fields of a protobuf message, inner messages as mappings; repeated ones are left out."""
-    found: dict[str, Any] = {}
+    fields: dict[str, Any] = {}
     for field in message.DESCRIPTOR.fields:
         value = getattr(message, field.name)
         if hasattr(value, "DESCRIPTOR"):
-            found[field.name] = _messages(value)
+            fields[field.name] = _messages(value)
         elif isinstance(value, int | float):
-            found[field.name] = value
-    return found
+            fields[field.name] = value
+    return fields
 
 
 def _units_of(schema: Any) -> dict[str, str]:
     """Units that a JSON schema states, by the paths of the fields."""
     if schema is None or schema.encoding != "jsonschema" or not schema.data:
         return {}
-    found: dict[str, str] = {}
+    units: dict[str, str] = {}
 
-    def look(node: Any, path: str, depth: int) -> None:
-        if not isinstance(node, dict) or depth > _DEEPEST:
+    def look(node: Any, path: str) -> None:
+        if not isinstance(node, dict):
             return
         unit = node.get("unit", node.get("units"))
         if isinstance(unit, str) and path:
-            found[path] = unit
+            units[path] = unit
         properties = node.get("properties")
         for name, inner in properties.items() if isinstance(properties, dict) else ():
-            look(inner, f"{path}/{name}" if path else name, depth + 1)
+            look(inner, f"{path}/{name}" if path else name)
 
-    look(json.loads(schema.data), "", 0)
-    return found
+    look(json.loads(schema.data), "")
+    return units

@@ -39,10 +39,10 @@ class Topic:
         """One message, in CDR or in ROS 1's form. Raises struct.error and IndexError for one that is cut off."""
         order = ">" if cdr and not data[1] & 1 else "<"
         seconds, nanoseconds, length = struct.unpack_from(f"{order}iII", data, 4)
-        at = 16 + length
+        begin = 16 + length
         if cdr:
-            at += -(at - 4) % 8
-        self.values.extend(struct.unpack_from(f"{order}{LAYOUTS[self.kind]}d", data, at))
+            begin += -(begin - 4) % 8
+        self.values.extend(struct.unpack_from(f"{order}{LAYOUTS[self.kind]}d", data, begin))
         self.stamps.append(seconds * 1_000_000_000 + nanoseconds)
 
     def table(self, name: str) -> Table:
@@ -69,20 +69,20 @@ class Topic:
 def _axes(values: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
     """Columns of the axes that an Imu [n, 37] has. A sensor that it has not reads 0 throughout, or has a covariance of
     -1 (REP 145)."""
-    found = {}
-    for letter, (at, _) in _AXES.items():
-        triad = values[:, at : at + 3]
-        if len(values) and triad.any() and values[0, at + 3] != -1.0:
-            found[letter] = triad
-    if found.keys() == _AXES.keys():
-        none = (found["a"] == 0.0).all(axis=1, keepdims=True)  # at rest gravity is among the axes: no reading is 0
-        found["a"] = np.where(none, np.nan, found["a"])
+    triads = {}
+    for letter, (first, _) in _AXES.items():
+        triad = values[:, first : first + 3]
+        if len(values) and triad.any() and values[0, first + 3] != -1.0:
+            triads[letter] = triad
+    if triads.keys() == _AXES.keys():
+        none = (triads["a"] == 0.0).all(axis=1, keepdims=True)  # at rest gravity is among the axes: no reading is 0
+        triads["a"] = np.where(none, np.nan, triads["a"])
         # A topic has the gyro and the accelerometer in turn.
         if none.mean() > 0.1:
-            found["g"] = np.where((found["g"] == 0.0).all(axis=1, keepdims=True), np.nan, found["g"])
+            triads["g"] = np.where((triads["g"] == 0.0).all(axis=1, keepdims=True), np.nan, triads["g"])
     return {
         f"{letter}{axis}[{_AXES[letter][1]}]": triad[:, place]
-        for letter, triad in found.items()
+        for letter, triad in triads.items()
         for place, axis in enumerate("xyz")
     }
 

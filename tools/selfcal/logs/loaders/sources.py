@@ -10,10 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from selfcal.base.errors import UserError, few, printable, short
-
-#: Sources that a message lists.
-_MOST_LISTED = 30
+from selfcal.base.errors import MOST_NAMED, UserError, few, printable, short
 
 
 @dataclass(frozen=True)
@@ -55,22 +52,24 @@ def chosen(path: object, parts: Sequence[Part], wanted: Sequence[str]) -> tuple[
     repeated = [a for k, name in enumerate(kept) for a in axes[name] for other in kept[:k] if a in axes[other]]
     if repeated:
         raise UserError(f"{path}: axis '{repeated[0]}' is in more than one of the sources: give one --source")
-    found = [part for source in kept for part in sources[source]]
+    chosen_parts = [part for source in kept for part in sources[source]]
     notes = []
     if dropped:
         notes.append(
             f"{', '.join(kept)} is read; left out, for their lower rates: {', '.join(map(printable, dropped))}"
         )
     warm = [part for source in dropped for part in sources[source] if part.warm]
-    of_dropped = warm[:1] if len({part.source for part in warm}) == 1 and not any(part.warm for part in found) else []
-    found += of_dropped
+    of_dropped = (
+        warm[:1] if len({part.source for part in warm}) == 1 and not any(part.warm for part in chosen_parts) else []
+    )
+    chosen_parts += of_dropped
     sides = [source for source in sources if not axes[source] and source not in kept]
     if sides and not wanted:
         near = _nearest(kept, sides)
-        found += [part for source in near for part in sources[source]]
+        chosen_parts += [part for source in near for part in sources[source]]
         if len(near) < len(sides):
             notes.append(f"left out, add it by --source: {', '.join(side for side in sides if side not in near)}")
-    return found, of_dropped, notes
+    return chosen_parts, of_dropped, notes
 
 
 def _by_rate(
@@ -115,4 +114,4 @@ def _listed(sources: dict[str, list[Part]], axes: dict[str, frozenset[str]], nam
         part = max(sources[name], key=lambda own: (bool(own.axes), own.rate_hz))
         of = " ".join(sorted(axes[name], key=lambda axis: (axis[0] != "g", axis))) or "no axis"
         lines.append(f"--source '{printable(name)}' ({of}; {part.rate_hz:.4g} Hz, {part.span()[1]:.4g} s)")
-    return f"give {few(lines, _MOST_LISTED)}"
+    return f"give {few(lines, MOST_NAMED)}"

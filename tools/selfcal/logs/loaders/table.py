@@ -248,11 +248,12 @@ def vectors(path: Path, arrays: Mapping[str, NDArray[Any]]) -> dict[str, Member]
     """Vectors as they are, a matrix NAME as NAME:1, NAME:2, ..."""
     members: dict[str, Member] = {}
     for name, array in arrays.items():
-        if array.ndim != 2 or 1 in array.shape:
-            add(path, members, name, array.ravel() if array.ndim == 2 else array)
+        columns = array.squeeze()
+        if columns.ndim != 2:
+            add(path, members, name, np.atleast_1d(columns))
             continue
-        for column in range(min(array.shape[1], MOST_COLUMNS + 1)):
-            add(path, members, f"{name}:{column + 1}", array[:, column])
+        for k, column in enumerate(columns.T[: MOST_COLUMNS + 1], 1):
+            add(path, members, f"{name}:{k}", column)
     return members
 
 

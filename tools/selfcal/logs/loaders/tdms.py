@@ -75,15 +75,15 @@ def _unknown_scale(*stated: Mapping[str, Any]) -> str:
 
 def _cut(path: Path) -> Damaged:
     """What the last segment states that is not there: nptdms reads what there is. Source: NI's description of TDMS."""
-    at, size, lead = 0, path.stat().st_size, struct.calcsize(f"={_LEAD}")
+    begin, size, lead = 0, path.stat().st_size, struct.calcsize(f"={_LEAD}")
     with path.open("rb") as stream:
-        while at < size:
-            stream.seek(at)
+        while begin < size:
+            stream.seek(begin)
             head = stream.read(lead)
             if len(head) < lead or head[:4] != b"TDSm":
-                return Damaged(size - at, 1)
+                return Damaged(size - begin, 1)
             length = struct.unpack(f"{'>' if head[4] & 0x40 else '<'}{_LEAD}", head)[3]
             if length == 2**64 - 1:  # the writer did not come to its end
                 return Damaged()
-            at += lead + length
-    return Damaged(at - size, 1, at) if at > size else Damaged()
+            begin += lead + length
+    return Damaged(begin - size, 1, begin) if begin > size else Damaged()

@@ -67,7 +67,7 @@ _OF_DAY = re.compile(
     r"(?: ?(?:Z|UTC|[-+]\d\d:?\d\d))?",
     re.ASCII,
 )
-_DAY_S = 86400.0
+_DAY_S = units.factor("day", "s")
 #: Stamp that a serial monitor puts before a line.
 _MONITOR = re.compile(r"(\d\d:\d\d:\d\d\.\d{1,6}) -> ", re.ASCII)
 #: Bytes that are no text, as they are decoded: a zero, and what is no UTF-8.
@@ -145,7 +145,7 @@ class TextReader:
         if len(cells) == len(headings) + 1 and not cells[-1].strip():
             headings.append("")  # a separator ends each row
         self.keys = [self._heading(cell, number, place) for place, cell in enumerate(headings)]
-        self.first = [cell.strip(' "') for cell in self._cells(self._batch[0])]
+        self.first = [cell.strip(_QUOTED) for cell in self._cells(self._batch[0])]
 
     @property
     def skipped(self) -> int:
@@ -243,15 +243,17 @@ class TextReader:
             return batch
         again = {line for line in set(batch) if line.strip() in self._heads} if self._heads else set()
         if again:
-            at = next(place for place, line in enumerate(batch) if line in again)
-            note(f"{self.path}: line {self._row + before + at} repeats the header: the log goes on there")
-            self.restarts.append(before + at)
+            first = next(place for place, line in enumerate(batch) if line in again)
+            note(f"{self.path}: line {self._row + before + first} repeats the header: the log goes on there")
+            self.restarts.append(before + first)
             batch, count = [line for line in batch if line not in again], len(batch)
             self._row += count - len(batch)
         if self._only is not None:
             place, cell = self._only
             batch = [
-                line for line in batch if len(cells := self._cells(line)) <= place or cells[place].strip(' "') == cell
+                line
+                for line in batch
+                if len(cells := self._cells(line)) <= place or cells[place].strip(_QUOTED) == cell
             ]
         return batch
 
@@ -294,16 +296,16 @@ class TextReader:
 
     def _separated(self, header: str, row: str, number: int) -> str:
         """The separator of columns: the one sign of the header that splits the first row in as many cells."""
-        found = [sign for sign in _SEPARATORS if sign in header]
-        if len(found) > 1:
-            fitting = [sign for sign in found if row.count(sign) == header.count(sign)]
+        present = [sign for sign in _SEPARATORS if sign in header]
+        if len(present) > 1:
+            fitting = [sign for sign in present if row.count(sign) == header.count(sign)]
             if len(fitting) != 1:
-                signs = " or ".join(_SEPARATORS[sign] for sign in found)
+                signs = " or ".join(_SEPARATORS[sign] for sign in present)
                 raise UserError(f"{self.path}: line {number}: {signs} could separate the columns: keep one of them")
-            found = fitting
-        if not found and 1 < len(_words(header)) == len(row.split()):
+            present = fitting
+        if not present and 1 < len(_words(header)) == len(row.split()):
             return " "
-        return found[0] if found else ","
+        return present[0] if present else ","
 
     def _cells(self, line: str) -> list[str]:
         if self._separator == "," and _THOUSANDS.search(line):
@@ -313,7 +315,6 @@ class TextReader:
     def _stated(self, headings: list[str]) -> list[str]:
         """The headings with the units that the cells of the first row have after their numbers: `0.02 sec`."""
         cells = self._cells(self._batch[0])
-        self._ending = {}
         for place, (heading, cell) in enumerate(zip(headings, cells, strict=False)):
             match = _WITH_UNIT.fullmatch(cell)
             if match is not None and units.known(unit := units.plain(match[1])) and not set("[(") & set(heading):
@@ -376,7 +377,7 @@ class TextReader:
         parts: list[list[NDArray[np.float64]] | None],
     ) -> NDArray[np.float64]:
         """The slow exact way, or the first fault. An optional column that fails leaves `parts`."""
-        found: list[list[float]] = []
+        rows: list[list[float]] = []
         for number, line in enumerate(lines):
             try:
                 cells = self._row_of(line)
@@ -391,7 +392,7 @@ class TextReader:
                     else:
                         value = self._value(cells[column], place, dated=place == time)
                     values.append(value)
-                found.append(values)
+                rows.append(values)
             except _Bad as bad:
                 if not self._skip_bad:
                     self._fail(row + number, None if bad.place is None else names[bad.place][1], bad.what)
@@ -403,7 +404,7 @@ class TextReader:
                         f"{self.path}: line {self._row + row + number}: {len(self._skipped)} lines so far are no rows "
                         f"of its columns; this one: {bad.what}"
                     ) from None
-        table = np.array(found, np.float64).reshape(len(found), len(index))
+        table = np.array(rows, np.float64).reshape(len(rows), len(index))
         return table[:, [place for place in range(len(index)) if parts[place] is not None]]
 
     def _optional(self, cell: str, place: int, parts: list[list[NDArray[np.float64]] | None]) -> float:
@@ -446,7 +447,7 @@ class TextReader:
 
     def _date(self, cell: str) -> float:
         """Seconds since the first date. Raises ValueError, and TypeError where one has a zone and the other has not."""
-        cell = cell.strip(' "')
+        cell = cell.strip(_QUOTED)
         if not _ISO.fullmatch(cell):
             return self._since_first(cell)
         moment = datetime.fromisoformat(cell)
@@ -514,16 +515,16 @@ def _bare(line: str) -> str:
 
 def _words(line: str) -> list[str]:
     """The headings between blanks: a unit in brackets may stand apart, and have blanks in it."""
-    found: list[list[str]] = []
+    headings: list[list[str]] = []
     within = False
     for word in line.split(None, 8 * MOST_COLUMNS):  # the rest of a longer line is one word
-        if found and (within or word[0] in "[("):
-            found[-1].append(word)
+        if headings and (within or word[0] in "[("):
+            headings[-1].append(word)
         else:
-            found.append([word])
+            headings.append([word])
         opened, closed = max(word.rfind("["), word.rfind("(")), max(word.rfind("]"), word.rfind(")"))
         within = opened > closed or (within and closed < 0)
-    return [" ".join(words) for words in found]
+    return [" ".join(words) for words in headings]
 
 
 def _with_signs(text: str) -> str:
@@ -539,7 +540,7 @@ def _with_signs(text: str) -> str:
 def is_row(line: str) -> bool:
     """Whether most cells of a line are numbers."""
     for sign in (*_SEPARATORS, " "):
-        cells = [cell.strip(' "') for cell in line.split(None if sign == " " else sign, MOST_COLUMNS)]
+        cells = [cell.strip(_QUOTED) for cell in line.split(None if sign == " " else sign, MOST_COLUMNS)]
         if len(cells) > 1 and sum(_NUMBER.fullmatch(cell) is not None for cell in cells) > len(cells) / 2:
             return True
     return False
@@ -550,14 +551,14 @@ def _is_header(line: str, after: Sequence[str], knows: Callable[[Sequence[str]],
     for sign in (*_SEPARATORS, " "):
         if sign != " " and line.count(sign) > MOST_COLUMNS:
             continue
-        cells = [cell.strip(' "') for cell in (_words(line) if sign == " " else line.split(sign))]
+        cells = [cell.strip(_QUOTED) for cell in (_words(line) if sign == " " else line.split(sign))]
         if len(cells) > MOST_COLUMNS or max(map(len, cells), default=0) > LONGEST_HEADING:
             continue
         if any(_NUMBER.fullmatch(cell) for cell in cells) or not knows(cells):
             continue
         row = [cell for line in after for cell in (line.split() if sign == " " else line.split(sign))]
         same = len(row) == len(cells) or (len(row) == len(cells) - 1 and cells[-1].lower() == _COMMENT_OF_ROWS)
-        if not after or (same and any(_ROW.fullmatch(cell.strip(' "')) for cell in row)):
+        if not after or (same and any(_ROW.fullmatch(cell.strip(_QUOTED)) for cell in row)):
             return True
     return False
 
@@ -567,7 +568,7 @@ def _with_units(line: str, after: Sequence[str]) -> str:
     for sign in (*_SEPARATORS, " "):
         names, stated = (
             [cell.strip(signs) for text in lines for cell in text.split(None if sign == " " else sign)]
-            for lines, signs in (([line], ' "'), (after, ' "[]'))
+            for lines, signs in (([line], _QUOTED), (after, ' "[]'))
         )
         if len(names) != len(stated) or not 1 < len(names) <= MOST_COLUMNS or max(map(len, stated)) > LONGEST_HEADING:
             continue
@@ -609,7 +610,7 @@ def _opened(path: Path, files: ExitStack) -> tuple[BinaryIO, int]:
         raise UserError(f"{path}: the file is empty")
     size = path.stat().st_size
     console = Console(stderr=True)
-    if size > (1 << 26) and console.is_terminal:
+    if size > BLOCK_BYTES and console.is_terminal:
         progress = wrap_file(raw, size, description="reading", console=console, transient=True)
         raw = files.enter_context(progress)
     if path.suffix.lower() == ".gz":
@@ -621,19 +622,6 @@ def _of_no_text(path: Path, line: int, sign: str) -> str:
     return f"{path}: line {line}: not text (byte 0x{ord(sign) & 0xFF:02x}); it must be UTF-8, or UTF-16 with its mark"
 
 
-class _Wide:
-    """The bytes of a text in UTF-16 as UTF-8. What is no text stays so; half a sign at the end is cut off."""
-
-    def __init__(self, stream: BinaryIO | _Wide, begin: bytes) -> None:
-        self._stream, self._begin = stream, begin
-        self._decoder = codecs.getincrementaldecoder(_WIDE[begin])("surrogatepass")
-
-    def read(self, size: int) -> bytes:
-        """Up to some `size` bytes; none at the end alone."""
-        block, self._begin = self._begin + self._stream.read(size // 2), b""
-        return self._decoder.decode(block).encode("utf-8", "surrogatepass")
-
-
 class _Lines:
     """The lines of a text, a block at a time. `number`: lines before the last block; `rest`: not used yet, of it.
 
@@ -641,7 +629,7 @@ class _Lines:
 
     def __init__(self, path: Path, stream: BinaryIO, packed: int, skip_bad: bool) -> None:
         self.path = path
-        self.stream: BinaryIO | _Wide = stream
+        self.stream: BinaryIO | codecs.StreamRecoder = stream
         self.number, self.rest, self.unfinished = 0, list[str](), False
         self._carry, self._next, self._start = b"", 0, True
         #: Lines end with CR alone, as on old Macs.
@@ -697,21 +685,21 @@ class _Lines:
             begin = self.stream.read(2)
             if begin not in _WIDE:
                 return begin + self.stream.read(BLOCK_BYTES)
-            self.stream = _Wide(self.stream, begin)
+            self.stream = codecs.EncodedFile(self.stream, "utf-8", _WIDE[begin], "surrogatepass")
         return self.stream.read(BLOCK_BYTES)
 
     def _text(self, data: bytes) -> str:
-        skip = 3 if self._start and data.startswith(b"\xef\xbb\xbf") else 0
+        alphabet = "utf-8-sig" if self._start else "utf-8"
         try:
-            text, self.no_text = data[skip:].decode("utf-8"), b"\0" in data
+            text, self.no_text = data.decode(alphabet), b"\0" in data
         except UnicodeDecodeError:
-            text = data[skip:].decode("utf-8", "surrogateescape")
+            text = data.decode(alphabet, "surrogateescape")
             if self._start:
                 text = _with_signs(text)
             self.no_text = _NO_TEXT.search(text) is not None
         if self.no_text and not self._skip_bad:
-            found = _NO_TEXT.search(text)
-            assert found is not None
-            raise UserError(_of_no_text(self.path, self._next + text.count("\n", 0, found.start()) + 1, found[0]))
+            fault = _NO_TEXT.search(text)
+            assert fault is not None
+            raise UserError(_of_no_text(self.path, self._next + text.count("\n", 0, fault.start()) + 1, fault[0]))
         self._start = False
         return text

@@ -86,7 +86,7 @@ class TextTable(Table):
 
 def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Table]:
     """The tables of a text, or of the texts in a zip: one for each sensor whose rows take turns. Raises UserError."""
-    found: list[Table] = []
+    tables: list[Table] = []
     for text in texts_in(path):
         try:
             with ExitStack() as files:
@@ -100,20 +100,20 @@ def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Tab
         meta = parse_meta(beside, read_text(beside, MOST_META_BYTES, "not a JSON text")) if beside.is_file() else {}
         for only in turns or (None,):
             source = "/".join(wanted for wanted in (text.source, ":".join(only or ())) if wanted)
-            found.append(
+            tables.append(
                 TextTable(
                     source, {}, meta, name=text.name, headings=reader.keys, before=reader.before, line=reader.where,
                     first=reader.first, text=text, knows=knows, skip_bad=skip_bad, only=only,
                 )
             )  # fmt: skip
-    return found
+    return tables
 
 
 def texts_in(path: Path) -> list[Text]:
     """The texts of a file. Raises UserError."""
     if path.suffix.lower() != ZIP:
         return [Text(path, path.name)]
-    found = []
+    texts = []
     with reading(path, "not a whole zip file"), zipfile.ZipFile(path) as archive:
         listed = archive.infolist()
         if sum(info.compress_size for info in listed) > path.stat().st_size:
@@ -122,15 +122,15 @@ def texts_in(path: Path) -> list[Text]:
             name = PurePosixPath(info.filename)
             if name.suffix.lower() in TEXT and "meta" not in (part.lower() for part in name.parts[:-1]):
                 label = path / printable(info.filename)
-                found.append(Text(label, name.name, name.stem, optional=True, open=_opener(path, info)))
-    if len(found) > MOST_COLUMNS:
+                texts.append(Text(label, name.name, name.stem, optional=True, open=_opener(path, info)))
+    if len(texts) > MOST_COLUMNS:
         raise UserError(f"{path}: more than {MOST_COLUMNS} tables")
     for names in _BETTER:
-        there = [name for name in names if any(wanted.source.lower() == name for wanted in found)]
-        found = [wanted for wanted in found if wanted.source.lower() not in there[1:]]
-    if not found:
+        there = [name for name in names if any(wanted.source.lower() == name for wanted in texts)]
+        texts = [wanted for wanted in texts if wanted.source.lower() not in there[1:]]
+    if not texts:
         raise UserError(f"{path}: no table ({', '.join(TEXT)}) is in the zip")
-    return found
+    return texts
 
 
 def _opener(path: Path, info: zipfile.ZipInfo) -> Opened:

@@ -70,17 +70,17 @@ def _ends(data: Bytes) -> Callable[[int], int]:
     formats: dict[bytes, bytes] = {}
     lengths: dict[bytes, tuple[int, int]] = {}
 
-    def end_of(at: int) -> int:
-        length, kind, end = int.from_bytes(data[at : at + 2], "little"), data[at + 2 : at + 3], 0
-        if kind and kind in _KINDS and 0 < length <= len(data) - at - 3:
-            end = at + 3 + length
+    def end_of(begin: int) -> int:
+        length, kind, end = int.from_bytes(data[begin : begin + 2], "little"), data[begin + 2 : begin + 3], 0
+        if kind and kind in _KINDS and 0 < length <= len(data) - begin - 3:
+            end = begin + 3 + length
         if end and kind == b"D":
-            return end if length in lengths.get(data[at + 3 : at + 5], ()) else 0
+            return end if length in lengths.get(data[begin + 3 : begin + 5], ()) else 0
         if end and kind == b"F":
-            name, _, fields = data[at + 3 : end].partition(b":")
+            name, _, fields = data[begin + 3 : end].partition(b":")
             formats[name] = fields
         elif end and kind == b"A":
-            lengths[data[at + 4 : at + 6]] = _lengths(data[at + 6 : end], formats, {})
+            lengths[data[begin + 4 : begin + 6]] = _lengths(data[begin + 6 : end], formats, {})
         return end
 
     return end_of

@@ -19,8 +19,6 @@ from selfcal.studies.methods.recursive import FORGET, KEEP
 
 #: The parameters stay within this many sd of the prior's mean: a poor first step leads no further.
 REACH = 3.0
-#: Least square with a logarithm, a part of the innovation variance.
-LEAST = 1e-12
 ROW = np.ones(2)
 
 
@@ -53,7 +51,7 @@ def _run(problem: Problem, law: str) -> dict[str, Value]:
         e, de = value - float(x @ ROW), -dx @ ROW
         seen = np.array([-de, dS / S])
         # Less the mean of ln chi^2 of one degree of freedom.
-        surprise = np.array([e, math.log(max(e * e / S, LEAST)) + 1.270363])
+        surprise = np.array([e, math.log(e * e / S + np.finfo(float).eps) + 1.270363])
         # With the variance of that ln chi^2.
         total = seen @ covariance @ seen.T + np.diag([S, (0.5 * math.pi**2)])
         gain = np.linalg.solve(total, seen @ covariance).T

@@ -26,13 +26,13 @@ def grid(problem: Problem) -> Answer:
     ln_evidence: dict[str, float] = {}
     estimates: dict[str, dict[str, Value]] = {}
     for law in problem.laws:
-        at, ln_weight = nodes(problem, law)
+        nodes_at, ln_weight = nodes(problem, law)
         top = float(ln_weight.max())
         weight = np.exp(ln_weight - top)
         ln_evidence[law] = top + math.log(float(weight.sum()))
         weight /= weight.sum()
         estimates[law] = {}
-        for name, ln_value in zip(NAMED[law].parameters, at, strict=True):
+        for name, ln_value in zip(NAMED[law].parameters, nodes_at, strict=True):
             values, index = np.unique(ln_value, return_inverse=True)
             low, high = weighted_quantiles(values, np.bincount(index, weight), (0.05, 0.95))
             estimates[law][name] = Value(math.exp(float(weight @ ln_value)), math.exp(low), math.exp(high))

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable
 
 import numpy as np
+from scipy import optimize
 from statsmodels.tsa.statespace.structural import UnobservedComponents
 
 from selfcal.model.laws import NAMED
@@ -49,7 +49,7 @@ def _continuous(law: str, fitted: Floats, covariance: Floats, scale: float, dt_s
         variance, phi = p[1], p[2]
         return np.array([N, 0.5 * _ln(variance * scale**2 / (1.0 - phi**2)), _ln(-_ln(phi) / dt_s)])
 
-    slope = _derivative(ln_of, fitted)
+    slope = np.atleast_2d(optimize.approx_fprime(fitted, ln_of, 1e-5 * np.abs(fitted) + 1e-12))
     return {
         name: value if math.isfinite(value.value) and value.value > 0.0 else Value(math.nan)
         for name, value in logarithmic(NAMED[law].parameters, ln_of(fitted), slope @ covariance @ slope.T).items()
@@ -59,8 +59,3 @@ def _continuous(law: str, fitted: Floats, covariance: Floats, scale: float, dt_s
 def _ln(value: float) -> float:
     """NaN of what has no logarithm: the method has no answer then."""
     return math.log(value) if value > 0.0 else math.nan
-
-
-def _derivative(function: Callable[[Floats], Floats], theta: Floats) -> Floats:
-    steps = np.diag(1e-5 * np.abs(theta) + 1e-12)
-    return np.array([(function(theta + s) - function(theta - s)) / (2.0 * s.sum()) for s in steps]).T

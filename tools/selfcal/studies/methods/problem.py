@@ -124,8 +124,8 @@ def logarithmic(names: Sequence[str], ln_value: Floats, covariance: Floats) -> d
     for k, name in enumerate(names):
         variance = float(covariance[k, k])
         half = HALF_90 * math.sqrt(variance) if variance > 0.0 else math.nan
-        ln = float(ln_value[k])
-        values[name] = Value(_exp(ln), _exp(ln - half), _exp(ln + half))
+        with np.errstate(over="ignore"):
+            values[name] = Value(*np.exp(ln_value[k] + np.array([0.0, -half, half])).tolist())
     return values
 
 
@@ -147,10 +147,6 @@ def ln_moments(prior: Prior) -> tuple[float, float]:
 def root(square: float) -> Value:
     """NaN of a negative square: the method has no answer then."""
     return Value(math.sqrt(float(square)) if square > 0.0 else math.nan)
-
-
-def _exp(ln: float) -> float:
-    return math.exp(ln) if ln < 700.0 else math.inf
 
 
 def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> Peak:

@@ -19,6 +19,7 @@ from selfcal.batch.spread import Row, spread
 from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import make_tables
+from selfcal.readings.budget import FALSE_ALARM
 from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import curve, fit
 from selfcal.studies.methods.problem import Problem
@@ -32,8 +33,6 @@ MARKS = (10, 20, 50, 100, 150, 200, 250, 300, 350, 400, 450, 500, 550, 600, 1000
 BELOW, TEXT_S = 0.10, 1000
 #: The law that Fig. 2 is of, and the end of its axis.
 SECOND, FIGURE_2_S = "gauss_markov", 400
-#: Probability that curves which coincide are said to differ.
-FALSE_ALARM = 0.01
 NAMES = {"sigma_m": "σm, deg/s", "alpha": "α, 1/s", "N": "σv, deg/s"}
 #: Figs 3, 4: the record of each law, whose drifts have the same steps at short times (K^2 = 2 alpha sigma_m^2).
 ALIKE = {

@@ -248,9 +248,9 @@ def figures_5_and_6(model: Model, records: Mapping[str, Array], real_ones: bool,
     errors = linear(model, truth, seed + 17)
     rms_figures, said = [], []
     for letter, (name, (unit, scale, _)) in zip("cd", SHOWN.items(), strict=True):
-        rms, at = errors[name], np.array(ALLAN_MARKS, dtype=float)
-        real_rms = Curve(f"real (16), {SCATTER} records", at, rms.real / scale, "dots")
-        their_rms = Curve("computed (17), the same records", at, rms.computed / scale, "fitted")
+        rms, marks = errors[name], np.array(ALLAN_MARKS, dtype=float)
+        real_rms = Curve(f"real (16), {SCATTER} records", marks, rms.real / scale, "dots")
+        their_rms = Curve("computed (17), the same records", marks, rms.computed / scale, "fitted")
         panels = [
             Panel(
                 title,
