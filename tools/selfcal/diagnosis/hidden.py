@@ -31,6 +31,7 @@ from selfcal.likelihood.joint import (
     bins_of,
     course,
     fitted,
+    refitted,
     without_each,
     without_lines,
     without_pairs,
@@ -73,18 +74,15 @@ class Hidden:
 
     @cached_property
     def gain(self) -> float:
-        """Nats by the quantity."""
-        return self.course.ln_likelihood - course(self.null, self.y).ln_likelihood
+        """Nats by the quantity with its jumps."""
+        rest = self.y - np.outer(self.model.loading, self.jumped[1])
+        return course(self.model, rest).ln_likelihood - course(self.null, self.y).ln_likelihood
 
     @property
     def net(self) -> float:
         """`gain` net of the search."""
-        return net(self.gain, len(self.names) + 1, LN_EITHER)
-
-    @cached_property
-    def course(self) -> Course:
-        """Filter and smoother of the model with the quantity."""
-        return course(self.model, self.y, smooth=True)
+        count = len(self.jumps)
+        return net(self.gain, len(self.names) + 1 + count, LN_EITHER + count * math.log(self.y.shape[1]))
 
     @cached_property
     def halves(self) -> tuple[tuple[Joint, Course], tuple[Joint, Course]]:
@@ -109,12 +107,13 @@ class Hidden:
         return float(self.model.share(1.0 / self.model.rate)[self.names.index(name)])
 
     @cached_property
-    def jumps(self) -> list[dict[str, float]]:
-        """Jumps beyond the quantity's own wandering, in time: `time_s`, `size` in its unit, `evidence_nats`."""
-        y, found, seen = self.y, [], self.course
-        t = np.arange(y.shape[1])
+    def jumped(self) -> tuple[list[dict[str, float]], Array]:
+        """Jumps beyond the quantity's own wandering: `time_s`, `size` in its unit, `evidence_nats`; and what they make
+        of it [k]."""
+        found, course_of = list[dict[str, float]](), np.zeros(self.y.shape[1])
+        t = np.arange(course_of.size)
         for _ in range(JUMPS):
-            score, known = seen.of_f.T
+            score, known = course(self.model, self.y - np.outer(self.model.loading, course_of), smooth=True).of_f.T
             gains = 0.5 * score**2 / np.maximum(known, 1e-300)
             gains[: max(3, gains.size // 200)] = 0.0
             at = int(np.argmax(gains))
@@ -122,9 +121,17 @@ class Hidden:
                 break
             size = float(score[at] / known[at])
             found.append({"time_s": at * self.dt, "size": size / self.step, "evidence_nats": float(gains[at])})
-            y = y - np.outer(self.model.loading, np.where(t >= at, size * np.exp(-self.model.rate * (t - at)), 0.0))
-            seen = course(self.model, y, smooth=True)
-        return sorted(found, key=lambda jump: jump["time_s"])
+            course_of += np.where(t >= at, size * np.exp(-self.model.rate * (t - at)), 0.0)
+        return sorted(found, key=lambda jump: jump["time_s"]), course_of
+
+    @property
+    def jumps(self) -> list[dict[str, float]]:
+        return self.jumped[0]
+
+    def calm(self) -> Hidden:
+        """The quantity by its law without its jumps, which would count as steps of its wandering."""
+        rest = self.y - np.outer(self.model.loading, self.jumped[1])
+        return replace(self, model=refitted(self.model, rest, self.dt)) if self.jumps else self
 
     def on(self, state: State) -> On:
         """What it does to an axis, by the quantity as the other axes show it."""
@@ -165,7 +172,8 @@ class Hidden:
         found = {}
         for name in self.names:
             others = [k for k, other in enumerate(self.names) if other != name]
-            found[name] = course(self.model.of(others), self.y[others], smooth=True).f
+            rest = self.y[others] - np.outer(self.model.loading[others], self.jumped[1])
+            found[name] = course(self.model.of(others), rest, smooth=True).f + self.jumped[1]
         return found
 
     @cached_property

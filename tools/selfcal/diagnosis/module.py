@@ -775,7 +775,7 @@ def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
         y = np.where(np.isfinite(search.rest), y, np.nan) - sum(candidate.effect for candidate in search.several)
         model = refitted(search.model, y, span)
-        of = Hidden(tuple(found), model, y, scale, span)
+        of = Hidden(tuple(found), model, y, scale, span).calm()
     return Module(tuple(found), span, tuple(search.several), of, scale)
 
 
