@@ -103,7 +103,7 @@ def side_looks(state: State, record: Record, cause: str) -> list[Look]:
 
 
 def side_at(state: State, record: Record, cause: str, theta: Sequence[float]) -> Look:
-    """The look at a side channel that is known to act, in the form `theta`: its place in FORMS, and its number or the
+    """The look at a side channel that is known to act, in the form `theta`: its place in FORMS, its number, and the
     width of its means, s."""
     shape = shape_of(_side(record, cause), state, FORMS[int(theta[0])], *theta[1:])
     found = columns.located(state, cause, shape)
