@@ -455,6 +455,30 @@ def test_error_values_of_a_channel_are_no_readings(tmp_path: Path, capsys: pytes
     assert "temp: 40 of 4000 readings are far from all others, the first 85: left out" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(("rows", "step"), [(40, 30), (500, 400), (40, 20), (100, 97)])
+def test_batches_that_repeat_the_end_of_the_last_one(tmp_path: Path, rows: int, step: int) -> None:
+    """A logger that writes a window again is refused; --skip-bad has each row once, at the rate that it was read at."""
+    random = np.random.default_rng(rows)
+    gx = np.round(random.standard_normal(6000), 2)
+    places = np.concatenate([np.arange(k, min(k + rows, gx.size)) for k in range(0, gx.size - rows + step, step)])
+    text = "".join(f"{0.05 * k:.3f},{gx[k]:.2f}\n" for k in places)
+    log = written(tmp_path, b"t[s],gx[deg/s]\n" + text.encode())
+    with pytest.raises(UserError, match="an earlier row is written again: --skip-bad leaves those out"):
+        load(log)
+    recording = load(log, skip_bad=True)
+    assert recording.rate_hz == pytest.approx(20.0, rel=1e-6)  # the printed digits
+    np.testing.assert_array_equal(recording.columns["gx"].values, gx)
+    assert not recording.missing_before.any()
+
+
+def test_a_counter_that_wraps_may_repeat_a_row(tmp_path: Path) -> None:
+    """Stamps of 16 bits at a rate that divides them come again, and coarse readings with them by chance."""
+    gx = np.round(2.0 * np.random.default_rng(2).standard_normal(40_000))
+    text = "".join(f"{8 * k % 65536},{value:.0f}\n" for k, value in enumerate(gx))
+    recording = load(written(tmp_path, b"t[ms],gx[deg/s]\n" + text.encode()))
+    np.testing.assert_array_equal(recording.columns["gx"].values, gx)
+
+
 def test_damaged_meta_beside_a_csv(tmp_path: Path) -> None:
     path = written(tmp_path, ROWS)
     beside = tmp_path / "log.csv.meta.json"

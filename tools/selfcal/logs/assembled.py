@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -67,7 +67,7 @@ def assembled(rows: Rows, header: Header) -> Recording:
         return _on_clocks(rows, rate, columns, count, None, header)
     if header.written and np.isfinite(stamps.values).all():
         return _as_written(rows, columns, units.convert(stamps.values, stamps.unit, "s"), header)
-    ordered, kept = _ordered(rows, stamps, part, header)
+    ordered, kept = _ordered(rows, stamps, part, columns, header)
     if kept.size < count or (np.diff(kept) < 0).any():
         columns = {name: replace(column, values=column.values[kept]) for name, column in columns.items()}
     return _on_clocks(rows, header.rate, columns, kept.size, ordered, header)
@@ -94,7 +94,9 @@ def _tame(column: Column, header: Header) -> Column:
     return replace(column, values=left)
 
 
-def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header) -> tuple[_Stamps, Places]:
+def _ordered(
+    rows: Rows, stamps: Column, part: Column | None, columns: Mapping[str, Column], header: Header
+) -> tuple[_Stamps, Places]:
     """The stamps in their order, and the rows of the table that they are of. `part`: what is added to the stamps. With
     `skip_bad` rows with a damaged stamp are left out, rows out of order are sorted."""
     mend = header.asked.skip_bad
@@ -103,6 +105,10 @@ def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header) ->
     unknown = stamps.values.size - known.size
     if unknown and not (mend and few(unknown, stamps.values.size)):
         rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
+    twice = _twice([stamps.values[known], *(column.values[known] for column in columns.values())])
+    if twice.size and not mend:
+        rows.fail(int(known[twice[0]]), number, "an earlier row is written again: --skip-bad leaves those out")
+    known = np.delete(known, twice)
     values = _at(stamps.values, known)
     tick_s = units.factor(stamps.unit, "s") * rows.fields[number].lsb
     since = units.convert(values - values[0], stamps.unit, "s")
@@ -112,7 +118,9 @@ def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header) ->
     kept = known[order.rows]
     if unknown:
         header.notes.append(f"{unknown} line{'s were' if unknown > 1 else ' was'} skipped, without a time stamp")
-    header.damaged += Damaged(0, order.damaged + unknown)
+    if twice.size:
+        header.notes.append(f"{twice.size} rows that were written again are left out")
+    header.damaged += Damaged(0, order.damaged + unknown + twice.size)
     header.notes += order.notes
     return (
         _Stamps(
@@ -123,6 +131,19 @@ def _ordered(rows: Rows, stamps: Column, part: Column | None, header: Header) ->
         ),
         kept,
     )
+
+
+def _twice(columns: Sequence[Floats]) -> Places:
+    """Rows of columns [n], their stamps first, that are an earlier one to the bit, where stamps fall. None where most
+    rows that come late are others: a counter that wraps has some by chance."""
+    time, none = columns[0], np.empty(0, np.int64)
+    if not (np.diff(time) < 0.0).any():
+        return none
+    table = np.ascontiguousarray(np.column_stack(columns))
+    _, first = np.unique(table.view(np.dtype((np.void, table.strides[0]))), return_index=True)
+    again = np.setdiff1d(np.arange(len(table)), first)
+    late = np.count_nonzero(time[1:] <= np.maximum.accumulate(time)[:-1])
+    return again if 2 * again.size > late else none
 
 
 def _as_written(rows: Rows, columns: Mapping[str, Column], t: Floats, header: Header) -> Recording:
