@@ -282,11 +282,14 @@ class Model:
         return tuple(dict.fromkeys((*SENSORS, *self.axes)))
 
     @property
-    def left_out(self) -> str:
-        """Regressors that a bank leaves out, in words; "" for none."""
+    def left_out(self) -> list[str]:
+        """What a bank leaves out, in words."""
         names = ", ".join(regressor.name for regressor in self.beyond)
         said = f"a bank has {MOST_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
-        return f"{self.path}: {said}" if names else ""
+        beyond = [f"{self.path}: {said}"] if names else []
+        if self.hidden_input is None:
+            return beyond
+        return [*beyond, f"{self.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"]
 
     def group_of(self, axis: str) -> Group:
         """The group of an axis, with its own priors. Raises UserError for an axis the model does not have."""

@@ -107,7 +107,8 @@ def identify(
     if decimate is not None and not (math.isfinite(decimate) and decimate > 0.0):
         raise UserError("--decimate must be a rate above 0 Hz")
     loaded_model = Model.load(model)
-    say_once(loaded_model.left_out)
+    for text in loaded_model.left_out:
+        say_once(text)
     bounds = None if limits is None else Limits.load(limits, loaded_model)
     recording = shared.looked_at(log, loaded_model, since_power_on_s, gate, reading)
     names = chosen_axes(recording, loaded_model, [axes] if isinstance(axes, str) else axes)

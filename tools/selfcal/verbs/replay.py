@@ -73,7 +73,8 @@ def replay(
     check_picture(plot)
     check_writable(json, plot, inputs=(*list_of(log), model, start))
     loaded_model = Model.load(model)
-    say_once(loaded_model.left_out)
+    for text in loaded_model.left_out:
+        say_once(text)
     known = None if start is None else load_start(start, loaded_model)
     recording = load(log, sensors=loaded_model.sensors, **reading)
     recording = recording.later(since_power_on_s)

@@ -59,10 +59,7 @@ def bank_bytes(tables: Tables, axes: int = 0) -> int:
 
 def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
     """Parts of the model that have no effect."""
-    if model.left_out:
-        yield model.left_out
-    if model.hidden_input is not None:
-        yield f"{model.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"
+    yield from model.left_out
     measured = {name for name, axis in model.simulate.get("axes", {}).items() if "hypothesis" in axis}
     if measured and (others := [axis.name for axis in tables.axes if axis.name not in measured]):
         yield f"{model.path}: wide priors, without a result in the file: {', '.join(others)}"
