@@ -289,7 +289,8 @@ class Model:
         beyond = [f"{self.path}: {said}"] if names else []
         if self.hidden_input is None:
             return beyond
-        return [*beyond, f"{self.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"]
+        of_one = f"{self.path}: `hidden_input` is left out: a bank is of one axis, whose law has the whole drift"
+        return [*beyond, of_one]
 
     def group_of(self, axis: str) -> Group:
         """The group of an axis, with its own priors. Raises UserError for an axis the model does not have."""
