@@ -172,6 +172,31 @@ def test_a_source_that_no_pair_shows_is_a_leak(tmp_path: Path) -> None:
     assert len(leak["axes"]) >= 3
 
 
+@pytest.mark.parametrize("beside_f", [False, True])
+def test_a_source_with_a_strong_drift_is_no_hidden_quantity(tmp_path: Path, *, beside_f: bool) -> None:
+    """gx leaks 0.35 and 0.2 of its readings into two axes, K/N 0.1; beside a quantity that moves all six by 0.05 N a
+    second the loadings hold the truth within 4 sd. A model that states the leak leaves nothing of it in its record."""
+    random = np.random.default_rng([15, beside_f])
+    n = 7200
+    names = ("gx", "gy", "gz", "ax", "ay", "az")
+    f = np.cumsum(0.05 * random.standard_normal(n)) if beside_f else np.zeros(n)
+    axes = {
+        name: random.standard_normal(n) + drift(random, n, 0.03 if beside_f or name != "gx" else 0.1) + f
+        for name in names
+    }
+    axes |= {name: axes[name] + share * axes["gx"] for name, share in (("gy", 0.35), ("ax", 0.2))}
+    log, model = written(tmp_path, axes), tmp_path / "model.yaml"
+    found = {finding["cause"]: finding for finding in diagnose(log, write_model=model)["findings"]}
+    assert set(found) == {"cross_axis", "hidden_input"} if beside_f else {"cross_axis"}
+    assert found["cross_axis"]["estimate"]["other"] == "gx"
+    assert set(found["cross_axis"]["axes"]) == {"gy", "ax"}
+    assert diagnose(log, model=model)["findings"] == []
+    if beside_f:
+        sizes = [axis["estimate"]["loading"] for axis in found["hidden_input"]["axes"].values()]
+        assert len(sizes) == 6
+        assert all(abs(size["mean"] - 0.05) < 4.0 * size["sd"] for size in sizes)
+
+
 def test_a_leak_is_no_common_source(tmp_path: Path) -> None:
     """The drift of the other axis leaks as well; of a common source each axis has a drift of its own. Of 100 modules
     one has a finding by chance: two of eight have a probability of 0.3 %."""

@@ -79,6 +79,24 @@ def test_loadings_and_share_are_those_drawn() -> None:
     assert 25.0 < 1.0 / found.model.rate < 150.0
 
 
+@pytest.mark.parametrize("seed", [33, 34])
+def test_jumps_are_no_steps_of_its_law(seed: int) -> None:
+    """A walk with three jumps of 40 of its steps: their square would make its law 1.5 times too large in 3600 s. A
+    loading is known to 0.15 of its size, the mean of six to 0.06, a jump to 0.1: three times that is allowed."""
+    random = np.random.default_rng(seed)
+    truth = random.uniform(0.04, 0.07, 6)
+    f, places = np.cumsum(random.normal(size=3600)), (900, 1900, 2700)
+    for place, size in zip(places, (40.0, -40.0, 40.0), strict=True):
+        f[place:] += size
+    seen = module.together(states(drawn(random, 6, 3600) + np.outer(truth, f)), {})
+    assert seen is not None and seen.hidden is not None
+    found = seen.hidden
+    loading = np.array([found.loading(name) for name in NAMES])
+    assert abs(float(np.mean(loading / truth)) - 1.0) < 0.18
+    assert [jump["time_s"] for jump in found.jumps] == pytest.approx(places, abs=2.0)  # beside its own steps
+    assert [jump["size"] for jump in found.jumps] == pytest.approx([40.0, -40.0, 40.0], rel=0.3)
+
+
 def test_axes_of_their_own_share_nothing() -> None:
     """A record in 2000 may show something (P_LOOK): none of these may, by more than a chance of 1 in 100."""
     for seed in range(case_records(8, 100)):
