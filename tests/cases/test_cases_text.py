@@ -528,7 +528,7 @@ def test_other_faults_of_time_are_no_damaged_digits(tmp_path: Path) -> None:
     out. A block of rows written twice is refused, and left out with --skip-bad, which the message names."""
     log = tmp_path / "log.csv"
     rows = rows_of(600, 0.04, 5)
-    anew = rows + rows
+    anew = rows + rows_of(600, 0.04, 6)
     twice = rows[:300] + rows[280:]
     in_turn = [row for k, one in enumerate(rows) for row in (one, f"{5000.0 + 0.04 * k},0.1")]
     for made in (anew, twice, in_turn):

@@ -463,7 +463,7 @@ def test_batches_that_repeat_the_end_of_the_last_one(tmp_path: Path, rows: int, 
     places = np.concatenate([np.arange(k, min(k + rows, gx.size)) for k in range(0, gx.size - rows + step, step)])
     text = "".join(f"{0.05 * k:.3f},{gx[k]:.2f}\n" for k in places)
     log = written(tmp_path, b"t[s],gx[deg/s]\n" + text.encode())
-    with pytest.raises(UserError, match="an earlier row is written again: --skip-bad leaves those out"):
+    with pytest.raises(UserError, match="rows are written again, which --skip-bad leaves out"):
         load(log)
     recording = load(log, skip_bad=True)
     assert recording.rate_hz == pytest.approx(20.0, rel=1e-6)  # the printed digits

@@ -107,7 +107,8 @@ def _ordered(
         rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
     twice = _twice([stamps.values[known], *(column.values[known] for column in columns.values())])
     if twice.size and not mend:
-        rows.fail(int(known[twice[0]]), number, "an earlier row is written again: --skip-bad leaves those out")
+        what = "time runs backwards: rows are written again, which --skip-bad leaves out, and --no-time --rate HZ keeps"
+        rows.fail(int(known[twice[0]]), number, what)
     known = np.delete(known, twice)
     values = _at(stamps.values, known)
     tick_s = units.factor(stamps.unit, "s") * rows.fields[number].lsb

@@ -28,8 +28,6 @@ from scipy.fft import rfft
 from scipy.ndimage import grey_closing, uniform_filter1d
 from scipy.special import betaln, rel_entr
 
-from selfcal.base.limits import LONGEST
-
 #: Rows that decide on the law, and that show the phase of the first.
 _HEAD, _NEAR_FIRST = 4000, 512
 #: Places of a histogram in one of its cells.
@@ -58,6 +56,8 @@ _FEW, _BAND_OF_FEW = 64, (0.95, 1.4)
 _STEPS, _PIECES = 20, 500
 #: Share of an interval or a rate below which two count as one.
 SAME = 1e-6
+#: Intervals of a record at most: beyond, their number has no digits for one more.
+_LONGEST = 2.0**53
 #: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
 CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
@@ -210,7 +210,7 @@ def _stamps(time: Floats, noise_s: float) -> _Stamps:
     """Stamps with what one look shows of them. Raises Ambiguous."""
     time, steps = time - time[0], np.diff(time)
     usual = _usual(steps)
-    if not time[-1] < LONGEST * usual:
+    if not time[-1] < _LONGEST * usual:
         raise Ambiguous(f"a step of {float(steps.max()):.3g} s among others of {usual:.3g} s")
     asleep = _asleep(time, steps)
     pieces = np.linspace(0, steps.size, max(1, min(_AWAKE, steps.size // _AWAKE)) + 1).astype(int)
