@@ -13,7 +13,7 @@ variance is K^2 tau / 3 (1 + 1 / (2 m^2)) of single readings, and K^2 tau / 3 of
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -143,6 +143,10 @@ class Fit:
     allan_variance: _Floats
     variance: _Floats
     covariance: _Floats
+
+    def drawn(self, draws: Mapping[str, _Floats]) -> Iterable[Terms]:
+        """The terms at each draw [k] of the parameters."""
+        return map(self.terms_at, np.log(np.column_stack([*draws.values()])))
 
 
 def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floats], Terms]:
@@ -278,8 +282,7 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     own = np.array([relative_variance(fit.terms, length, windows) for length, _, windows in rows])
     left = np.maximum(own - shared * fit.variance, LEFT_LEAST * own)
     ratio = recorded / fit.allan_variance
-    draws = np.log(np.column_stack([*posterior_draws(estimates, fit.covariance).values()]))
-    curves = [fit.terms_at(ln_theta).allan_variance(m) for ln_theta in draws]
+    curves = [terms.allan_variance(m) for terms in fit.drawn(posterior_draws(estimates, fit.covariance))]
     low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
     return Curve(
         m * dt_s,
@@ -337,9 +340,10 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
     n = int(np.isfinite(values).sum())
     parted = np.insert(values - np.nanmean(values), np.flatnonzero(missing_before), np.nan)
-    variances, windows = zip(*(overlapping(parted, length) for length in m.tolist()), strict=True)
-    kept = (np.array(variances) > 0.0) & (np.array([whole.sum() for whole in windows]) >= m)
-    m, deviation = m[kept], np.sqrt(np.array(variances)[kept])
+    each = (overlapping(parted, length) for length in m.tolist())  # a mask of all samples each: one at a time
+    variance, count = np.array([(value, whole.sum()) for value, whole in each]).T
+    kept = (variance > 0.0) & (count >= m)
+    m, deviation = m[kept], np.sqrt(variance[kept])
     slope = np.gradient(np.log(deviation), np.log(m)) if m.size > 1 else np.full(m.size, -0.5)
     powers = np.clip(np.rint(2.0 * slope), -1.0, 1.0)
     half = np.array([0.5 * freedom_of(power, length, n) for power, length in zip(powers, m.tolist(), strict=True)])

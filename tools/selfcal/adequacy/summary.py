@@ -155,7 +155,7 @@ def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]
         white, floor = white_of(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
         side = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
     else:
-        lowest = [_minimum(fit.terms_at(ln_theta), m) for ln_theta in np.log(np.column_stack([*draws.values()]))]
+        lowest = [_minimum(terms, m) for terms in fit.drawn(draws)]
         white, (floor, side) = draws["N"], np.array(lowest, dtype=float).T
     # A Gauss-Markov drift is like a walk. Noise without a memory, or with one of the other sign, has no Q.
     none = np.zeros(white.size)

@@ -200,15 +200,15 @@ def _here(
     lost: Callable[[Job], list[Row]] | None,
 ) -> Iterator[tuple[int, list[Row]]]:
     """Each worker is a pool of its own: a dead one leaves the others at their work, and its own job is known."""
-    todo, deaths = deque(waiting), dict.fromkeys(waiting, 0)
+    queue, deaths = deque(waiting), dict.fromkeys(waiting, 0)
     with ExitStack() as stack:
         slots: dict[int, ProcessPoolExecutor] = {}
         running: dict[Future[list[Row]], tuple[int, int]] = {}
 
         def start(slot: int) -> None:
-            if not todo:
+            if not queue:
                 return
-            k = todo.popleft()
+            k = queue.popleft()
             try:
                 running[slots[slot].submit(function, waiting[k])] = slot, k
             except (KeyError, BrokenProcessPool):  # a new slot; a worker that was killed while it had nothing to do
@@ -227,7 +227,7 @@ def _here(
                     del slots[slot]
                     deaths[k] += 1
                     if deaths[k] < DEATHS:
-                        todo.appendleft(k)
+                        queue.appendleft(k)
                     elif lost is None:
                         raise UserError(_KILLED) from error
                     else:

@@ -99,8 +99,8 @@ def own_pages(
         source = devices[name][-1].source
         digest = kept.place((source.path, source.content)).stem[:12]
         jobs[name] = (str(Path(source.path).absolute()), str(pages / f"{_UNSAFE.sub('_', name)[:60]}-{digest}.html"))
-    todo = [job for job in jobs.values() if not Path(job[1]).exists()]
-    spread(partial(_paged, verbs, options), todo, count=count, lost=lambda _: [{}], verb="pages")
+    missing = [job for job in jobs.values() if not Path(job[1]).exists()]
+    spread(partial(_paged, verbs, options), missing, count=count, lost=lambda _: [{}], verb="pages")
     return {name: f"{pages.name}/{Path(job[1]).name}" for name, job in jobs.items() if Path(job[1]).exists()}
 
 

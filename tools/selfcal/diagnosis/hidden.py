@@ -75,8 +75,7 @@ class Hidden:
     @cached_property
     def gain(self) -> float:
         """Nats by the quantity with its jumps."""
-        rest = self.y - np.outer(self.model.loading, self.jumped[1])
-        return course(self.model, rest).ln_likelihood - course(self.null, self.y).ln_likelihood
+        return course(self.model, self.rest).ln_likelihood - course(self.null, self.y).ln_likelihood
 
     @property
     def net(self) -> float:
@@ -128,10 +127,14 @@ class Hidden:
     def jumps(self) -> list[dict[str, float]]:
         return self.jumped[0]
 
+    @property
+    def rest(self) -> Array:
+        """The records [m, k] less the jumps."""
+        return np.asarray(self.y - np.outer(self.model.loading, self.jumped[1]))
+
     def calm(self) -> Hidden:
         """The quantity by its law without its jumps, which would count as steps of its wandering."""
-        rest = self.y - np.outer(self.model.loading, self.jumped[1])
-        return replace(self, model=refitted(self.model, rest, self.dt)) if self.jumps else self
+        return replace(self, model=refitted(self.model, self.rest, self.dt)) if self.jumps else self
 
     def on(self, state: State) -> On:
         """What it does to an axis, by the quantity as the other axes show it."""
@@ -172,8 +175,7 @@ class Hidden:
         found = {}
         for name in self.names:
             others = [k for k, other in enumerate(self.names) if other != name]
-            rest = self.y[others] - np.outer(self.model.loading[others], self.jumped[1])
-            found[name] = course(self.model.of(others), rest, smooth=True).f + self.jumped[1]
+            found[name] = course(self.model.of(others), self.rest[others], smooth=True).f + self.jumped[1]
         return found
 
     @cached_property

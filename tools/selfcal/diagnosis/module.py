@@ -188,8 +188,11 @@ class Seen:
     @cached_property
     def axes(self) -> list[State]:
         """Each axis by itself."""
-        white = np.ones(self.n)
-        return [State("", "", row, self.dt, 0.0, white).refit() for row in self.y]
+        return [self.alone(row).refit() for row in self.y]
+
+    def alone(self, row: Array) -> State:
+        """A record [n] by itself, not fitted."""
+        return State("", "", row, self.dt, 0.0, np.ones(self.n))
 
     @property
     def edge(self) -> int:
@@ -508,8 +511,9 @@ def channels(seen: Seen) -> Iterator[Candidate]:
     for cause, values in seen.channels.items():
         side = replace(side_of(cause, "", values), forms=CHANNEL_FORMS)
         shapes: list[Shape] = []
-        for variant in variants_of(side, seen.axes[0]):
-            shape = shape_of(side, seen.axes[0], *variant)
+        plain = seen.alone(seen.y[0])
+        for variant in variants_of(side, plain):
+            shape = shape_of(side, plain, *variant)
             column = shape.columns[-1] - shape.columns[-1].mean()
             if np.ptp(column) > 0.0:
                 price = side.ln_looks + LN_FORMS[shape.form]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import shlex
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -105,7 +105,7 @@ def _ordered(
     unknown = stamps.values.size - known.size
     if unknown and not (mend and few(unknown, stamps.values.size)):
         rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
-    twice = _twice([stamps.values[known], *(column.values[known] for column in columns.values())])
+    twice = _twice(_at(stamps.values, known), (_at(column.values, known) for column in columns.values()))
     if twice.size and not mend:
         what = "time runs backwards: rows are written again, which --skip-bad leaves out, and --no-time --rate HZ keeps"
         rows.fail(int(known[twice[0]]), number, what)
@@ -134,13 +134,13 @@ def _ordered(
     )
 
 
-def _twice(columns: Sequence[Floats]) -> Places:
-    """Rows of columns [n], their stamps first, that are an earlier one to the bit, where stamps fall. None where most
-    rows that come late are others: a counter that wraps has some by chance."""
-    time, none = columns[0], np.empty(0, np.int64)
+def _twice(time: Floats, columns: Iterable[Floats]) -> Places:
+    """Rows of stamps and columns [n] that are an earlier one to the bit, where stamps fall; columns are formed there
+    alone. None where most rows that come late are others: a counter that wraps has some by chance."""
+    none = np.empty(0, np.int64)
     if not (np.diff(time) < 0.0).any():
         return none
-    table = np.ascontiguousarray(np.column_stack(columns))
+    table = np.ascontiguousarray(np.column_stack([time, *columns]))
     _, first = np.unique(table.view(np.dtype((np.void, table.strides[0]))), return_index=True)
     again = np.setdiff1d(np.arange(len(table)), first)
     late = np.count_nonzero(time[1:] <= np.maximum.accumulate(time)[:-1])

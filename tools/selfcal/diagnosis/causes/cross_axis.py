@@ -63,7 +63,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     partners = _partners(found)
     for (name, other), finding in pairs.items():
         back = pairs.get((other, name))
-        if back is None:  # of the two ways the model file may state the other one
+        if back is None:  # the other one may follow by a lag or a rate alone
             source = found[other].state if other in found else record.axes[other]
             known = source.best.ln_likelihood - without(source, name).best.ln_likelihood
             if known > finding.look.gain - ALIKE:
