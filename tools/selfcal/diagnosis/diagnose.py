@@ -94,13 +94,15 @@ def looked_at(
 
 
 def shared_by(found: Mapping[str, Diagnosed], model: Model) -> hidden.Hidden | None:
-    """What moves several axes and nobody recorded; None: nothing does, or the model file states it."""
-    if model.hidden_input is not None:
-        return None
-    return next((axis.hidden for axis in found.values() if axis.hidden is not None), None)
+    """What moves several axes and nobody recorded; None: nothing does, or the model file states it and it does not
+    jump."""
+    common = next((axis.hidden for axis in found.values() if axis.hidden is not None), None)
+    return None if common is None or (model.hidden_input is not None and not common.jumps) else common
 
 
-def entry_of(shared: hidden.Hidden, found: Mapping[str, Diagnosed], recording: Recording) -> dict[str, Any]:
+def entry_of(
+    shared: hidden.Hidden, found: Mapping[str, Diagnosed], recording: Recording, model: Model
+) -> dict[str, Any]:
     """The finding of all axes for the document."""
     units = {name: recording.columns[name].unit for name in shared.names}
     record = next(axis.record for axis in found.values() if axis.hidden is shared)
@@ -108,7 +110,7 @@ def entry_of(shared: hidden.Hidden, found: Mapping[str, Diagnosed], recording: R
         **record.axes,
         **{name: axis.state for name, axis in found.items() if axis.hidden is shared},
     }
-    return hidden.entry(shared, states, units, record.start_s)
+    return hidden.entry(shared, states, units, record.start_s, stated=model.hidden_input is not None)
 
 
 def events_of(record: Record) -> dict[str, Array]:

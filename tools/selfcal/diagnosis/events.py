@@ -122,11 +122,13 @@ def add_findings(
         for finding, entry in zip(diagnosed.by_gain, document["axes"][name]["findings"], strict=True):
             members.append(Member(name, finding, entry, factor, _plain(diagnosed, finding, recording, factor)))
     events = grouped(members, quantity)
+    drifts = {name: axis.hidden.in_drift(axis.state) for name, axis in found.items() if axis.hidden is not None}
     for event in events:
         acted = {*(event.entry or {"axes": ()})["axes"], *(member.axis for member in event.members)}
         event.axes = [axis for axis in document["axes"] if axis in acted]
         event.changes = {
-            axis: _changes(event, axis, document["axes"][axis]["unit"], known.get(axis)) for axis in event.axes
+            axis: _changes(event, axis, document["axes"][axis]["unit"], known.get(axis), drifts.get(axis))
+            for axis in event.axes
         }
     events.sort(key=lambda event: event.order)
     counts: dict[str, int] = {}
@@ -149,7 +151,8 @@ def add_findings(
         axis["verdict"] = "inadequate" if material or UNEXPLAINED in axis["causes"] else "adequate"
         axis["small_findings"] = len(own) - len(material) - axis["causes"].count(UNEXPLAINED)
         of_axis = [member for member in members if member.axis == name]
-        axis["numbers"] = _before_and_after(diagnosed, of_axis, axis["unit"], known.get(name))
+        drift = drifts.get(name, (diagnosed.state, diagnosed.state))
+        axis["numbers"] = _before_and_after(diagnosed, drift, of_axis, axis["unit"], known.get(name))
 
 
 def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -> list[Event]:
@@ -220,17 +223,23 @@ def _farthest(before: State, after: State) -> float:
     return float(max(ends, key=lambda end: abs(math.log(end))))
 
 
-def _changes(event: Event, axis: str, unit: str, known: Identified | None) -> dict[str, Any]:
+def _changes(
+    event: Event, axis: str, unit: str, known: Identified | None, drift: tuple[State, State] | None
+) -> dict[str, Any]:
     """What an event does to an axis: N, K and B without it over with it (infinite: with it the record shows none), the
-    bias, its error ahead where that is known; and which of them it moves by as much as matters."""
+    bias, its error ahead where that is known; and which of them it moves by as much as matters. `drift`: the axis with
+    the jumps of a hidden quantity in its drift, and without them."""
     own = [member for member in event.members if member.axis == axis]
     entry = {} if event.entry is None else event.entry["axes"].get(axis, {})
+    pairs = [member.sides for member in own]
+    if event.entry is not None and drift is not None and drift[0] is not drift[1]:
+        factor = units.factor(drift[0].unit, unit)
+        pairs.append(_sides(*drift, factor, 1.0))
     found: dict[str, Any] = {}
     material, most = [], 0.0
     for name in SUMMARY:
         factor, moved = 1.0, 0.0
-        for member in own:
-            old, new = (side[name] for side in member.sides)
+        for old, new in ((before[name], after[name]) for before, after in pairs):
             factor *= old / new if new else math.inf if old else 1.0
             moved += old - new
         found[name] = factor
@@ -411,22 +420,21 @@ def _confirmed(gains: Sequence[Mapping[str, Any] | None]) -> bool | None:
 
 
 def _before_and_after(
-    axis: Diagnosed, members: Sequence[Member], unit: str, known: Identified | None
+    axis: Diagnosed, drift: tuple[State, State], members: Sequence[Member], unit: str, known: Identified | None
 ) -> dict[str, dict[str, Any]]:
     """N, K and B of an axis: without any finding, and with all, as the extended model has them where that is `known`.
-    Both are then in its measure: an axis without findings has one number."""
+    Both are then in its measure: an axis without findings has one number. `drift`: as `_changes` has it."""
     factor = units.factor(axis.state.unit, unit)
     if any("y" in finding.look.changes for finding in axis.findings):  # the bank has the readings as they were read
         known = None
-    state = axis.state
-    if known is not None and any(regressor.name == hidden.ID for regressor in state.regressors):
-        state = state.without({hidden.ID}).refit()  # no bank has the quantity
-    old, new = _sides(axis.first, state, factor, math.prod(member.plain for member in members))
+    old, whole = _sides(axis.first, drift[0], factor, math.prod(member.plain for member in members))
+    _, new = _sides(axis.first, drift[1], factor, 1.0)
     found: dict[str, dict[str, Any]] = {}
     for name, key in SUMMARY.items():
         after: dict[str, Any] = {"median": new[name], "identified": new[name] > 0.0}
-        if known is not None and key in known.summary:
-            level = _farthest(axis.first, state) if name == "N" else 1.0  # the bank has the mean one
+        if known is not None and key in known.summary and bool(new[name]) == bool(whole[name]):
+            level = _farthest(axis.first, drift[0]) if name == "N" else 1.0  # the bank has the mean one
+            level *= new[name] / whole[name] if whole[name] else 1.0  # it has the jumps of a quantity in its drift
             number = known.summary[key].estimate.scaled(units.factor(known.group_unit, unit) * level)
             after = {part: getattr(number, part) for part in ("median", "q05", "q95", "identified")}
         measure = after["median"] / new[name] if after["identified"] and new[name] else 1.0

@@ -72,16 +72,13 @@ class Hidden:
         """The model without the quantity."""
         return fitted(self.bins, self.dt, False, self.model)
 
-    @cached_property
-    def gain(self) -> float:
-        """Nats by the quantity with its jumps."""
-        return course(self.model, self.rest).ln_likelihood - course(self.null, self.y).ln_likelihood
-
-    @property
-    def net(self) -> float:
-        """`gain` net of the search."""
+    def worth(self, *, stated: bool) -> tuple[float, float]:
+        """Nats by the quantity with its jumps, and net of the search; by the jumps alone of one that is `stated`."""
         count = len(self.jumps)
-        return net(self.gain, len(self.names) + 1 + count, LN_EITHER + count * math.log(self.y.shape[1]))
+        known, choice = (0, 0.0) if stated else (len(self.names) + 1, LN_EITHER)
+        before = course(self.model if stated else self.null, self.y)
+        gain = course(self.model, self.rest).ln_likelihood - before.ln_likelihood
+        return gain, net(gain, known + count, choice + count * math.log(self.y.shape[1]))
 
     @cached_property
     def halves(self) -> tuple[tuple[Joint, Course], tuple[Joint, Course]]:
@@ -152,6 +149,17 @@ class Hidden:
         """The state with it, if it acts on that axis."""
         on = self.on(state)
         return state.refit(regressors=(*state.regressors, on.column)) if on.probability >= 0.5 else state
+
+    def in_drift(self, state: State) -> tuple[State, State]:
+        """An axis as a bank has it, with the quantity's wandering in its drift: with the jumps there too, and with them
+        as a column."""
+        if ID not in (regressor.name for regressor in state.regressors):
+            return state, state
+        whole = state.without({ID}).refit()
+        if not self.jumps:
+            return whole, whole
+        column = regridded(self.jumped[1] / self.step, self.dt, state.y.size, state.dt)
+        return whole, whole.refit(regressors=(*whole.regressors, Regressor(ID, ID, column, "1", {})))
 
     def beside(self, states: Mapping[str, State]) -> Hidden | None:
         """The quantity beside what the models of its axes have by now; None: there is none."""
@@ -230,8 +238,11 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
     return score_entry(level, level + more, sd, scores.shape[1]) | {"bias_rmse": {"unit": unit, "horizon_s": rmse}}
 
 
-def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str], start_s: float) -> dict[str, Any]:
-    """The finding of the document, in the `units` of the recording's columns. `start_s`: where the record begins."""
+def entry(
+    hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str], start_s: float, *, stated: bool
+) -> dict[str, Any]:
+    """The finding of the document, in the `units` of the recording's columns. `start_s`: where the record begins.
+    `stated`: the model file has the quantity, and its jumps alone are news."""
     axes: dict[str, Any] = {}
     gains = []
     for name in hidden.names:
@@ -248,24 +259,29 @@ def entry(hidden: Hidden, states: Mapping[str, State], units: Mapping[str, str],
     acting = {name: axis for name, axis in axes.items() if axis["probability"] >= 0.5}
     jumps = [{**jump, "time_s": jump["time_s"] + start_s} for jump in hidden.jumps]
     tau_s = hidden.dt / hidden.model.rate
+    evidence, net_evidence = hidden.worth(stated=stated)
     estimate = {"law": "gauss_markov", "time_constant_s": tau_s, "jumps": jumps}
     return {
         "id": ID,
         "cause": ID,
-        "words": _sentence(acting, jumps, tau_s),
+        "words": _sentence(acting, jumps, tau_s, stated=stated),
         "estimate": estimate,
         "axes": acting,
-        "evidence_nats": hidden.gain,
-        "net_nats": hidden.net,
+        "evidence_nats": evidence,
+        "net_nats": net_evidence,
         "confirmed": in_sd(gains) > HARM_SD,
         "also_possible": ["temperature", "supply"],
         "record_next": "Record the temperature at the sensor and its supply voltage.",
     }
 
 
-def _sentence(axes: Mapping[str, Any], jumps: Sequence[Mapping[str, float]], time_constant_s: float) -> str:
+def _sentence(
+    axes: Mapping[str, Any], jumps: Sequence[Mapping[str, float]], time_constant_s: float, *, stated: bool
+) -> str:
     shares = ", ".join(f"{name} {100.0 * axis['estimate']['share']:.0f} %" for name, axis in axes.items())
     times = ", ".join(f"{jump['time_s']:.0f}" for jump in jumps)
+    if stated:
+        return f"The hidden quantity of the model file jumps at {times} s."
     jumped = f" It jumps at {times} s." if jumps else ""
     return (
         f"One quantity that nobody recorded moves {len(axes)} axes together, over some {time_constant_s:.2g} s. "

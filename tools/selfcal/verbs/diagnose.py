@@ -122,8 +122,9 @@ def diagnose(
             common = shared_by(diagnosed, loaded) if not ending.asked else None
             quantity = None
             if common is not None:
-                hidden.extend(tree, common)
-                quantity = entry_of(common, diagnosed, recording)
+                if loaded.hidden_input is None:
+                    hidden.extend(tree, common)
+                quantity = entry_of(common, diagnosed, recording, loaded)
                 if second is not None:
                     on_second = of_recording(second, loaded, 1.0 / common.dt)
                     quantity["gain_on"] = hidden.carried(common, on_second.axes, events_of(on_second))
