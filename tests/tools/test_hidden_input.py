@@ -6,20 +6,24 @@ Truth: records drawn here by numpy from the printed model, y_i = c_i + l_i f + d
 from __future__ import annotations
 
 from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from numpy.typing import NDArray
+from rich.console import Console
 from scipy.signal import lfilter
 
 from selfcal.diagnosis import hidden, module
-from selfcal.likelihood.joint import bins_of, course, fitted
+from selfcal.likelihood.joint import bins_of, course, fitted, last
 from selfcal.likelihood.state import NET_LEAST
 from selfcal.logs.recording import load, save
-from selfcal.model.file import Model
+from selfcal.model.file import DEFAULT, Model
+from selfcal.show import identification
 from selfcal.verbs.codegen import codegen
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify
@@ -174,6 +178,57 @@ def test_the_filter_is_the_dense_likelihood() -> None:
 
     # The filter leaves out the first sample, which only sets the levels; in the density its part is the same in both.
     assert got == pytest.approx(dense(model) - dense(other), abs=1e-2)
+
+
+def test_the_last_bias_is_the_dense_one() -> None:
+    """Mean and variance of each axis after the last sample, given all readings, against the dense normal density: their
+    levels have a prior of 1e3 there, of 1e3 times the noise or more in the filter, so 1e-4 of a deviation is left."""
+    random = np.random.default_rng(12)
+    n, m = 50, 3
+    y = drawn(random, m, n) + np.outer([0.5, 0.7, -0.6], markov(random, n, 10.0))
+    y[1, 20:24] = np.nan
+    model = replace(fitted(bins_of(drawn(random, m, 600)), 1.0, True), loading=np.array([0.5, 0.7, -0.6]), rate=0.1)
+    t = np.arange(n + 1)
+    S = np.kron(np.outer(model.loading, model.loading), np.exp(-model.rate * np.abs(t[:, None] - t)))
+    for k, (ln_n, ln_rho, ln_m, ln_a) in enumerate(model.own):
+        own_drift = np.exp(2.0 * (ln_n + ln_rho)) * np.minimum.outer(t, t) + 1e6
+        own_drift += np.exp(2.0 * (ln_n + ln_m)) * np.exp(-np.exp(ln_a) * np.abs(t[:, None] - t))
+        S[k * (n + 1) : (k + 1) * (n + 1), k * (n + 1) : (k + 1) * (n + 1)] += own_drift
+    read = S + np.kron(model.correlation * np.outer(model.white, model.white), np.eye(n + 1))
+    x = np.column_stack([y, np.full(m, np.nan)]).ravel()
+    there = np.flatnonzero(np.isfinite(x))
+    wanted = np.arange(1, m + 1) * (n + 1) - 1
+    gain = np.linalg.solve(read[np.ix_(there, there)], S[np.ix_(there, wanted)])
+    mean, sd = last(model, y)
+    assert mean == pytest.approx(gain.T @ x[there], abs=1e-3)
+    variance = np.diag(S)[wanted] - np.sum(S[np.ix_(there, wanted)] * gain, axis=0)
+    assert sd == pytest.approx(np.sqrt(variance), rel=1e-3)
+
+
+def test_identify_tells_the_bias_by_all_axes(tmp_path: Path) -> None:
+    """A quantity that makes the most of three axes' drifts, in another unit than the model's. The stated sd falls, by
+    3^-1/4 = 0.76 if the axes had no drifts of their own, and the bias holds the truth within 4 of it. An axis alone has
+    no such bias."""
+    random = np.random.default_rng(19)
+    n, step = 2400, np.sqrt(-2.0 * np.expm1(-1.0 / 80.0))
+    f, alone = markov(random, n, 80.0), 57.29578
+    biases = {name: 0.03 * (np.cumsum(0.003 * random.normal(size=n)) + 0.8 * f) for name in NAMES[:3]}
+    rows = {name: ("rad/s", (row + 0.03 * random.normal(size=n)) / alone) for name, row in biases.items()}
+    save(tmp_path / "log.npz", rows, 1.0, {})
+    tree = yaml.safe_load(DEFAULT.read_text(encoding="utf-8"))
+    law = [{"kind": "markov", "deviation": float(1.0 / step), "alpha": 1.0 / 80.0}]
+    loadings = dict.fromkeys(biases, float(0.03 * 0.8 * step))
+    tree["hidden_input"] = {"law": law, "loadings": loadings, "noise_correlation": {}}
+    (tmp_path / "model.yaml").write_text(yaml.safe_dump(tree), encoding="utf-8")
+    document = identify(tmp_path / "log.npz", model=tmp_path / "model.yaml")
+    for name, axis in document["axes"].items():
+        now = axis["bias_now"]
+        assert now["together"]["sd"] < 0.95 * now["sd"]
+        assert abs(now["together"]["mean"] - biases[name][-1] / alone) < 4.0 * now["together"]["sd"]
+    identification.show(document, console=Console(file=(shown := StringIO()), width=200))
+    assert f"gz {document['axes']['gz']['bias_now']['together']['mean']:.6g} ±" in shown.getvalue()
+    one = identify(tmp_path / "log.npz", model=tmp_path / "model.yaml", axes=["gx"])
+    assert "together" not in one["axes"]["gx"]["bias_now"]
 
 
 def test_diagnose_names_it_and_every_verb_reads_its_model(tmp_path: Path) -> None:

@@ -234,9 +234,10 @@ template <int G> void filtered(const Filter<G> &filter, const Course &out, doubl
         if (unseen == 0)
             ln_likelihood -= 0.5 * (square + gain.ln_det);
         for (std::size_t i = 0; i < m; i++) {
+            out.spread.row(t)[i] = gain.variances[i];
             if (!gain.there[i])
                 continue;
-            out.innovations.row(t)[i] = v[i], out.spread.row(t)[i] = gain.variances[i];
+            out.innovations.row(t)[i] = v[i];
             if (!seen[i]) // the first reading of an axis sets its level
                 seen[i] = true, unseen--;
             for (std::size_t g = 0; g < S::groups; g++)

@@ -308,7 +308,10 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
 
 
 def extend(tree: dict[str, Any], hidden: Hidden) -> None:
-    """Put the quantity into a model file's tree, and the drifts beside it into the axes of its `simulate`."""
+    """Put the quantity into a model file's tree, and the drifts beside it into the axes of its `simulate`. One that the
+    file states stays."""
+    if tree.get("hidden_input"):
+        return
     tree["hidden_input"] = _stated(hidden)
     axes = tree["simulate"]["axes"]
     for name, law in _own_laws(hidden).items():

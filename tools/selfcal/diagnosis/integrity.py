@@ -175,10 +175,3 @@ def _anew(record: Record, axis: str, look: Look) -> tuple[Look, State]:
         return look, state
     y = np.where(np.isfinite(state.y), record.redrawn[axis], np.nan)
     return look, state.refit(y=y, redrawn=True, **look.changes)
-
-
-def masked(state: State, mask: Mask) -> State:
-    """The state without the samples of `mask`."""
-    y = state.y.copy()
-    y[mask] = np.nan
-    return replace(state, y=y)

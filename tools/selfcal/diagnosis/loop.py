@@ -64,7 +64,7 @@ def diagnose_record(
     handled = {name: readings.moved for name, readings in record.readings.items() if readings.moved is not None}
     quiet = dict(record.axes)
     if handled:
-        quiet = {name: integrity.masked(state, record.moving) for name, state in quiet.items()}
+        quiet = {name: state.masked(record.moving) for name, state in quiet.items()}
     states = dict(zip(quiet, work.each(lambda state: state.refit(), quiet.values()), strict=True))
     shown = [name for name in handled if name in axes]
     spoilt = dict(zip(shown, work.each(lambda name: record.axes[name].refit(), shown), strict=True))
@@ -182,7 +182,7 @@ def _integrity(record: Record, found: Mapping[str, Diagnosed], handled: Mapping[
     """What needs no model beyond the first. `handled`: motion that is left out of the record already."""
     gone, held = integrity.missing(record)
     if held.any():
-        masked = {name: integrity.masked(state, held).refit() for name, state in record.axes.items()}
+        masked = {name: state.masked(held).refit() for name, state in record.axes.items()}
         record = replace(record, axes=masked)
     states = dict(record.axes)
     changed = integrity.rate_changes(record)
@@ -306,7 +306,7 @@ def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> S
     for begin, end in passing:
         if state.dt > 0.5 * span or end - begin > HOLDS:
             gone[round(begin * span / state.dt) : round(end * span / state.dt)] = True
-    return integrity.masked(state, gone).refit() if gone.any() else state
+    return state.masked(gone).refit() if gone.any() else state
 
 
 def _fast(record: Record, found: Mapping[str, Diagnosed]) -> Record:

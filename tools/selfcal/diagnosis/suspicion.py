@@ -15,7 +15,6 @@ from selfcal.bank.blocks import FEWEST
 from selfcal.bank.priors import add_sources, for_record
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import UNEXPLAINED
-from selfcal.diagnosis.integrity import masked
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import of_recording
 from selfcal.likelihood.fit import ROUGH_FTOL
@@ -41,7 +40,7 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
         if name not in record.axes or record.axes[name].below_lattice:
             continue
         state = record.axes[name]
-        state = (masked(state, record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
+        state = (state.masked(record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
         shown = [look for cause in LOOKS for look in cause(state, record) if look.net >= NET_LEAST]
         if shown:  # what has no name is the suspicion where nothing has
             found[name] = max(shown, key=lambda look: (look.cause != UNEXPLAINED, look.net))

@@ -272,8 +272,9 @@ class _Cost:
         return value, slope
 
 
-def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
-    """The model of most likelihood, with f or without. `start`: one near it, to which f is added if it has none."""
+def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None, *, held: bool = False) -> Joint:
+    """The model of most likelihood, with f or without. `start`: one near it, to which f is added if it has none. It
+    keeps f as that has it where f is `held`."""
     cost, m = _Cost(bins, f), bins.power.shape[1]
     size, rate = np.log(SIZE_LIMITS), np.log(np.array(ALPHA_LIMITS) * dt)
     rate[1] = min(rate[1], math.log(2.0))
@@ -287,7 +288,9 @@ def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None) -> Joint:
     head = np.concatenate([own.ravel(), root[_lower(m)]])
     tries = [head]
     if f and start is not None and start.has_f:
-        tries = [np.concatenate([head, start.loading / start.white, [math.log(start.rate)]])]
+        of_f = np.append(start.loading / start.white, math.log(start.rate))
+        bounds[head.size :] = [(value, value) for value in of_f] if held else bounds[head.size :]
+        tries = [np.concatenate([head, of_f])]
     elif f:
         vector = _together(bins, own)
         tries = [np.concatenate([head, vector, [np.clip(math.log(dt / tau), *bounds[-1])]]) for tau in STARTS_S]
@@ -357,10 +360,10 @@ def _together(bins: Bins, own: Array) -> Array:
 @dataclass(frozen=True)
 class Course:
     """What filter and smoother make of a record. `ln_likelihood`; `innovations` [n, m] of each axis (NaN: missing) and
-    their variances `spread` [n, m]; `predicted` [n, s]: the states before each sample. Of the smoother: `f` [n];
-    `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its product
-    with them; `of_f` [n, 2]: score of a jump of f just before each sample, and its information; `shock` [n, m] and
-    `known` [n, m, m]: the same of the levels."""
+    their variances `spread` [n, m], of missing ones too; `predicted` [n, s]: the states before each sample. Of the
+    smoother: `f` [n]; `weights` [n, m]: the record times its inverse covariance, so that the score of any column is its
+    product with them; `of_f` [n, 2]: score of a jump of f just before each sample, and its information; `shock` [n, m]
+    and `known` [n, m, m]: the same of the levels."""
 
     ln_likelihood: float
     innovations: Array
@@ -380,6 +383,13 @@ class Course:
         """ln likelihood [n, m] of each reading given the past of all axes; NaN where it is missing."""
         found: Array = -0.5 * (np.log(2.0 * math.pi * self.spread) + self.innovations**2 / self.spread)
         return found
+
+
+def last(model: Joint, y: Array) -> tuple[Array, Array]:
+    """What each axis of records y [m, n] is without its white noise, a sample after the last: mean and standard
+    deviation [m]."""
+    found = course(model, np.column_stack([y, np.full(len(y), np.nan)]))
+    return ahead(model, found, 1)[-1], np.sqrt(found.spread[-1] - model.white**2)
 
 
 def ahead(model: Joint, found: Course, steps: int) -> Array:

@@ -15,7 +15,7 @@ from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
-from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Terms
+from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Mask, Terms
 from selfcal.readings.budget import OF_MODULES, P_LOOK
 
 if TYPE_CHECKING:
@@ -101,6 +101,10 @@ class State:
     @property
     def best(self) -> Fit:
         return best(self.fits)
+
+    def masked(self, mask: Mask) -> State:
+        """The state without the samples of `mask` [n]."""
+        return replace(self, y=np.where(mask, np.nan, self.y))
 
     @property
     def rest(self) -> Array:

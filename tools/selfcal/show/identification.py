@@ -268,6 +268,10 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         there = Path(recording["path"]).exists() or recording.get("paths")
         typed = f"{called()} diagnose {as_typed(recording)}" if there else "selfcal.diagnose() of the same readings"
         failed.append(f"why, and what mends it: {typed}")
+    by_all = {name: axis["bias_now"]["together"] for name, axis in axes.items() if "together" in axis["bias_now"]}
+    if by_all:
+        biases = ", ".join(f"{name} {bias['mean']:.6g} ± {bias['sd']:.2g}" for name, bias in by_all.items())
+        kept.append(f"bias by all axes together, with the model's hidden_input: {biases}")
     N = {name: axis["summary"]["arw"] for name, axis in axes.items() if axis.get("summary")}
     return [*kept, *_unidentified(axes), *noisier(N), *_ahead(axes), *failed]
 

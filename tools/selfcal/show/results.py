@@ -104,12 +104,21 @@ class Posterior(Object):
     off_grid: bool | None
 
 
+class OfAll(Object):
+    """A bias by the readings of all axes."""
+
+    mean: float
+    sd: float
+
+
 class Bias(Object):
-    """x0 + drift at the last sample, in `unit`."""
+    """x0 + drift at the last sample, in `unit`. `together`: by the readings of all axes, where the model file states a
+    quantity that moves them."""
 
     mean: float
     sd: float
     unit: str
+    together: OfAll | None
 
 
 class Check(Object):

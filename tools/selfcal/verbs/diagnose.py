@@ -122,8 +122,7 @@ def diagnose(
             common = shared_by(diagnosed, loaded) if not ending.asked else None
             quantity = None
             if common is not None:
-                if loaded.hidden_input is None:
-                    hidden.extend(tree, common)
+                hidden.extend(tree, common)
                 quantity = entry_of(common, diagnosed, recording, loaded)
                 if second is not None:
                     on_second = of_recording(second, loaded, 1.0 / common.dt)

@@ -141,6 +141,11 @@ def identify(
                 progress.update(task, description="more laws")
                 again = with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)
                 weigh_more_laws(document, recording, [name for name in doubtful if name not in again])
+        if of_file.hidden_input is not None and len(names) > 1:
+            from selfcal.diagnosis.together import add_biases
+
+            progress.update(task, description="all axes together")
+            add_biases(document, recording, loaded_model, of_file.hidden_input)
     add_verdicts(document, bounds, junit, verdicts)
     write_json(document, json)
     if export is not None:
