@@ -27,14 +27,12 @@ from selfcal.diagnosis.causes.variance_change import ENDS
 from selfcal.diagnosis.finding import UNEXPLAINED, Diagnosed, Finding
 from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood import work
-from selfcal.likelihood.heldout import HARM_SD, in_sd
+from selfcal.likelihood.heldout import HARM_SD, MATTERS, in_sd
 from selfcal.likelihood.state import State, interval, log_normal, mixture
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.readings.motion import joined
 
-#: Least change of a number that matters, over the number.
-LEAST = 0.05
 #: The numbers, and their names in a summary.
 SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}
 #: The key of what a slow change of a channel does.
@@ -243,7 +241,7 @@ def _changes(
             factor *= old / new if new else math.inf if old else 1.0
             moved += old - new
         found[name] = factor
-        times = _times(name, factor, moved, known) if abs(factor - 1.0) > LEAST else None
+        times = _times(name, factor, moved, known) if abs(factor - 1.0) > MATTERS else None
         if times is not None:
             material.append(name)
             most = max(most, abs(math.log(times)))
@@ -288,7 +286,7 @@ def _ahead(gains: Sequence[Mapping[str, Any] | None]) -> dict[str, dict[str, flo
 def _better(row: Mapping[str, float]) -> bool:
     """Whether the error ahead falls by as much as matters."""
     less = row["before"] - row["after"]
-    return less > LEAST * row["before"] and less > HARM_SD * row["sd"]
+    return less > MATTERS * row["before"] and less > HARM_SD * row["sd"]
 
 
 def _entry(event: Event) -> dict[str, Any]:
@@ -340,7 +338,7 @@ def _add_readings(entry: dict[str, Any], recording: Recording, found: Mapping[st
         if rate_hz > 0.5 * recording.rate_hz:
             continue
         seen = of_readings(recording, axis, line["median"], line["q95"] - line["median"], rate_hz)
-        if seen is not None and abs(seen[0] / line["median"] - 1.0) > LEAST:
+        if seen is not None and abs(seen[0] / line["median"] - 1.0) > MATTERS:
             told.append(seen[0])
             unit = recording.columns[axis].unit
             on_axis["estimate"] = {"readings_amplitude": {"median": seen[1], "unit": unit}, **on_axis["estimate"]}

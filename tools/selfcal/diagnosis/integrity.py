@@ -155,7 +155,7 @@ def quantization(record: Record, axis: str) -> tuple[Look, State] | None:
         changes = {"stated_lsb": step} if lsb else {}
         return _anew(record, axis, Look("quantization", found.nats, found.nats, estimate, changes))
     q, stated = state.lsb, state.stated_lsb
-    if q <= 0.0 or (stated > 0.0 and abs(q / stated - 1.0) < 0.02) or _averaged(stated / q):
+    if q <= 0.0 or state.lattice_is_stated or _averaged(stated / q):
         return None
     sigma = state.best.sigma
     white = math.sqrt(max(sigma**2 - q * q / 12.0, 1e-12 * sigma**2))

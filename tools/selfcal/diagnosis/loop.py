@@ -72,7 +72,7 @@ def diagnose_record(
     left_out = {
         name
         for name, state in states.items()
-        if state.below_lattice and (state.redrawn or _stated(state) or carried(record, name))
+        if state.below_lattice and (state.redrawn or state.lattice_is_stated or carried(record, name))
     }
     states = {name: state for name, state in states.items() if name not in left_out}
     record = replace(record, axes=states)
@@ -126,11 +126,6 @@ def diagnose_record(
     tilt.settle(record, found)
     work.each(end, found)
     return found
-
-
-def _stated(state: State) -> bool:
-    """Whether the model file states the lattice."""
-    return state.stated_lsb > 0.0 and abs(state.lsb / state.stated_lsb - 1.0) < 0.02
 
 
 def _end(axis: Diagnosed, advance: Callable[[str], None]) -> None:

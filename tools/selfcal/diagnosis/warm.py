@@ -30,10 +30,12 @@ WIDENED = REACH / math.sqrt(3.0)
 #: temperature.
 RUN_TO_RUN = {"N": 0.05, "K": 0.2, "sigma_m": 0.2, "B": 0.2}
 RUN_TO_RUN_COEFFICIENT = 0.1
-#: A law with less than this probability keeps the model's priors: its parameters stand for nothing.
+#: Probability below which one record says nothing. Such a law keeps the model's priors. Such a regressor may be in use
+#: in the next record all the same, and one that is sure may not: odds of 99 to 1 at most.
 LEAST_PROBABILITY = 0.01
-#: ln of the odds, at most, that a regressor is in use or is not: 99 to 1. The next record may say otherwise.
-MOST_LN_ODDS = math.log(99.0)
+MOST_LN_ODDS = math.log1p(-LEAST_PROBABILITY) - math.log(LEAST_PROBABILITY)
+#: How far rounding takes a sum of probabilities beyond 1.
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -143,6 +145,13 @@ class _Reader:
             raise self.fail(f"{where}.{key}", f"must be a finite number{above}, not {shown(value)}")
         return number
 
+    def probability(self, tree: Mapping[str, Any], key: str, where: str) -> float:
+        """0 to 1, and the rounding of a sum."""
+        value = self.number(tree, key, where)
+        if not -ROUNDING <= value <= 1.0 + ROUNDING:
+            raise self.fail(f"{where}.{key}", f"must be 0 to 1, not {value:g}")
+        return value
+
     def start(self) -> Start:
         tree = self.tree()
         recording = self.mapping(tree, "recording", "")
@@ -183,11 +192,9 @@ class _Reader:
         laws = self.mapping(posterior, "parameters", f"{where}.")
         if set(laws) != set(self.model.hypotheses):
             raise self.fail(f"{where}.parameters", f"must have the laws {', '.join(self.model.hypotheses)}")
-        probability = self.mapping(posterior, "hypotheses", f"{where}.")
+        hypotheses = self.mapping(posterior, "hypotheses", f"{where}.")
         limits: dict[str, dict[str, tuple[float, float]]] = {}
-        share = {law: self.number(probability, law, f"{where}.hypotheses") for law in laws}
-        if not all(-1e-9 <= estimate <= 1.0 + 1e-6 for estimate in share.values()):
-            raise self.fail(f"{where}.hypotheses", "must be probabilities, 0 to 1")
+        share = {law: self.probability(hypotheses, law, f"{where}.hypotheses") for law in laws}
         for law in sorted(laws, key=lambda law: -share[law]):
             if share[law] < LEAST_PROBABILITY:
                 # What such a law says of N is wrong, and a wider prior would have it win where N has changed.
@@ -230,9 +237,7 @@ class _Reader:
             raise self.fail(where, f"must be a mapping of the model's regressors ({', '.join(columns_of) or 'none'})")
         for name in tree:
             one = self.mapping(tree, name, f"{where}.")
-            probability = self.number(one, "probability", f"{where}.{name}")
-            if not 0.0 <= probability <= 1.0 + 1e-9:
-                raise self.fail(f"{where}.{name}.probability", f"must be 0 to 1, not {probability:g}")
+            probability = self.probability(one, "probability", f"{where}.{name}")
             against = max(1.0 - probability, 1e-300)
             odds[columns_of[name][0]] = min(
                 max(math.log(max(probability, 1e-300) / against), -MOST_LN_ODDS), MOST_LN_ODDS

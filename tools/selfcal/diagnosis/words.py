@@ -11,6 +11,7 @@ from selfcal.base.units import duration_words
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.finding import ROUNDS
 from selfcal.diagnosis.separate import NATS
+from selfcal.likelihood.heldout import MATTERS
 from selfcal.logs.recording import SIDE_CHANNELS
 
 
@@ -373,7 +374,7 @@ def navigation(document: Mapping[str, Any]) -> list[str]:
 
 def inflation_sentence(inflation: Mapping[str, float]) -> str:
     """The answer to "why must I multiply by ten?"."""
-    told = [f"{name} {_off([factor])}" for name, factor in inflation.items() if not 0.95 < factor < 1.05]
+    told = [f"{name} {_off([factor])}" for name, factor in inflation.items() if abs(factor - 1.0) > MATTERS]
     return f"Without it, the numbers of plain white noise and random walk are wrong: {', '.join(told)}." if told else ""
 
 

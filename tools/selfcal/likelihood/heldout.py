@@ -15,6 +15,8 @@ from selfcal.likelihood.statemodel import Array
 HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
 #: Pieces of the held-out time whose scatter gives the uncertainty.
 PIECES = 24
+#: Least change of a number that matters, over the number.
+MATTERS = 0.05
 #: A finding whose gain lies so many standard deviations below 0 is none.
 HARM_SD = 2.0
 

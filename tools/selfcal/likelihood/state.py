@@ -30,6 +30,8 @@ EVIDENT = -math.log(OF_MODULES["together"])
 FAR = 40.0
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
+#: Difference of two lattices over one of them from which on they are two.
+SAME_LATTICE = 0.02
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
 #: Columns that one pass of the filter takes beside the model's.
@@ -101,6 +103,11 @@ class State:
     @property
     def best(self) -> Fit:
         return best(self.fits)
+
+    @property
+    def lattice_is_stated(self) -> bool:
+        """Whether the model file states the lattice that the values lie on."""
+        return self.stated_lsb > 0.0 and abs(self.lsb / self.stated_lsb - 1.0) < SAME_LATTICE
 
     def masked(self, mask: Mask) -> State:
         """The state without the samples of `mask` [n]."""

@@ -142,7 +142,7 @@ def identify(
                 again = with_added_laws(document, recording, suspected, engine, decimate, draw=plot is not None)
                 weigh_more_laws(document, recording, [name for name in doubtful if name not in again])
         if of_file.hidden_input is not None and len(names) > 1:
-            from selfcal.diagnosis.together import add_biases
+            from selfcal.diagnosis.biases import add_biases
 
             progress.update(task, description="all axes together")
             add_biases(document, recording, loaded_model, of_file.hidden_input)
