@@ -11,6 +11,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.heldout import HeldOut
 from selfcal.likelihood.state import Look, Regressor, State
+from selfcal.likelihood.statemodel import Mask
 
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
@@ -86,6 +87,14 @@ class Diagnosed:
     stated: list[Finding] = field(default_factory=list)
     unfinished: str = ""
     hidden: Hidden | None = None
+
+    @property
+    def loud(self) -> Mask:
+        """[n]: when its noise is louder than most of the time, for a while."""
+        levels = [each.after.r / each.before.r for each in self.findings if "r" in each.look.changes and each.look.when]
+        above = [level > level.min() for level in levels if level.size == self.state.y.size]
+        found: Mask = np.any([np.zeros(self.state.y.size, bool), *above], axis=0)
+        return found if 2 * found.sum() <= found.size else np.zeros_like(found)
 
     @property
     def by_gain(self) -> list[Finding]:
