@@ -18,7 +18,7 @@ from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, tilt, variance_change
 from selfcal.diagnosis.curve import FREE
-from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
+from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding, rarer
 from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.record import TIMES, Record, carried
 from selfcal.diagnosis.statistics import judged
@@ -221,16 +221,15 @@ def _with_motion(record: Record, first: State, rest: State, moved: Moved) -> Sta
 
 def _louder(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
     """Stretches in which the noise of several axes is louder go into the models of these, before a look at what axes
-    have in common: one source shakes them there. Those looks leave the loud time out."""
+    have in common: one source shakes them there. Those looks leave that time out."""
     advance("noise of all axes")
     states = dict(record.axes)
     for number in range(FIRST_LOUD, FIRST_LOUD + (variance_change.CAUSE.grouping.most or ROUNDS)):
         event = module.louder(states)
         if event is None or not _give(record, found, states, event, number, module.MEANS_S):
             break
-    ratios = {name: state.r / record.axes[name].r for name, state in states.items()}
-    loud = {name: ratio > ratio.min() for name, ratio in ratios.items()}
-    return replace(_with(record, found, states), loud={name: mask for name, mask in loud.items() if mask.any()})
+    changed = {name: state.r / record.axes[name].r for name, state in states.items() if state is not record.axes[name]}
+    return replace(_with(record, found, states), apart={name: rarer(ratio) for name, ratio in changed.items()})
 
 
 def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
@@ -238,7 +237,7 @@ def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[
     advance("all axes together")
     record = _curves(record, found)
     states = dict(record.axes)
-    seen = module.together(states, record.channels, record.since_power_on_s + record.start_s, record.loud)
+    seen = module.together(states, record.channels, record.since_power_on_s + record.start_s, record.apart)
     if seen is None:
         return record
     if seen.hidden is not None:

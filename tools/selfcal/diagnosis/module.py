@@ -784,17 +784,17 @@ def together(
     states: Mapping[str, State],
     channels: Mapping[str, Array],
     since_s: float = 0.0,
-    loud: Mapping[str, Mask] = MappingProxyType({}),
+    apart: Mapping[str, Mask] = MappingProxyType({}),
 ) -> Module | None:
     """What acts on several axes of one grid; None: there are too few axes or means to tell.
 
-    `channels` [n]: temperature and supply. `loud` [n]: when an axis is shaken with others. Before the quantity is
+    `channels` [n]: temperature and supply. `apart` [n]: as a record has it. Before the quantity is
     weighed its wandering looks like events: those need be beyond doubt. With it in the model, or where it is not there,
     the usual limit holds."""
     dt = max((state.dt for state in states.values()), default=1.0)
     block = max(1, round(MEANS_S / dt))
-    calm = calmed({name: state for name, state in states.items() if not state.below_lattice}, loud)
-    found = {name: half_means(rest, block)[0] for name, rest in calm.items()}
+    rest = calmed({name: state for name, state in states.items() if not state.below_lattice}, apart)
+    found = {name: half_means(values, block)[0] for name, values in rest.items()}
     found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}
     if len(found) < 2 or min(y.size for y in found.values()) < LEAST:
         return None
@@ -857,21 +857,26 @@ def sharpened(times: Sequence[float], states: Sequence[State], span: float) -> t
     return tuple(found)
 
 
-def calmed(states: Mapping[str, State], loud: Mapping[str, Mask]) -> dict[str, Array]:
-    """Readings [n] of axes less the columns of their models. Where some are `loud` their white noise has the covariance
-    that it has elsewhere, as `steady` has its variance: no search knows noise of two kinds."""
+def calmed(states: Mapping[str, State], apart: Mapping[str, Mask]) -> dict[str, Array]:
+    """Readings [n] of axes less the columns of their models. Where some are `apart` their white noise has the
+    covariance that it has elsewhere, as `steady` has its variance: no search knows noise of two kinds."""
     rest = {name: state.rest for name, state in states.items()}
-    names = [name for name in states if name in loud]
+    names = [name for name in states if name in apart]
     if not names:
         return rest
-    white = np.nan_to_num([white_of(states[name]) for name in names])
-    masks = np.array([loud[name] for name in names])
-    calm = ~masks.any(axis=0)
-    for kind in np.unique(masks[:, ~calm], axis=1).T:
+    masks = np.array([apart[name] for name in names])
+    white = [np.nan_to_num(white_of(states[name])) for name in names]
+    for kind in np.unique(masks[:, masks.any(axis=0)], axis=1).T:
+        own = np.array(white)[kind]
         inside = (masks == kind[:, None]).all(axis=0)
-        own, other = (white[np.ix_(kind, where)] for where in (inside, calm))
-        roots = [np.linalg.cholesky(each @ each.T / each.shape[1]) for each in (own, other)]
-        less = own - roots[1] @ np.linalg.solve(roots[0], own)
-        for name, row in zip([names[k] for k in np.flatnonzero(kind)], less, strict=True):
-            rest[name][inside] -= row
+        roots = [_root(own[:, where]) for where in (inside, ~masks.any(axis=0))]
+        less = own[:, inside] - roots[1] @ np.linalg.solve(roots[0], own[:, inside])
+        for k, row in zip(np.flatnonzero(kind), less, strict=True):
+            rest[names[k]][inside] -= row
     return rest
+
+
+def _root(rows: Array) -> Array:
+    """Of the covariance of noise [m, n]."""
+    products = rows @ rows.T / max(1, rows.shape[1])
+    return np.linalg.cholesky(products + 1e-6 * (np.trace(products) + 1e-300) * np.eye(len(rows)))

@@ -171,9 +171,9 @@ def at(state: State, record: Record, theta: Sequence[float]) -> Look:
 def filtered(states: Sequence[State], power: Power, begin: int, end: int) -> Power:
     """The power of axes behind filters that know the level of a stretch, by what filters that do not have: those follow
     loud noise, and are off for a while after it."""
-    level = power.levels(begin, end)[0][:, :, 0]
+    level, shown = power.levels(begin, end)[0][:, :, 0], power.gain(begin, end)[:, 0] > 0.0
     rows = []
-    for state, ratio in zip(states, level[0] / level[1], strict=True):
+    for state, ratio in zip(states, np.where(shown, level[0] / level[1], 1.0), strict=True):
         raise_by = np.where(raised(state.y.size, begin, end) > 0.0, ratio, 1.0)
         series, best = replace(state, r=state.r * raise_by).series, state.best
         white = run(series, best.terms, best.theta, innovations=True)[1]
@@ -198,8 +198,7 @@ def _look(state: State, level: Level) -> Look:
 
 def _of_time(state: State, record: Record, begin: int, end: int) -> Level:
     """A level from a sample on and before another one."""
-    power = filtered([state], Power.of(state.whitened[None]), begin, end)
-    n, places = power.n, power.present[1:]
+    n = state.y.size
 
     def likely(gain: Array, at: Rows, wide: float) -> tuple[Array, Rows]:
         """Weights of the likeliest places `at` of an end by their gains, and these."""
@@ -207,30 +206,30 @@ def _of_time(state: State, record: Record, begin: int, end: int) -> Level:
         held = weight > WEIGHT_LEAST
         return weight[held], at[held]
 
-    def time(weight: Array, at: Rows) -> dict[str, Any]:
+    def time(present: Rows, weight: Array, at: Rows) -> dict[str, Any]:
         """When an end is: between the last reading before a place and the first one after it."""
-        last = record.time_s[power.present[np.searchsorted(places, at)]]
+        last = record.time_s[present[np.searchsorted(present, at) - 1]]
         apart = record.time_s[at] - last
         return mixture(weight * apart, last + 0.5 * apart, apart / math.sqrt(12.0), "s")
 
     def told(slope: float, sd: float, wide: float) -> dict[str, Any]:
         """Over every place of each end, the other one held."""
-        before, after = places[places < end], places[places > begin]
+        power = filtered([state], Power.of(state.whitened[None]), begin, end)
+        present = power.present
+        before, after = present[1:][present[1:] < end], present[present > begin]
         weight, first = likely(power.gain(before, end)[0], before, wide)
         (level, many), (now, _) = power.levels(first, end), power.levels(begin, end)
         ratios = np.sqrt(level[0] / level[1] * now[1] / now[0])[0] * math.exp(0.5 * slope)
-        found = {"time_s": time(weight, first)}
+        found = {"time_s": time(present, weight, first)}
         if end < n:
-            until = time(*likely(power.gain(begin, after)[0], after, wide))
+            until = time(present, *likely(power.gain(begin, after)[0], after, wide))
             lasts, sds = until["median"] - found["time_s"]["median"], (until["sd"], found["time_s"]["sd"])
             found["duration_s"] = interval(lasts, math.hypot(*sds), "s")
-        return {
-            **found,
-            "ratio": mixture(weight, ratios, ratios * np.sqrt(0.5 * wide * (1.0 / many[:, 0]).sum(axis=0)), "1"),
-        }
+        sds = ratios * np.sqrt(0.5 * wide * (1.0 / np.maximum(many, 1.0)).sum(axis=0)[0])
+        return {**found, "ratio": mixture(weight, ratios, sds, "1")}
 
     when = (float(record.time_s[begin]), float(record.time_s[min(end, n - 1)]))
-    price = partial(ln_changes, n, ends=1 + (end < n))
+    price = partial(ln_changes, round(state.best.n), ends=1 + (end < n))
     return Level("", raised(n, begin, end), price, told, when)
 
 
