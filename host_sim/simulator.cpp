@@ -242,7 +242,8 @@ void add_noise_and_effects(const Scene &scene, std::size_t index, const Axis &ax
     Random shake = stream(scene.seed, index, motion);
     for (std::size_t i = 0; i < out.size(); ++i) {
         const double t = static_cast<double>(i) / scene.rate_hz;
-        out[i] += axis.N * noise[i] * (t >= axis.variance_time_s ? axis.noise_ratio : 1.0);
+        const bool changed = t >= axis.variance_time_s && t - axis.variance_time_s < axis.variance_duration_s;
+        out[i] += axis.N * noise[i] * (changed ? axis.noise_ratio : 1.0);
         out[i] += axis.ramp_slope * t + (t >= axis.step_time_s ? axis.step_amplitude : 0.0);
         out[i] += axis.periodic_amplitude * std::sin(2.0 * pi * axis.periodic_frequency_hz * t);
         out[i] += axis.motion_amplitude * shake.normal() * moving[i];

@@ -13,6 +13,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <functional>
+#include <limits>
 #include <vector>
 
 namespace selfcal_reference {
@@ -35,7 +36,8 @@ struct Axis {
     double periodic_amplitude = 0.0;
     double flicker_B = 0.0;       // flicker: Gauss-Markov terms half a decade apart, spectrum B^2 / (2 pi f)
     double noise_lag1 = 0.0;      // colored_noise: correlation of neighbours; level at low frequency stays N
-    double variance_time_s = 0.0; // variance_change: white noise times noise_ratio from here
+    double variance_time_s = 0.0; // variance_change: white noise times noise_ratio from here, for so long
+    double variance_duration_s = std::numeric_limits<double>::infinity();
     double noise_ratio = 1.0;
     double outlier_fraction = 0.0; // outliers: this share of samples is off by +-10 to 20 sd of the white noise
     double motion_amplitude = 0.0; // motion: sd of the disturbance in the intervals all axes share

@@ -228,6 +228,8 @@ def test_noise_effects() -> None:
     changed = record(axis(N=1.0, variance_time_s=n / 2, noise_ratio=3.0), scene(n))
     np.testing.assert_array_equal(changed[: n // 2], plain[: n // 2])
     np.testing.assert_allclose(changed[n // 2 :], 3.0 * plain[n // 2 :], rtol=1e-12)
+    until = record(axis(N=1.0, variance_time_s=n / 2, variance_duration_s=n / 8, noise_ratio=3.0), scene(n))
+    np.testing.assert_array_equal(until, np.where(np.arange(n) < 5 * n // 8, changed, plain))
 
     hit = record(axis(N=1.0, outlier_fraction=0.01), scene(n)) - plain
     count = np.count_nonzero(hit)

@@ -302,6 +302,7 @@ NB_MODULE(_reference, m) {
         .def_rw("flicker_B", &sr::Axis::flicker_B)
         .def_rw("noise_lag1", &sr::Axis::noise_lag1)
         .def_rw("variance_time_s", &sr::Axis::variance_time_s)
+        .def_rw("variance_duration_s", &sr::Axis::variance_duration_s)
         .def_rw("noise_ratio", &sr::Axis::noise_ratio)
         .def_rw("outlier_fraction", &sr::Axis::outlier_fraction)
         .def_rw("motion_amplitude", &sr::Axis::motion_amplitude)

@@ -117,6 +117,7 @@ class Axis:
     flicker_B: float
     noise_lag1: float
     variance_time_s: float
+    variance_duration_s: float
     noise_ratio: float
     outlier_fraction: float
     motion_amplitude: float

@@ -11,6 +11,8 @@ from threading import Event
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+
 from selfcal.adequacy.document import Identified, parameters_entry, recording_entry, regressors_entry
 from selfcal.adequacy.identify import identify_axis
 from selfcal.base.ending import Held, Stopped, abandon
@@ -172,18 +174,33 @@ def below_lattice(record: Record, name: str) -> bool:
 
 
 def add_posteriors(
-    document: dict[str, Any], recording: Recording, model: Model, ending: Held
+    document: dict[str, Any], recording: Recording, found: Mapping[str, Diagnosed], model: Model, ending: Held
 ) -> dict[str, Identified | None]:
     """What the extended model knows of each axis at rest, as `identify` tells it; None where the record bears no
-    report, and after a signal. The document has its posterior."""
+    report, and after a signal. The document has its posterior. Readings of a loud while are left out: a bank has one
+    level of noise."""
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     known: dict[str, Identified | None] = {}
     for name, axis in axes.items():
         known[name] = None
         with suppress(UserError, Stopped):
-            known[name] = None if ending.asked else identify_axis(recording, name, model, "library", None)
+            known[name] = (
+                None if ending.asked else identify_axis(_calm(recording, found[name]), name, model, "library", None)
+            )
         axis["posterior"] = _posterior(known[name])
     return known
+
+
+def _calm(recording: Recording, axis: Diagnosed) -> Recording:
+    """The recording less the readings of an axis while its noise is loud."""
+    if not axis.loud.any():
+        return recording
+    name = axis.state.axis
+    cell = (recording.clock_of(name).time_s * axis.record.rate_hz + 1e-6).astype(np.int64)
+    loud = axis.loud[np.clip(cell, 0, axis.loud.size - 1)]
+    column = recording.columns[name]
+    calm = replace(column, values=np.where(loud, np.nan, column.values))
+    return replace(recording, columns={**recording.columns, name: calm})
 
 
 def _posterior(known: Identified | None) -> dict[str, Any] | None:

@@ -210,15 +210,14 @@ def _differences(values: Array) -> float:
 def _sides(before: State, after: State, factor: float, plain: float) -> tuple[dict[str, float], dict[str, float]]:
     """N, K and B by two models of an axis, times `factor`. `plain`: of N, by readings that no model has."""
     old, new = ({name: value * factor for name, value in numbers(state).items()} for state in (before, after))
-    new["N"] *= math.sqrt(float(np.mean(after.r / before.r))) * _farthest(before, after)
+    new["N"] *= math.sqrt(_calm(before, after))
     return {**old, "N": old["N"] * plain}, new
 
 
-def _farthest(before: State, after: State) -> float:
-    """Times its mean that the noise level is where it is farthest from that: a finding may have made it several."""
-    ratio = after.r / before.r
-    ends = np.sqrt(np.quantile(ratio, ENDS) / ratio.mean())
-    return float(max(ends, key=lambda end: abs(math.log(end))))
+def _calm(before: State, after: State) -> float:
+    """The variance where the noise is at its lowest level, over the model's nominal one: a finding may have made it
+    several."""
+    return float(np.quantile(after.r / before.r, ENDS[0]))
 
 
 def _changes(
@@ -427,11 +426,12 @@ def _before_and_after(
         known = None
     old, whole = _sides(axis.first, drift[0], factor, math.prod(member.plain for member in members))
     _, new = _sides(axis.first, drift[1], factor, 1.0)
+    mean = float((axis.state.r / axis.first.r)[~axis.loud].mean())  # the bank has one level
     found: dict[str, dict[str, Any]] = {}
     for name, key in SUMMARY.items():
         after: dict[str, Any] = {"median": new[name], "identified": new[name] > 0.0}
         if known is not None and key in known.summary and bool(new[name]) == bool(whole[name]):
-            level = _farthest(axis.first, drift[0]) if name == "N" else 1.0  # the bank has the mean one
+            level = math.sqrt(_calm(axis.first, drift[0]) / mean) if name == "N" else 1.0
             level *= new[name] / whole[name] if whole[name] else 1.0  # it has the jumps of a quantity in its drift
             number = known.summary[key].estimate.scaled(units.factor(known.group_unit, unit) * level)
             after = {part: getattr(number, part) for part in ("median", "q05", "q95", "identified")}

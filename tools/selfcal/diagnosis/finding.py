@@ -11,6 +11,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.heldout import HeldOut
 from selfcal.likelihood.state import Look, Regressor, State
+from selfcal.likelihood.statemodel import Array, Mask
 
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12
@@ -64,6 +65,12 @@ class Finding:
         return tuple(regressor for regressor in self.after.regressors if regressor.name not in known)
 
 
+def rarer(level: Array) -> Mask:
+    """[n]: where a noise level is above its lowest, or where it is not if it is above for most of the time."""
+    above: Mask = level > level.min()
+    return above if 2 * np.count_nonzero(above) <= level.size else ~above
+
+
 @dataclass
 class Diagnosed:
     """One axis after the loop: what it began as, what it is, and what was found in which record.
@@ -86,6 +93,14 @@ class Diagnosed:
     stated: list[Finding] = field(default_factory=list)
     unfinished: str = ""
     hidden: Hidden | None = None
+
+    @property
+    def loud(self) -> Mask:
+        """[n]: when its noise is louder than most of the time, for a while."""
+        ratio = self.state.r / self.first.r
+        once = any("r" in finding.look.changes and finding.look.when for finding in self.findings)
+        found: Mask = (ratio > ratio.min()) & rarer(ratio) & once
+        return found
 
     @property
     def by_gain(self) -> list[Finding]:

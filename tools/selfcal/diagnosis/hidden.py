@@ -19,6 +19,7 @@ from selfcal.base import units as unit_module
 from selfcal.base.grid import half_means, regridded
 from selfcal.diagnosis.model_tree import digits
 from selfcal.likelihood.columns import LN_EITHER
+from selfcal.likelihood.edges import steady
 from selfcal.likelihood.fit import best
 from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES, error_entry, in_sd, score_entry, spread
 from selfcal.likelihood.joint import (
@@ -163,7 +164,7 @@ class Hidden:
 
     def beside(self, states: Mapping[str, State]) -> Hidden | None:
         """The quantity beside what the models of its axes have by now; None: there is none."""
-        y = np.array([half_means(state.rest, max(1, round(self.dt / state.dt)))[0] for state in states.values()])
+        y = np.array([half_means(steady(state), max(1, round(self.dt / state.dt)))[0] for state in states.values()])
         n = min(y.shape[1], self.y.shape[1])
         y = np.where(np.isfinite(self.y[:, :n]), y[:, :n] / self.scale[:, None], np.nan)
         model = weighed(fitted(bins_of(y), self.dt, False), y, self.dt)

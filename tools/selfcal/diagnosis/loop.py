@@ -16,9 +16,9 @@ from selfcal.base.ending import Stopped
 from selfcal.base.grid import regridded, runs
 from selfcal.diagnosis import hidden, integrity, module, score
 from selfcal.diagnosis.cause import Looks
-from selfcal.diagnosis.causes import CAUSES, motion, tilt
+from selfcal.diagnosis.causes import CAUSES, motion, tilt, variance_change
 from selfcal.diagnosis.curve import FREE
-from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
+from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding, rarer
 from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.record import TIMES, Record, carried
 from selfcal.diagnosis.statistics import judged
@@ -43,6 +43,8 @@ UNLASTING = 2.0 * NET_LEAST
 HOLDS = 2
 #: Noise of a fit over that of the first one, below which it has none: of readings that are equal it explains them all.
 NO_NOISE = 1e-6
+#: Number of the first loud stretch of several axes, beyond those of events and lines.
+FIRST_LOUD = 1 + module.MOST + module.FAST_LINES
 #: From this finding on, a cause waits that was worth less than another one when it was last looked at.
 BUSY = 3
 
@@ -81,6 +83,7 @@ def diagnose_record(
         if name not in left_out:
             found[name] = Diagnosed(spoilt.get(name, states[name]), states[name], record, unfinished=INTERRUPTED)
     record = _integrity(record, found, handled)
+    record = _louder(record, found, advance)
     record = _of_means(record, found, means) if means else _together(record, found, advance)
     record = _fast(record, found)
 
@@ -149,7 +152,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> None:
                 events.setdefault(finding.event, []).append((axis, finding))
     for parts in sorted(events.values(), key=lambda parts: sum(finding.look.gain for _, finding in parts)):
         price = sum(finding.look.gain for _, finding in parts) - max(finding.look.net for _, finding in parts)
-        less = [axis.state.without({column.name for column in finding.columns}).refit() for axis, finding in parts]
+        less = [finding.ended(axis.state).without_and_with[0] for axis, finding in parts]
         gains = [
             axis.state.best.ln_likelihood - state.best.ln_likelihood
             for (axis, _), state in zip(parts, less, strict=True)
@@ -211,12 +214,25 @@ def _with_motion(record: Record, first: State, rest: State, moved: Moved) -> Sta
     return replace(first, y=y).refit()
 
 
+def _louder(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
+    """Stretches in which the noise of several axes is louder go into the models of these, before a look at what axes
+    have in common: one source shakes them there. Those looks leave that time out."""
+    advance("noise of all axes")
+    states = dict(record.axes)
+    for number in range(FIRST_LOUD, FIRST_LOUD + (variance_change.CAUSE.grouping.most or ROUNDS)):
+        event = module.louder(states)
+        if event is None or not _give(record, found, states, event, number, module.MEANS_S):
+            break
+    changed = {name: state.r / record.axes[name].r for name, state in states.items() if state is not record.axes[name]}
+    return replace(_with(record, found, states), apart={name: rarer(ratio) for name, ratio in changed.items()})
+
+
 def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
     """What acts on several axes goes into the model of each. One that predicts held-out time worse on all is none."""
     advance("all axes together")
     record = _curves(record, found)
     states = dict(record.axes)
-    seen = module.together(states, record.channels, record.since_power_on_s + record.start_s)
+    seen = module.together(states, record.channels, record.since_power_on_s + record.start_s, record.apart)
     if seen is None:
         return record
     if seen.hidden is not None:
@@ -271,15 +287,15 @@ def _give(
     event: module.Event,
     number: int,
     span: float,
-) -> None:
-    """Put an event into the models of the axes that have it, unless it predicts held-out time worse on all. `number`:
-    of the event in the module; `span`: of the means that show it, s."""
+) -> bool:
+    """Put an event into the models of the axes that have it, unless it predicts held-out time worse on all; whether
+    that was done. `number`: of the event in the module; `span`: of the means that show it, s."""
     own = {name: _between(states[name], event.passing, span) for name in event.names}
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     # An axis whose model has the column already has no look.
     looks = {name: look for name, look in looks.items() if look.shape is None or look.shape.regressors}
     if sum(look.gain for look in looks.values()) < module.NAMED:  # what the axes know by now explains it
-        return
+        return False
     findings = {}
     for name, look in looks.items():
         after = own[name].refit(**look.changes)
@@ -287,11 +303,12 @@ def _give(
         held_out = score.gain(known, own[name], after, record, located=True)
         findings[name] = Finding(known, 0, own[name], after, held_out=held_out, event=number)
     if harmful([finding.held_out for finding in findings.values() if finding.held_out is not None]):
-        return
+        return False
     for name, finding in findings.items():
         states[name] = finding.after
         if name in found:
             found[name].findings.append(finding)
+    return True
 
 
 def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> State:

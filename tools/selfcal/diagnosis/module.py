@@ -11,6 +11,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,11 +23,12 @@ from selfcal.base.grid import half_means
 from selfcal.diagnosis.alias import WANDERS
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
+from selfcal.diagnosis.causes.variance_change import Power, filtered, ln_changes
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, shape_of, side_of, variants_of
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
 from selfcal.likelihood.columns import LN_EITHER, LN_SLOW
-from selfcal.likelihood.edges import EDGE, peaks, scan
+from selfcal.likelihood.edges import EDGE, peaks, scan, white_of
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
     WIDTHS,
@@ -441,6 +443,30 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
     return found
 
 
+def louder(states: Mapping[str, State]) -> Event | None:
+    """The stretch in which the noise of several axes has another level; None: they show none. Beside it each axis has
+    its own noise, so that its evidence is that of the axes apart."""
+    names = [name for name, state in states.items() if not state.below_lattice]
+    if len({(states[name].y.size, states[name].dt) for name in names}) != 1 or len(names) < 2:
+        return None
+    of, dt = [states[name] for name in names], states[names[0]].dt
+    first, found = Power.of(np.array([state.whitened for state in of])), list[Event]()
+    for stretch in first.best():
+        power = filtered(of, first, *stretch)
+        begin, end = power.moved(*stretch)
+        level, n = (rows[:, :, 0] for rows in power.levels(begin, end))
+        wide = power.wide(of, begin, end)
+        gain, widths = power.gain(begin, end) / wide[:, None], np.array(WIDTHS)
+        sd = np.sqrt(2.0 * wide * (1.0 / np.maximum(n, 1.0)).sum(axis=0))
+        ln_bf = gain - gain / (1.0 + widths**2) - 0.5 * np.log1p(widths**2)
+        acts = act_apart(ln_bf, np.log(level[0] / level[1]), sd)
+        price = ln_changes(power.n, float(gain[acts.axes].sum()), 1 + (end < power.n))
+        held = tuple(names[k] for k in acts.axes)
+        found.append(Event(held, "variance_change", (begin * dt, end * dt), acts.evidence - price))
+    best = max(found, key=lambda event: event.evidence)
+    return best if best.evidence >= EVIDENT and len(best.names) > 1 else None
+
+
 def _sharpest(gain: Callable[[Array], Array], f: float, reach: float) -> float:
     """The frequency about f, turns a sample, of the highest of gains [tried]."""
     for _ in range(3):
@@ -754,14 +780,21 @@ class Search:
         self._changed()
 
 
-def together(states: Mapping[str, State], channels: Mapping[str, Array], since_s: float = 0.0) -> Module | None:
+def together(
+    states: Mapping[str, State],
+    channels: Mapping[str, Array],
+    since_s: float = 0.0,
+    apart: Mapping[str, Mask] = MappingProxyType({}),
+) -> Module | None:
     """What acts on several axes of one grid; None: there are too few axes or means to tell.
 
-    `channels` [n]: temperature and supply. Before the quantity is weighed its wandering looks like events: those need
-    be beyond doubt. With it in the model, or where it is not there, the usual limit holds."""
+    `channels` [n]: temperature and supply. `apart` [n]: as a record has it. Before the quantity is
+    weighed its wandering looks like events: those need be beyond doubt. With it in the model, or where it is not there,
+    the usual limit holds."""
     dt = max((state.dt for state in states.values()), default=1.0)
     block = max(1, round(MEANS_S / dt))
-    found = {name: _means(state, block) for name, state in states.items() if not state.below_lattice}
+    rest = calmed({name: state for name, state in states.items() if not state.below_lattice}, apart)
+    found = {name: half_means(values, block)[0] for name, values in rest.items()}
     found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}
     if len(found) < 2 or min(y.size for y in found.values()) < LEAST:
         return None
@@ -824,6 +857,26 @@ def sharpened(times: Sequence[float], states: Sequence[State], span: float) -> t
     return tuple(found)
 
 
-def _means(state: State, block: int) -> Array:
-    """Means [k] of the readings less the columns of the model; NaN where half are missing."""
-    return half_means(state.rest, block)[0]
+def calmed(states: Mapping[str, State], apart: Mapping[str, Mask]) -> dict[str, Array]:
+    """Readings [n] of axes less the columns of their models. Where some are `apart` their white noise has the
+    covariance that it has elsewhere, as `steady` has its variance: no search knows noise of two kinds."""
+    rest = {name: state.rest for name, state in states.items()}
+    names = [name for name in states if name in apart]
+    if not names:
+        return rest
+    masks = np.array([apart[name] for name in names])
+    white = [np.nan_to_num(white_of(states[name])) for name in names]
+    for kind in np.unique(masks[:, masks.any(axis=0)], axis=1).T:
+        own = np.array(white)[kind]
+        inside = (masks == kind[:, None]).all(axis=0)
+        roots = [_root(own[:, where]) for where in (inside, ~masks.any(axis=0))]
+        less = own[:, inside] - roots[1] @ np.linalg.solve(roots[0], own[:, inside])
+        for k, row in zip(np.flatnonzero(kind), less, strict=True):
+            rest[names[k]][inside] -= row
+    return rest
+
+
+def _root(rows: Array) -> Array:
+    """Of the covariance of noise [m, n]."""
+    products = rows @ rows.T / max(1, rows.shape[1])
+    return np.linalg.cholesky(products + 1e-6 * (np.trace(products) + 1e-300) * np.eye(len(rows)))

@@ -61,7 +61,8 @@ class Record:
     `redrawn` [n]: readings of an axis with those drawn anew that are clipped, or of uneven codes. `left_out`: why an
     axis of the model is not here. `roughness` [n] of each axis: variance of its noise by differences of the samples as
     recorded. `moving` [n]: the raw readings of an axis show that the sensor moved. `since_power_on_s`: of the
-    recording."""
+    recording. `apart` [n] of an axis: when its noise and that of others have another level than most of
+    the time."""
 
     rate_hz: float
     axes: Mapping[str, State]
@@ -78,17 +79,21 @@ class Record:
     roughness: Mapping[str, Array] = field(default_factory=dict)
     moving: Mask = field(default_factory=lambda: np.zeros(0, bool))
     since_power_on_s: float = 0.0
+    apart: Mapping[str, Mask] = field(default_factory=dict)
 
     @property
     def time_s(self) -> Array:
         return np.arange(self.present.size) / self.rate_hz
 
     def other_axes(self, axis: str) -> dict[str, Array]:
-        """The other axes about their level, bridged where missing, less what the model lets this one leak into them."""
-        return {
-            name: bridged(y) - float(np.nanmedian(y))
-            for name, y in ((name, state.less_of(axis)) for name, state in self.axes.items() if name != axis)
-        }
+        """The other axes about their level, bridged where missing or `apart`, less what the model lets this one leak
+        into them."""
+        each = {name: self.calm(name, state.less_of(axis)) for name, state in self.axes.items() if name != axis}
+        return {name: bridged(y) - float(np.nanmedian(y)) for name, y in each.items()}
+
+    def calm(self, name: str, values: Array) -> Array:
+        """Values [n] of an axis; NaN where it is `apart`."""
+        return np.where(self.apart[name], np.nan, values) if name in self.apart else values
 
     def variances(self, axis: str) -> dict[str, Array]:
         """Short-term variance of the other axes that have any, bridged where an axis is missing or left out."""

@@ -97,6 +97,23 @@ def scan(series: Series, fit: Fit, held: Array | None = None) -> Scan:
     return Scan(B / fit.sigma**2, A / fit.sigma**2, _bend(A, found.impulse), turns, none)
 
 
+def white_of(state: State) -> Array:
+    """White noise [n] of a record as all of it shows it; 0 where it is missing.
+
+    The score of a step sums the record over its covariance from a place on: its steps are that times the noise's."""
+    score = scan(state.series, state.best).B
+    return np.asarray(state.best.sigma**2 * state.r * (score - np.append(score[1:], 0.0)))
+
+
+def steady(state: State) -> Array:
+    """A record [n] less its level and columns, with as little white noise throughout as where that is least.
+
+    What is left of a drift has less power than the drift: with the noise no more than such a record, at any
+    frequency."""
+    quieter = np.sqrt(state.r.min() / state.r)
+    return state.rest if (quieter == 1.0).all() else state.rest - (1.0 - quieter) * white_of(state)
+
+
 def _bend(A: Array, impulse: Array) -> Array:
     """`Scan.bend`. Two steps one sample apart differ by an impulse. Near the ends of a record, where the level is known
     from few samples, each place is a look of its own."""

@@ -273,7 +273,7 @@ def _level(
         middle,
         (finding.before, finding.after),
         (summary, summary),
-        marks=finding.look.when[:1] if marked and finding.look.when else (),
+        marks=finding.look.when[: 1 + ("duration_s" in finding.look.estimate)] if marked and finding.look.when else (),
     )
 
 

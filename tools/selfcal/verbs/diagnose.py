@@ -133,7 +133,7 @@ def diagnose(
                 doing.now(f"gain on {second.path}")
                 add_carried(document, loaded, tree, record, diagnosed, second)
             doing.now("posterior")
-            known = add_posteriors(document, recording, Model.of_tree(tree, loaded.path), ending)
+            known = add_posteriors(document, recording, diagnosed, Model.of_tree(tree, loaded.path), ending)
             add_findings(document, recording, diagnosed, known, quantity)
             if navigate and not ending.asked:
                 from selfcal.studies.outage import add_outages

@@ -245,11 +245,12 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     sources = Counter(other for _, other, _ in leaks(found))
     judged = {name: each for name, each in found.items() if name in states}
     for each in judged.values():
-        _leaks(each, states, sources, ln_pairs)
+        _leaks(each, record, states, sources, ln_pairs)
     states |= {name: each.state for name, each in judged.items()}
     for names in pairs:
-        one, two = (states[name] for name in names)
-        pair = pair_of(one.whitened, two.whitened, one.dt)
+        one = states[names[0]]
+        u, v = (record.calm(name, states[name].whitened) for name in names)
+        pair = pair_of(u, v, one.dt)
         both = common(pair, ln_pairs)
         if both is None or both.net < NET_LEAST:
             continue
@@ -292,7 +293,9 @@ def _accounted(name: str, axis: Diagnosed, found: Mapping[str, Diagnosed]) -> No
     axis.findings[:] = [each for each in axis.findings if each.look.changes or each.look.shown_by not in known]
 
 
-def _leaks(axis: Diagnosed, states: Mapping[str, State], sources: Mapping[str, int], ln_pairs: float) -> None:
+def _leaks(
+    axis: Diagnosed, record: Record, states: Mapping[str, State], sources: Mapping[str, int], ln_pairs: float
+) -> None:
     """Judge whether an axis that follows another shares a source with it instead.
 
     A leak has one coefficient at all frequencies, the drift's included. A common source is in the noise alone. The one
@@ -303,7 +306,8 @@ def _leaks(axis: Diagnosed, states: Mapping[str, State], sources: Mapping[str, i
         if other not in states:
             continue
         free = without(axis.state, other)
-        both = common(pair_of(free.whitened, states[other].whitened, free.dt), ln_pairs)
+        source = record.calm(other, states[other].whitened)
+        both = common(pair_of(free.whitened, source, free.dt), ln_pairs)
         if both is None or both.net < NET_LEAST:
             continue
         search = max(0.0, finding.look.gain - finding.look.net)

@@ -19,7 +19,7 @@ from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simu
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, top
-from selfcal.likelihood.edges import scan
+from selfcal.likelihood.edges import scan, steady
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
 from selfcal.likelihood.statemodel import Array, Mask
 
@@ -28,8 +28,6 @@ AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)
 DWELLS = (15.0, 50.0, 150.0, 450.0)
 #: The drift without levels, so that both are judged by one filter: ln of walk and white noise over the fitted ones.
 WALKS, WHITES = np.linspace(-2.0, 0.5, 11), np.linspace(-0.03, 0.03, 4)
-#: Share of samples of another noise level at most: gaps have some, a change of the noise has more.
-UNEVEN_MOST = 0.05
 #: Places of a dwell time's posterior.
 QUANTILES = 64
 #: Fewer jumps are steps, or a pulse.
@@ -75,18 +73,16 @@ def switching(y: Array, theta: Array) -> tuple[Array, Array]:
 
 def looks(state: State, record: Record) -> list[Look]:
     """The likeliest levels and dwell times, where they jump often enough."""
-    # The filter knows a walk and white noise of one level alone.
-    uneven = float((state.r != np.median(state.r)).mean()) > UNEVEN_MOST
-    if state.y.size < 200 or uneven or state.extras != NONE:
+    if state.y.size < 200 or state.extras != NONE:
         return []
     # Two levels that jump often have the correlation of a Gauss-Markov drift, which leaves no jump to see.
     if scan(state.series, state.best).gain.max() < SCREEN + 2.0 and _law(state) < SCREEN:
         return []
-    series, block = state.means()
-    y = series.y - state.best.c[1:] @ series.columns[1:]
+    series, block = replace(state, y=steady(state)).means()  # the filter knows a walk and white noise of one level
+    y = series.y
     walk = next(fit for fit in state.fits if fit.terms.walk)
     ln_rho = walk.of_means(block, 0.0)[walk.terms.names.index("ln_rho")]
-    ln_sigma = math.log(walk.sigma / math.sqrt(block))
+    ln_sigma = math.log(walk.sigma * math.sqrt(float(state.r.min()) / block))
     tried = np.array(
         [
             (math.log(a) + ln_sigma, math.log(d), math.log(d), ln_rho - less, ln_sigma)

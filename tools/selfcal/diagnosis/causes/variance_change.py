@@ -1,18 +1,21 @@
-"""The noise level changes once, or follows a channel.
+"""The noise level changes once, for a while, or follows a channel.
 
-One change bends the cumulative sum of squared innovations. A level that follows a channel has a logarithm in proportion
-to the temperature, the supply, or the logarithm of another axis' short-term variance.
+The logarithm of the level has a column: a change from a time on, or between two times, bends the cumulative sum of
+squared innovations. A level that follows a channel is in proportion to the temperature, the supply, or the logarithm of
+another axis' short-term variance.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Rows
 from selfcal.diagnosis.cause import (
     Cause,
     Extension,
@@ -30,14 +33,17 @@ from selfcal.diagnosis.causes.step import ONE_EVENT_S
 from selfcal.diagnosis.forms import SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
-from selfcal.likelihood.columns import LN_EITHER, NEARLY
-from selfcal.likelihood.edges import raised
+from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, NEARLY
+from selfcal.likelihood.edges import WEIGHT_LEAST, raised
+from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
+#: Places among which the two ends of a stretch are looked for first.
+PLACES = 120
 #: A squared innovation counts as so many variances at most: one wild sample is no change of the noise.
 MOST = 12.0
 #: Steps of the search for a slope, and the largest one in standard deviations of the channel.
@@ -49,12 +55,81 @@ OWN = 5
 ENDS = (0.05, 0.95)
 
 
-def ln_changes(n: int, gain: float) -> float:
-    """ln of the number of independent places of a change among `n` samples.
+@dataclass(frozen=True)
+class Power:
+    """Squared innovations of axes on one grid: sums before each sample, `total` [m, n + 1], of so many that are there,
+    `count` [m, n + 1]. `present`: samples that an axis has. A level may begin or end at each but the first."""
+
+    total: Array
+    count: Array
+    present: Rows
+
+    @classmethod
+    def of(cls, whitened: Array) -> Power:
+        """Of residual innovations [m, n] of standard deviation 1, NaN where they are missing."""
+        there = np.isfinite(whitened)
+        square = np.where(there, np.minimum(whitened**2, MOST) + 1e-12, 0.0)
+        total, count = (np.cumsum(np.pad(rows, ((0, 0), (1, 0))), axis=1) for rows in (square, there.astype(float)))
+        return cls(total, count, np.flatnonzero(there.any(axis=0)))
+
+    @property
+    def n(self) -> int:
+        """Samples of the grid."""
+        return len(self.total.T) - 1
+
+    def levels(self, begin: Rows | int, end: Rows | int) -> tuple[Array, Array]:
+        """Variances, and the samples that they rest on, in stretches and beside them: [2, m, k] each."""
+        first, last = np.broadcast_arrays(np.atleast_1d(begin), np.atleast_1d(end))
+        inside = [rows[:, last] - rows[:, first] for rows in (self.total, self.count)]
+        square, n = (
+            np.array([own, rows[:, -1:] - own]) for own, rows in zip(inside, (self.total, self.count), strict=True)
+        )
+        return np.maximum(square, 1e-12) / np.maximum(n, 1.0), n
+
+    def gain(self, begin: Rows | int, end: Rows | int) -> Array:
+        """Gain of ln likelihood [m, k] by a level of their own of stretches; 0 of few samples."""
+        (level, n), every = self.levels(begin, end), self.count[:, -1:]
+        mean = self.total[:, -1:] / np.maximum(every, 1.0)
+        least = np.maximum(EDGE_SAMPLES, np.round(every * EDGE_SHARE))
+        found = 0.5 * (every * np.log(np.maximum(mean, 1e-12)) - (n * np.log(level)).sum(axis=0))
+        return np.where((n >= least).all(axis=0), found, 0.0)
+
+    def wide(self, states: Sequence[State], begin: int, end: int) -> Array:
+        """Times [m] that the null is wider than of normal noise, by the kurtosis of the squares beside the levels of a
+        stretch."""
+        level, inside = self.levels(begin, end)[0], raised(self.n, begin, end) > 0.0
+        squares = np.diff(self.total) / np.where(inside, level[0], level[1])
+        known = np.diff(self.count) > 0.0
+        pairs = zip(states, squares, known, strict=True)
+        return np.array([max(1.0, 0.5 * float(np.var(x[there]))) if own.lsb == 0.0 else 1.0 for own, x, there in pairs])
+
+    def best(self) -> list[tuple[int, int]]:
+        """The likeliest change that lasts, and the likeliest stretch, by all axes together: from and before which
+        sample."""
+        places = self.present[1:]
+        coarse = places[np.unique(np.linspace(0, places.size - 1, PLACES).astype(int))]
+        first, last = coarse[np.transpose(np.triu_indices(coarse.size, 1))].T
+        at = int(np.argmax(self.gain(first, last).sum(axis=0)))
+        return [self.moved(int(places[0]), self.n), self.moved(int(first[at]), int(last[at]))]
+
+    def moved(self, begin: int, end: int) -> tuple[int, int]:
+        """Each end of a stretch in turn at its likeliest place."""
+        places = self.present[1:]
+        for _ in range(1 if end == self.n else 2):
+            before = places[places < end]
+            begin = int(before[np.argmax(self.gain(before, end).sum(axis=0))])
+            if end < self.n:
+                after = places[places > begin]
+                end = int(after[np.argmax(self.gain(begin, after).sum(axis=0))])
+        return begin, end
+
+
+def ln_changes(n: int, gain: float, ends: int = 1) -> float:
+    """ln of the number of independent changes among `n` samples, or of stretches with two `ends`.
 
     Scores at neighbouring places k of n differ by n / (2 k (n - k))."""
     k = np.arange(max(EDGE_SAMPLES, round(n * EDGE_SHARE)), n // 2)
-    return ln_looks(np.repeat(0.5 * n / (k * (n - k)), 2), gain)
+    return ends * ln_looks(np.repeat(0.5 * n / (k * (n - k)), 2), gain) + (LN_SLOW if ends > 1 else 0.0)
 
 
 @dataclass(frozen=True)
@@ -70,21 +145,43 @@ class Level:
 
 
 def looks(state: State, record: Record) -> list[Look]:
-    """The likeliest place, and for each channel the width of its means that shows most."""
+    """The likeliest time, and for each channel the width of its means that shows most."""
     present = np.isfinite(state.whitened)
     if present.sum() < 4 * EDGE_SAMPLES:
         return []
     square = np.minimum(state.whitened[present] ** 2, MOST) + 1e-12
+    power = Power.of(state.whitened[None])
+    times = [_of_time(state, record, *filtered([state], power, *ends).moved(*ends)) for ends in power.best()]
     best: dict[str, tuple[float, Level]] = {}
-    for level in (*_places(state, record, square), *levels(state, record)):
+    for level in (*times, *levels(state, record)):
         gain = slope_of(square, level.values[present])[1]
-        if gain > best.get(level.column, (0.0, level))[0]:
-            best[level.column] = gain, level
-    found = (_look(state, level) for gain, level in best.values() if net(gain, 1, level.price(gain)) > NEARLY)
-    return [look for look in found if look is not None]
+        worth = net(gain, 1, level.price(gain))
+        if worth > best.get(level.column, (NEARLY, level))[0]:
+            best[level.column] = worth, level
+    found = (_look(state, level) for _, level in best.values())
+    return [look for look in found if look.net >= 1.0]
 
 
-def _look(state: State, level: Level) -> Look | None:
+def at(state: State, record: Record, theta: Sequence[float]) -> Look:
+    """The look at a stretch that several axes show, from and before which time, s."""
+    begin, end = (min(round(time / state.dt), state.y.size) for time in theta)
+    return _look(state, _of_time(state, record, begin, end))
+
+
+def filtered(states: Sequence[State], power: Power, begin: int, end: int) -> Power:
+    """The power of axes behind filters that know the level of a stretch, by what filters that do not have: those follow
+    loud noise, and are off for a while after it."""
+    level, shown = power.levels(begin, end)[0][:, :, 0], power.gain(begin, end)[:, 0] > 0.0
+    rows = []
+    for state, ratio in zip(states, np.where(shown, level[0] / level[1], 1.0), strict=True):
+        raise_by = np.where(raised(state.y.size, begin, end) > 0.0, ratio, 1.0)
+        series, best = replace(state, r=state.r * raise_by).series, state.best
+        white = run(series, best.terms, best.theta, innovations=True)[1]
+        rows.append((white[:, 0] - white[:, 1:] @ best.c) / best.sigma * np.sqrt(raise_by))
+    return Power.of(np.array(rows))
+
+
+def _look(state: State, level: Level) -> Look:
     """The look at a level, refitted: limited squares show less of the louder part at first."""
     present = np.isfinite(state.whitened)
     changed, slope, sd = state, 0.0, math.inf
@@ -93,42 +190,47 @@ def _look(state: State, level: Level) -> Look | None:
         more, _, sd = slope_of(square, level.values[present])
         slope += more
         changed = state.refit(r=state.r * np.exp(slope * level.values))
-    # A kurtosis of the squares other than the normal's 2 widens the null in proportion.
-    square = np.minimum(changed.whitened[present] ** 2, MOST)
-    wide = max(1.0, float(np.var(square / square.mean())) / 2.0) if state.lsb == 0.0 else 1.0
+    wide = float(Power.of(changed.whitened[None]).wide([state], 0, state.y.size)[0])
     gain = changed.best.ln_likelihood - state.best.ln_likelihood
     worth = net(gain / wide, 1, level.price(gain))
-    if worth < 1.0:
-        return None
     return Look("variance_change", gain, worth, level.told(slope, sd, wide), {"r": changed.r}, when=level.when)
 
 
-def _places(state: State, record: Record, square: Array) -> Iterator[Level]:
-    """The likeliest place of a change, by the squares [m] of the samples that are there."""
-    n, read = square.size, np.flatnonzero(np.isfinite(state.whitened))
-    edge = max(EDGE_SAMPLES, round(n * EDGE_SHARE))
-    total, k = np.cumsum(square), np.arange(1, n)
-    first, second = total[:-1] / k, np.maximum((total[-1] - total[:-1]) / (n - k), 1e-12)
-    gain = 0.5 * (n * math.log(total[-1] / n) - k * np.log(first) - (n - k) * np.log(second))
-    gain[: edge - 1] = gain[n - edge :] = 0.0
-    at = int(np.argmax(gain))
-    place = int(read[at + 1])
+def _of_time(state: State, record: Record, begin: int, end: int) -> Level:
+    """A level from a sample on and before another one."""
+    n = state.y.size
+
+    def likely(gain: Array, at: Rows, wide: float) -> tuple[Array, Rows]:
+        """Weights of the likeliest places `at` of an end by their gains, and these."""
+        weight = np.exp((gain - gain.max()) / wide) * (gain > 0.0)
+        held = weight > WEIGHT_LEAST
+        return weight[held], at[held]
+
+    def time(present: Rows, weight: Array, at: Rows) -> dict[str, Any]:
+        """When an end is: between the last reading before a place and the first one after it."""
+        last = record.time_s[present[np.searchsorted(present, at) - 1]]
+        apart = record.time_s[at] - last
+        return mixture(weight * apart, last + 0.5 * apart, apart / math.sqrt(12.0), "s")
 
     def told(slope: float, sd: float, wide: float) -> dict[str, Any]:
-        """Over every place: the change lies between the last reading before it and the first one with it."""
-        weight = np.exp((gain - gain.max()) / wide) * (gain > 0.0)
-        held = weight > 1e-7
-        time = record.time_s[read]
-        apart = np.diff(time)[held]
-        ratios = np.sqrt(second[held] / first[held] * first[at] / second[at]) * math.exp(0.5 * slope)
-        sds = ratios * np.sqrt(0.5 * wide / k[held] + 0.5 * wide / (n - k[held]))
-        return {
-            "time_s": mixture(weight[held] * apart, time[1:][held] - 0.5 * apart, apart / math.sqrt(12.0), "s"),
-            "ratio": mixture(weight[held], ratios, sds, "1"),
-        }
+        """Over every place of each end, the other one held."""
+        power = filtered([state], Power.of(state.whitened[None]), begin, end)
+        present = power.present
+        before, after = present[1:][present[1:] < end], present[present > begin]
+        weight, first = likely(power.gain(before, end)[0], before, wide)
+        (level, many), (now, _) = power.levels(first, end), power.levels(begin, end)
+        ratios = np.sqrt(level[0] / level[1] * now[1] / now[0])[0] * math.exp(0.5 * slope)
+        found = {"time_s": time(present, weight, first)}
+        if end < n:
+            until = time(present, *likely(power.gain(begin, after)[0], after, wide))
+            lasts, sds = until["median"] - found["time_s"]["median"], (until["sd"], found["time_s"]["sd"])
+            found["duration_s"] = interval(lasts, math.hypot(*sds), "s")
+        sds = ratios * np.sqrt(0.5 * wide * (1.0 / np.maximum(many, 1.0)).sum(axis=0)[0])
+        return {**found, "ratio": mixture(weight, ratios, sds, "1")}
 
-    when = (float(record.time_s[place]), float(record.time_s[-1]))
-    yield Level("", raised(state.y.size, place), lambda gain: ln_changes(n, gain), told, when)
+    when = (float(record.time_s[begin]), float(record.time_s[min(end, n - 1)]))
+    price = partial(ln_changes, round(state.best.n), ends=1 + (end < n))
+    return Level("", raised(n, begin, end), price, told, when)
 
 
 def levels(state: State, record: Record) -> Iterator[Level]:
@@ -228,6 +330,7 @@ CAUSE = Cause(
     "Look for what was switched on at that time, or for what the channel drives.",
     source="surroundings",
     looks=looks,
+    at=at,
     pictures=shown("marked_level"),
     least=_least,
     grouping=Grouping(alike=_alike, most=3),
@@ -240,8 +343,9 @@ CAUSE = Cause(
     simulated=Simulated(
         keys={
             "time_s": Key(lambda s: s.duration_s / 2.0, "variance_time_s"),
+            "duration_s": positive(None, "variance_duration_s"),
             "ratio": positive(lambda s: 2.0, "noise_ratio"),
         },
-        of_estimate=lambda look: medians(look, "time_s", "ratio") if look.when else None,
+        of_estimate=lambda look: medians(look) if look.when else None,
     ),
 )
