@@ -57,7 +57,7 @@ _STEPS, _PIECES = 20, 500
 #: Share of an interval or a rate below which two count as one.
 SAME = 1e-6
 #: Intervals of a record at most: beyond, their number has no digits for one more.
-_LONGEST = 2.0**53
+_LONGEST = 2.0 / float(np.finfo(np.float64).eps)
 #: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
 CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;

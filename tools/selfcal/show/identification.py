@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from selfcal.adequacy.document import as_typed
-from selfcal.adequacy.summary import MOST_REST, noisier
+from selfcal.adequacy.summary import MOST_TIMES, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.bank.result import FAINT, likeliest
 from selfcal.base import units
@@ -130,7 +130,7 @@ def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     lines = [f"{what} not identified: {names}: {reason}" for (what, reason), names in by_reason.items()]
     for name, axis in axes.items():
         for parameter, rest_s in axis.get("halved_after_s", {}).items():
-            times = f"not even {MOST_REST:g} times this rest halves"
+            times = f"not even {MOST_TIMES:g} times this rest halves"
             how = times if rest_s is None else f"another {duration_words(rest_s)} would about halve"
             lines.append(f"{name}: {how} the interval of {parameter}")
     return lines
