@@ -44,7 +44,7 @@ def in_order(time: Array, tick_s: float, mend: bool) -> Order:
     within their neighbourhood, those of damaged and repeated stamps left out. Stamps may fall in what comes back."""
     rows = np.arange(time.size)
     notes: list[str] = []
-    if time.size > 2 and np.mean(np.diff(time) < 0.0) > 0.5 and time[-1] < time[0]:
+    if time.size > 2 and np.median(np.diff(time)) < 0.0 and time[-1] < time[0]:
         rows, time = rows[::-1], time[::-1]
         notes.append("the rows are newest first: read from the last one on")
     time, remark = unwrapped(time, tick_s)
@@ -55,7 +55,7 @@ def in_order(time: Array, tick_s: float, mend: bool) -> Order:
 def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
     """Stamps [n], s, of a clock that went on, and a line for each span by which it begins anew."""
     steps = np.diff(time)
-    if time.size < 3 or not (steps < 0.0).any():
+    if not (steps < 0.0).any():
         return time, []
     for span in _spans(time, steps, tick_s):
         on = steps + span
