@@ -17,10 +17,18 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import SAME, Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, rhythm, sampling
+from selfcal.logs.sampling import (
+    ONE_INSTANT,
+    SAME,
+    Ambiguous,
+    common_step,
+    in_pattern,
+    in_rhythm,
+    rate_changes,
+    rhythm,
+    sampling,
+)
 
-#: Share of an interval between the samples of one instant, at most.
-ONE_INSTANT = 0.01
 #: Largest difference of the stamps' rate from a stated one, as a share. A lattice of stamps that agrees so with the
 #: interval may be the interval, of which samples are lost.
 _AGREES = 0.1

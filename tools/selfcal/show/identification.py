@@ -187,7 +187,7 @@ def _times(intervals: Sequence[Sequence[float]]) -> str:
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
     """The table without the intervals of its last `left_out` columns."""
-    brief = {name: place < left_out for place, name in enumerate(("alpha", "N", "K"))}
+    brief = {name: rank < left_out for rank, name in enumerate(("alpha", "N", "K"))}
     names = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
     drift = "K or sigma_m" if "B" not in names else "K, sigma_m or B"
     second = "1/alpha, s" + (", or ratio" if names & set(RATIOS) else "")
