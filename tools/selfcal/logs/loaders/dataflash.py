@@ -149,7 +149,7 @@ def _layout(layout: Any) -> tuple[list[int], list[float], list[str], int | None]
         )
         headings.append(f"{here}[{stated if other else unit}]")
     places = [names.index(name) for name in fields]
-    sizes = [float(layout.msg_mults[place] or 1.0) for place in places]
+    sizes = [float(layout.msg_mults[k] or 1.0) for k in places]
     return places, sizes, headings, names.index("I") if "I" in names else None
 
 

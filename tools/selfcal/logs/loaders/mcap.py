@@ -145,14 +145,14 @@ def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple
     while data[at : at + len(_MAGIC)] != _MAGIC and at < len(data):
         begin = at
         try:
-            at, found, checked = _records(data, begin)
+            at, records, checked = _records(data, begin)
         except UnsupportedCompressionError:
             raise
         except Exception:  # whatever mcap stumbles over
             at = _next(data, begin)
             lost.append(Damaged(at - begin, 1))
             continue
-        for record in found:
+        for record in records:
             if isinstance(record, of.Schema):
                 schemas[record.id] = record
             elif isinstance(record, of.Channel):
