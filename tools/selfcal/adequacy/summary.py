@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import DRAWS, LONGEST, PER_OCTAVE, Terms, fit_of, posterior_draws
 from selfcal.adequacy.one_over_f import FLICKER, SURE, Beside, white_of
-from selfcal.bank.result import FAINT, HALF_90, AxisResult, Estimate
+from selfcal.bank.result import HALF_90, AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.base.grid import bisected, weighted_quantiles
@@ -34,6 +34,8 @@ _Floats = NDArray[np.float64]
 COLOURED = "spectral_ratio"
 #: Largest factor that is stated: of a rest to the record, of a unit's quantity to the batch's median.
 MOST_TIMES = 1000.0
+#: Least probability of a law that counts.
+_LEAST = 1e-3
 #: Least ratio of an axis' N to its siblings' or its data sheet's that a line names.
 NOISIER = 2.0
 #: Least share of the posterior with a walk, or a minimum, that identifies the number.
@@ -75,11 +77,11 @@ def summarize(
     laws = [
         Beside(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
-        if probability >= FAINT  # of the model's, whatever is added to them
+        if probability >= _LEAST  # of the model's, whatever is added to them
     ]
     of_model = len(laws)
     others = ((beside, more * left), (counted, 1.0 - left))
-    laws += [replace(law, probability=share) for law, share in others if law is not None and share >= FAINT]
+    laws += [replace(law, probability=share) for law, share in others if law is not None and share >= _LEAST]
     sound = [
         (law, k < of_model)
         for k, law in enumerate(laws)
