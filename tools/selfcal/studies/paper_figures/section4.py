@@ -21,7 +21,7 @@ from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import fit
 from selfcal.studies.methods.problem import Problem, Value
 from selfcal.studies.paper_figures.reproduction import Reproduction
-from selfcal.studies.paper_figures.section3 import PAPER, over_time
+from selfcal.studies.paper_figures.section3 import PAPER, by_chance, over_time
 
 AXIS = "ax"
 #: The paper's result, of which the simulated records are made: m/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
@@ -47,8 +47,8 @@ TRUTHS = {
     "random_walk": {"N": PAPER_N, "K": PAPER_K},
     "gauss_markov": {"N": PAPER_N, "sigma_m": PAPER_K * math.sqrt(SLOW_S / 2.0), "alpha": 1.0 / SLOW_S},
 }
-#: A computed rms is consistent if it is this near to the real one; of SCATTER records that is 2.4 standard errors.
-NEAR = 1.25
+#: A computed rms is consistent if it is this near to the real one, which SCATTER records know no better.
+NEAR = 1.0 + by_chance(1) / math.sqrt(2.0 * SCATTER)
 #: Section 4.2, four areas: rms in mGal, correlation interval in min, white noise in mGal. The paper's Fig. 8 has 1 to
 #: 2, 50 to 200 and below 0.012. It does not give the interval between samples.
 AREAS = {
