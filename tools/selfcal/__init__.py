@@ -22,7 +22,7 @@ from difflib import get_close_matches
 from functools import wraps
 from importlib import import_module
 from importlib.util import find_spec
-from itertools import islice
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -38,8 +38,6 @@ _OTHERS = {
 }
 #: Instructions of newer processors that a compiled module has a build for.
 _BUILDS = {"_library32": "fma", "_likelihood": "avx2", "_joint": "avx2"}
-#: Lines of /proc/cpuinfo that describe the first core.
-MOST_LINES = 100
 
 
 def __getattr__(name: str) -> Any:
@@ -135,7 +133,8 @@ def _newer(name: str) -> str:
         return ""
     try:
         with Path("/proc/cpuinfo").open(encoding="ascii", errors="replace") as file:
-            has = any(line.startswith("flags") and flag in line.split() for line in islice(file, MOST_LINES))
+            first_core = takewhile(str.strip, file)
+            has = any(line.startswith("flags") and flag in line.split() for line in first_core)
     except OSError:
         return ""
     return f"_{flag}" if has else ""

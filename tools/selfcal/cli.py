@@ -26,8 +26,8 @@ from selfcal.base.ending import install, last_signal, leave
 from selfcal.base.errors import UserError, called, printable
 from selfcal.base.options import Option
 
-#: Exit code of everything the user can put right.
-USER_ERROR = 2
+#: Exit code of everything the user can put right: typer's of a wrong use.
+USER_ERROR = typer.BadParameter.exit_code
 #: ... after Ctrl-C.
 INTERRUPTED = 128 + signal.SIGINT
 #: Folder of what compares the method with others; the verb of a file there stands apart in the help.

@@ -31,8 +31,6 @@ FILES = {
         "unity_internals.h": "6f8ebe5f102269d3bfbbd19198e45b37d92255a85f9d604091c49c535d15a950",
     },
 }
-#: Bytes of one of them at most.
-LARGEST = 1 << 20
 
 
 def main() -> None:
@@ -83,40 +81,40 @@ def ours(suites: str) -> bool:
 
 def one_line_sources() -> str:
     """The machine's `deb` lines as `deb-src`."""
-    found = []
+    sources = []
     for file in [Path("/etc/apt/sources.list"), *sorted(Path("/etc/apt/sources.list.d").glob("*.list"))]:
         for line in file.read_text().splitlines() if file.is_file() else []:
             match = re.match(r"deb\s+(\[[^\]]*\]\s+)?(\S+)\s+(\S+)\s+\S", line)
             if match and ours(match[3]):
-                found.append("deb-src" + line[3:])
-    return "\n".join(found) + "\n"
+                sources.append("deb-src" + line[3:])
+    return "\n".join(sources) + "\n"
 
 
 def deb822_sources() -> str:
     """The machine's deb822 stanzas with type `deb-src`."""
-    found = []
+    stanzas = []
     flags = re.MULTILINE | re.IGNORECASE
     for file in sorted(Path("/etc/apt/sources.list.d").glob("*.sources")):
         text = "\n".join(line for line in file.read_text().splitlines() if not line.startswith("#"))
         for stanza in re.split(r"\n\s*\n", text):
             suites = re.search(r"^Suites:(.*)$", stanza, flags)
             if suites and ours(suites[1]) and not re.search(r"^Enabled:\s*no", stanza, flags):
-                found.append(re.sub(r"^Types:.*$", "Types: deb-src", stanza.strip(), flags=flags))
-    return "\n\n".join(found) + "\n"
+                stanzas.append(re.sub(r"^Types:.*$", "Types: deb-src", stanza.strip(), flags=flags))
+    return "\n\n".join(stanzas) + "\n"
 
 
 def unpack(archive: Path, target: Path) -> None:
     """Unity's files of `archive` into `target`, which appears whole or not at all. Exits if they are not as stated."""
     names = {name for files in FILES.values() for name in files}
-    found: dict[str, bytes] = {}
+    files: dict[str, bytes] = {}
     with tarfile.open(archive) as tar:
         for member in tar:
             match = re.fullmatch(r"[^/]+/tests/unity/([^/]+)", member.name)
-            if match and match[1] in names and member.isfile() and member.size <= LARGEST:
+            if match and match[1] in names and member.isfile():
                 stream = tar.extractfile(member)
                 assert stream is not None
-                found[match[1]] = stream.read()
-    digests = {name: hashlib.sha256(content).hexdigest() for name, content in found.items()}
+                files[match[1]] = stream.read()
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in files.items()}
     if digests not in FILES.values():
         sys.exit(
             f"{archive.name} holds no Unity of a stated SHA-256 (tools/setup/unity.py); a Unity that you trust: "
@@ -125,7 +123,7 @@ def unpack(archive: Path, target: Path) -> None:
     fresh = target.with_name(target.name + ".part")
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
-    for name, content in found.items():
+    for name, content in files.items():
         (fresh / name).write_bytes(content)
     shutil.rmtree(target, ignore_errors=True)
     fresh.rename(target)

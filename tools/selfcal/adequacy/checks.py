@@ -21,12 +21,12 @@ from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import CHANGE
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
-from selfcal.readings.budget import CHECK_LIMIT
+from selfcal.readings.budget import CHECK_LIMIT, FALSE_ALARM
 from selfcal.readings.readings import Readings
 from selfcal.readings.tests import TESTS
 
-#: Largest distance of a part from its batch that passes, sd: one law's two parameters exceed it in 1 of 1000 parts.
-BATCH_LIMIT = 3.5
+#: Largest distance of a part from its batch that passes, sd: the two parameters of a law share FALSE_ALARM.
+BATCH_LIMIT = -float(ndtri(0.25 * FALSE_ALARM))
 #: Largest share of the white noise that a drift may hide within an average: a walk of K dt = 2.25 N. The nodes end at
 #: 0.9, where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84

@@ -64,9 +64,9 @@ def drift_checks(
     shapes = [_shape(f"{tau:g}", column, len(decays), tau_s=tau) for tau, column in decays.items()]
     checks["turn_on"] = _check(state, shapes, lambda best: dict(best.stated))
     steps = edges.scan(state.series, state.best)
-    places = steps.peaks(3, edges.SHORTEST)
+    rows = steps.peaks(3, edges.SHORTEST)
     begin_s = recording.start_s + blocks.begin / recording.rate_hz
-    jumps = [replace(edges.shape(state, "step", (place,), steps), form=f"{place}") for place in places]
+    jumps = [replace(edges.shape(state, "step", (row,), steps), form=f"{row}") for row in rows]
     checks["jump"] = _check(state, jumps, lambda best: {"time_s": begin_s + (best.when or (0.0,))[0]}, drift=False)
     return checks
 

@@ -24,11 +24,9 @@ from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, check_col
 from selfcal.model.file import Group, Model, Regressor
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
 from selfcal.model.tables import Tables, make_tables
+from selfcal.readings.lattice import FINE
 from selfcal.readings.readings import Readings, copied, look, mostly_beyond
 from selfcal.readings.rest import outside_priors
-
-#: Largest spacing of float32 in the noise of a reading that is fed without taking a nominal offset off.
-SPACING_LEAST = 0.01
 
 
 def with_reasons(axes: dict[str, Identified | UserError], recording: Recording, model: Model) -> None:
@@ -176,13 +174,14 @@ def _fed(recording: Recording, name: str, model: Model, decimate: float | None) 
     recording = readings.recording
     tables = make_tables(replace(model, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=decimate)
     values, offset = readings.working, 0.0
-    if readings.clipped is not None or readings.coarse > SPACING_LEAST:
+    shown = readings.coarse > FINE  # the lattice of float32 shows in the noise of a reading
+    if readings.clipped is not None or shown:
         # Substitutes of clipped readings may lie beyond the range, and so may readings less an offset.
         beyond = np.abs(values) >= (group.range if readings.clipped is None and group.range > 0.0 else np.inf)
         values = np.where(beyond, np.nan, values)
         group = replace(group, range=0.0)
         tables = replace(tables, axes=(replace(tables.axes[0], range=0.0),))
-    if readings.coarse > SPACING_LEAST:
+    if shown:
         offset = float(np.float32(np.nanmedian(values)))
     samples, columns = as_float(values - offset), as_float(columns_of(regressors, recording))
     for name_of, column in zip([column.name for column in tables.regressors], columns.T, strict=True):

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import LONGEST, fit_of, posterior_draws, terms_of
-from selfcal.bank.priors import MOST_INTERVALS
+from selfcal.bank.priors import MOST_INTERVALS, NARROW
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError
 from selfcal.model.file import ABOUT_N, MOST_HYPOTHESES, Group, Prior
@@ -38,8 +38,6 @@ _OMEGA = 2.0 * math.pi / 3.0
 _LEAST = 1e-3
 #: Nodes of rho and of alpha.
 _NODES = (24, 20)
-#: Factor by which B's limits are wider than those of a sigma_m about a known batch, either way.
-_WIDER = 10.0
 
 
 def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
@@ -127,7 +125,7 @@ def weigh(rerun: Rerun) -> Beside | None:
     times = max(1, math.ceil((samples.size + int(rerun.missing_before.sum())) / (tables.block * MOST_INTERVALS)))
     tables = replace(tables, dt_s=times * tables.dt_s, block=times * tables.block)
     drift = group.priors["sigma_m"]
-    wider = _WIDER if drift.law == "log_normal" else 1.0
+    wider = NARROW if drift.law == "log_normal" else 1.0  # those of a known batch are narrow
     own = {
         "B": Prior("log_uniform", drift.min / wider, drift.max * wider),
         "alpha": Prior("log_uniform", *(limit / tables.dt_s for limit in ABOUT_N["alpha"][:2])),

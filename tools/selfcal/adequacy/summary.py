@@ -32,8 +32,8 @@ _Floats = NDArray[np.float64]
 
 #: The parameter of coloured noise.
 COLOURED = "spectral_ratio"
-#: Longest rest that is looked at, in lengths of the record.
-MOST_REST = 100.0
+#: Largest factor that is stated: of a rest to the record, of a unit's quantity to the batch's median.
+MOST_TIMES = 1000.0
 #: Least probability of a law that counts.
 _LEAST = 1e-3
 #: Least ratio of an axis' N to its siblings' or its data sheet's that a line names.
@@ -187,8 +187,8 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
 
     By the Fisher information at the medians, with the priors. An open interval is wider than this information says,
     and falls faster with the rest: the geometric mean of both variances is taken for that of now. The median over
-    records of a kind is then 0.2 to 0.76 times as wide (tests/tools/test_summary.py). None: not even MOST_REST times
-    the record does.
+    records of a kind is then 0.2 to 0.76 times as wide (tests/tools/test_summary.py). None: not even MOST_TIMES
+    times the record does.
     """
     law = result.best
     estimates = result.parameters[law]
@@ -203,9 +203,9 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
 
     def rest_s(name: str) -> float | None:
         wanted = 0.25 * math.sqrt(now[name]) * estimates[name].ln_sd
-        if not variance(MOST_REST)[name] <= wanted:
+        if not variance(MOST_TIMES)[name] <= wanted:
             return None
-        return n * dt_s * (bisected(lambda times: variance(times)[name] <= wanted, 1.0, MOST_REST)[1] - 1.0)
+        return n * dt_s * (bisected(lambda times: variance(times)[name] <= wanted, 1.0, MOST_TIMES)[1] - 1.0)
 
     now = variance(1.0)
     return {name: rest_s(name) for name in open_}

@@ -26,6 +26,7 @@ from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.model.tables import bank_block, make_tables
 from selfcal.readings.budget import CHECK_LIMIT, CLEARLY
+from selfcal.readings.lattice import ROUNDED
 from selfcal.readings.rest import FEWEST, rest_of
 
 #: Factor of the own prior of N to each side of the record's N.
@@ -33,8 +34,6 @@ DECADES = 100.0
 #: Narrowest range of N, a factor, that is replaced: a narrower one is knowledge of the part (warm start, own model). An
 #: axis with so many times the N of its group has priors of its own.
 NARROW = math.sqrt(DECADES)
-#: Largest difference of equal means, a share of the largest mean: a counter's differences are rounded by that.
-SAME = 1e-10
 #: Level over the sd of the own bias prior.
 LEVEL_SD = 2.0
 #: Most bank intervals of a search beyond the bank's own: a longer record is averaged further.
@@ -162,7 +161,7 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             mean = total[whole] / size[whole]
             level = level if rows else float(np.median(mean))
             step = np.diff(mean)[np.diff(interval[whole]) == 1]
-            step[np.abs(step) < SAME * np.abs(mean).max()] = 0.0
+            step[np.abs(step) < ROUNDED * np.abs(mean).max()] = 0.0
             if step.size < (24 if rows else FEWEST):  # of a drift, more
                 break
             square = step * step
@@ -221,7 +220,7 @@ def laid(
     own = {"bias": Prior("normal", sd=sd), "N": _limits(priors["N"].law, least, DECADES * N)}
     for key, prior in priors.items():
         if key not in ("bias", "N", "alpha", *RATIOS):
-            most = max(scale * prior.max, 10.0 * (reach or {}).get(key, 0.0))
+            most = max(scale * prior.max, NARROW * (reach or {}).get(key, 0.0))
             own[key] = _limits(prior.law, scale * prior.min, most)
     return {**priors, **own}
 

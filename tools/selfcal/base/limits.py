@@ -15,6 +15,8 @@ from selfcal.base.errors import UserError, first_line
 
 #: Numbers of a recording, rows times columns read: 3.2 GB.
 MOST_NUMBERS = 400_000_000
+#: Fewest rows of a recording: a rate takes two.
+FEWEST_ROWS = 2
 #: Columns of a recording, and characters of a heading.
 MOST_COLUMNS, LONGEST_HEADING = 1000, 256
 #: Bytes of a block of a text recording, and of its longest line.

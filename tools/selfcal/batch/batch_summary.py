@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.adequacy.summary import MOST_TIMES
 from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
 from selfcal.base.errors import MOST_NAMED, UserError, few
@@ -27,7 +28,6 @@ from selfcal.batch.population import (
     sd_off,
 )
 from selfcal.batch.unit_table import Unit
-from selfcal.batch.verdicts import MOST_TIMES
 from selfcal.model.file import Group, Model, Prior, Regressor
 from selfcal.model.laws import RATIOS
 from selfcal.model.regressors import coefficient_unit, offered

@@ -25,6 +25,7 @@ import numpy as np
 
 from selfcal.adequacy.allan import information_of, terms_of
 from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
+from selfcal.adequacy.summary import MOST_TIMES
 from selfcal.bank.result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, short
@@ -305,8 +306,8 @@ def rates(
 
 
 def _times(half: Callable[[float, float], float], own_hz: float, rate_hz: float, duration_s: float) -> float:
-    """Length at another rate over this one for an equal interval, within a factor of 1000; 0 without an interval."""
-    target, far = half(own_hz, duration_s), math.log(1e3)
+    """Length at another rate over this one for an equal interval, within MOST_TIMES; 0 without an interval."""
+    target, far = half(own_hz, duration_s), math.log(MOST_TIMES)
     if target == math.inf:
         return 0.0
     return math.exp(bisected(lambda ln: half(rate_hz, duration_s * math.exp(ln)) <= target, -far, far)[1])

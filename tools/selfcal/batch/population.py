@@ -243,7 +243,8 @@ def _groups(groupings: Sequence[Grouping]) -> Groups:
             members.setdefault(name, []).append(device)
         for name, inside in members.items():
             if name and _is_group(len(inside), len(names)):
-                against = next(other for other in members if other != name) if len(members) == 2 else None
+                others = [other for other in members if other != name]
+                against = others[0] if len(others) == 1 else None
                 groups.setdefault(tuple(inside), []).append((kind, name, against))
     return groups
 

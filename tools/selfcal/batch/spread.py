@@ -27,6 +27,7 @@ from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.progress import BarColumn, TextColumn
 
 from selfcal.base.errors import UserError, first_line, install, printable, shown
@@ -39,8 +40,8 @@ Job = Any
 Row = dict[str, Any]
 #: Timeout of a scheduler, s.
 PATIENCE_S = 10.0
-#: Number of seeds that the simulator takes.
-SEEDS = 2**64
+#: Number of seeds that the simulator takes: whole numbers of 64 bits.
+SEEDS = int(np.iinfo(np.uint64).max) + 1
 #: Number of dead workers of a job after which the job is the reason.
 DEATHS = 4
 _KILLED = "a worker process was killed, maybe for want of memory: start again; --results DIR keeps finished records"

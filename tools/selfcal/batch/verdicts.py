@@ -19,6 +19,7 @@ from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
+from selfcal.adequacy.summary import MOST_TIMES
 from selfcal.bank.result import HALF_90, bias_of, likeliest
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
@@ -34,8 +35,6 @@ SCHEMA = "selfcal.limits/1"
 PASS, FAIL, OPEN, UNJUDGED = "pass", "fail", "cannot tell yet", "cannot be judged"
 #: Probability of a verdict after the rest that is asked for.
 CHANCE = 0.8
-#: Largest factor that is stated: of a rest to the record, of a unit's quantity to the batch's median.
-MOST_TIMES = 1000.0
 
 
 @dataclass(frozen=True)

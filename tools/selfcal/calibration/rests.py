@@ -18,7 +18,7 @@ from selfcal.calibration.tumble_fit import Fit, Problem, fit, linearized
 from selfcal.logs.recording import Recording, bridged, check_column
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
-from selfcal.readings.rest import PIECE_S, rest_of
+from selfcal.readings.rest import FEWEST, PIECE_S, rest_of
 
 ACCEL, GYRO = ("ax", "ay", "az"), ("gx", "gy", "gz")
 UNITS = {**dict.fromkeys(ACCEL, "m/s^2"), **dict.fromkeys(GYRO, "rad/s")}
@@ -28,8 +28,8 @@ SETTLE_S = PIECE_S
 REST_S, CUT_S = 10.0, 6.0 * PIECE_S
 #: Most rests: the fit is dense.
 MOST = 200
-#: Number of pieces of a rest: their differences show its drift.
-PIECES = 8
+#: Number of pieces of a rest: the fewest whose differences show its drift.
+PIECES = FEWEST
 #: Shares of a drift's mean square under a wide prior that are weighed: nearly four decades of its deviation, up to its
 #: limit. Largest loss of ln of the likelihood, by a rest, against the share that suits it best.
 SHARES, RESTLESS = 10.0 ** (1.5 - np.arange(0.0, 8.0, 0.75)), 10.0

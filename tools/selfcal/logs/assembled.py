@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.grid import runs
-from selfcal.base.limits import LONGEST_S, MOST_CLOCKS
+from selfcal.base.limits import FEWEST_ROWS, LONGEST_S, MOST_CLOCKS
 from selfcal.logs import written
 from selfcal.logs.headers import Header, number_in
 from selfcal.logs.loaders.damage import Damaged
@@ -253,15 +253,15 @@ def _sampled(path: Path, axes: Mapping[str, NDArray[np.bool_]]) -> tuple[Places,
     own = {name: names for names in patterns.values() for name in names}
     common = [has for name, has in axes.items() if name not in own]
     if common:
-        at = np.flatnonzero(np.logical_or.reduce(common))
+        sampled = np.flatnonzero(np.logical_or.reduce(common))
     else:  # the fastest of them is the recording's
         fastest = max(patterns.values(), key=lambda names: int(axes[names[0]].sum()))
-        at = np.flatnonzero(axes[fastest[0]])
+        sampled = np.flatnonzero(axes[fastest[0]])
         own = {name: names for name, names in own.items() if names is not fastest}
-    if at.size < 2:
-        what = f"{at.size} row{'s' if at.size > 1 else ''} with a sample"
+    if sampled.size < FEWEST_ROWS:
+        what = f"{sampled.size} row{'s' if sampled.size > 1 else ''} with a sample"
         raise UserError(f"{path}: {what}, a recording needs two or more")
-    return at, own
+    return sampled, own
 
 
 def _clock_at(rows: Rows, rate: float | None, sampled: Places, stamps: _Stamps | None, count: int) -> Clock:

@@ -141,7 +141,7 @@ class Header:
                 what = f"more than {LONGEST_HEADING} characters, or some that cannot be shown"
                 raise UserError(f"{self.path}: {where}a heading of {what}: '{short(key)}'")
         renamed = self._renamed(keys, where)
-        found: list[Field] = []
+        read: list[Field] = []
         for key in keys:
             name, unit = split(key)
             if unit is not None and unit.isdecimal():
@@ -167,11 +167,11 @@ class Header:
                 self.dated = self.dated or key
             if not (name in ("t", PART) and self.no_time):
                 lsb = entry.get("lsb", None if size == 1.0 else size)
-                found += self._field(key, name, entry.get("unit", unit), lsb, where, mapped=key in renamed, dates=dates)
+                read += self._field(key, name, entry.get("unit", unit), lsb, where, mapped=key in renamed, dates=dates)
         if self.without_unit or self.without_size:
             raise UserError(f"{self.path}: {where}{self._what_to_state()}")
-        names = [field.name for field in found]
-        fields = [field for field in found if not field.optional or names.count(field.name) == 1]
+        names = [field.name for field in read]
+        fields = [field for field in read if not field.optional or names.count(field.name) == 1]
         names = [field.name for field in fields]
         for name in names:
             if names.count(name) > 1:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.ndimage import median_filter
 
 from selfcal.base.grid import Array, Rows
-from selfcal.logs.sampling import common_step, in_rhythm, overlapping
+from selfcal.logs.sampling import ONE_INSTANT, common_step, in_rhythm, overlapping
 
 #: Rows from which on stamps may repeat for being coarser than the sampling interval.
 _REPEATS_FROM = 100
@@ -44,7 +44,7 @@ def in_order(time: Array, tick_s: float, mend: bool) -> Order:
     within their neighbourhood, those of damaged and repeated stamps left out. Stamps may fall in what comes back."""
     rows = np.arange(time.size)
     notes: list[str] = []
-    if time.size > 2 and np.mean(np.diff(time) < 0.0) > 0.5 and time[-1] < time[0]:
+    if time.size > 1 and np.median(np.diff(time)) < 0.0 and time[-1] < time[0]:
         rows, time = rows[::-1], time[::-1]
         notes.append("the rows are newest first: read from the last one on")
     time, remark = unwrapped(time, tick_s)
@@ -55,7 +55,7 @@ def in_order(time: Array, tick_s: float, mend: bool) -> Order:
 def unwrapped(time: Array, tick_s: float) -> tuple[Array, list[str]]:
     """Stamps [n], s, of a clock that went on, and a line for each span by which it begins anew."""
     steps = np.diff(time)
-    if time.size < 3 or not (steps < 0.0).any():
+    if not (steps < 0.0).any():
         return time, []
     for span in _spans(time, steps, tick_s):
         on = steps + span
@@ -79,7 +79,9 @@ def _spans(time: Array, steps: Array, tick_s: float) -> list[float]:
     spans = [2.0**32 * tick for tick in dict.fromkeys((max(tick_s, _TICKS[0]), *_TICKS))] + [*_CLOCKS]
     usual = float(np.median(np.abs(steps)))
     counts = [common_step(np.abs(steps), 1e-9 * usual), *(10.0**-digits for digits in range(10))]
-    fits = (count for count in counts if count > 0.0 and np.abs(time / count - np.rint(time / count)).max() < 0.01)
+    fits = (
+        count for count in counts if count > 0.0 and np.abs(time / count - np.rint(time / count)).max() < ONE_INSTANT
+    )
     step = next(fits, None)
     return spans if step is None else [*spans, step * 2.0 ** math.ceil(math.log2(np.ptp(time) / step + 0.5))]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
-from selfcal.base.limits import LONGEST_S
+from selfcal.base.limits import FEWEST_ROWS, LONGEST_S
 from selfcal.logs.loaders.damage import SOUND, Damaged
 from selfcal.logs.timebase import Clock
 
@@ -169,7 +169,7 @@ class Recording:
         if not first < last:
             raise UserError(f"--start {first:g} --end {last:g}: the start must lie before the end")
         kept = (self.time_s >= first) & (self.time_s < last)
-        if np.count_nonzero(kept) < 2:
+        if np.count_nonzero(kept) < FEWEST_ROWS:
             raise UserError(
                 f"{self.path}: --start {first:g} --end {last:g}: fewer than two samples there; the recording lasts "
                 f"{self.duration_s:.6g} s"

@@ -209,15 +209,15 @@ def _parts(header: Header, table: Table, several: bool) -> list[Part]:
     sides = sides_of(keys) if several and not sensors else None
     if several and not sensors and sides is None:
         return []
-    found = []
+    parts = []
     for sensor in sensors or [sides or Sensor("", {})]:
         others = {key for other in sensors if other is not sensor for key in other.meant} - sensor.meant.keys()
         kept = [key for key in keys if key not in others]
         own = _Sensor(header, table, sensor, kept, bool(sides))
         names = set(map(own.name, kept))
         source = "/".join(name for name in (table.source, sensor.source) if name)
-        found.append(Part(source, frozenset(names & set(header.sensors)), "temp" in names, own.span, own.read))
-    return found
+        parts.append(Part(source, frozenset(names & set(header.sensors)), "temp" in names, own.span, own.read))
+    return parts
 
 
 @dataclass(frozen=True)

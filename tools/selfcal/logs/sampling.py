@@ -56,8 +56,10 @@ _FEW, _BAND_OF_FEW = 64, (0.95, 1.4)
 _STEPS, _PIECES = 20, 500
 #: Share of an interval or a rate below which two count as one.
 SAME = 1e-6
+#: Share of an interval, or of a tick of a clock, between the samples of one instant, at most.
+ONE_INSTANT = 0.01
 #: Intervals of a record at most: beyond, their number has no digits for one more.
-_LONGEST = 2.0**53
+_LONGEST = 2.0 / float(np.finfo(np.float64).eps)
 #: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
 CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
@@ -663,7 +665,7 @@ def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
         while rest > 10.0 * tolerance:  # Euclid's algorithm
             lattice, rest = rest, abs(lattice - rest * round(lattice / rest))
     times = np.rint(distinct / lattice)
-    if (np.abs(distinct - times * lattice) > np.maximum(10.0 * tolerance, 0.01 * lattice)).any():
+    if (np.abs(distinct - times * lattice) > np.maximum(10.0 * tolerance, ONE_INSTANT * lattice)).any():
         return 0.0
     return float(distinct @ times / (times @ times))
 

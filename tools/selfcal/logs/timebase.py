@@ -17,17 +17,23 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError
 from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
-from selfcal.logs.sampling import SAME, Ambiguous, common_step, in_pattern, in_rhythm, rate_changes, rhythm, sampling
+from selfcal.logs.sampling import (
+    ONE_INSTANT,
+    SAME,
+    Ambiguous,
+    common_step,
+    in_pattern,
+    in_rhythm,
+    rate_changes,
+    rhythm,
+    sampling,
+)
 
-#: Share of an interval between the samples of one instant, at most.
-ONE_INSTANT = 0.01
-#: Largest difference of the stamps' rate from a stated one, as a share.
+#: Largest difference of the stamps' rate from a stated one, as a share. A lattice of stamps that agrees so with the
+#: interval may be the interval, of which samples are lost.
 _AGREES = 0.1
 #: Spread of the steps between stamps, in intervals, from which on they lie on no grid: jitter of 0.2 makes 0.28.
 _NO_GRID = 0.3
-#: A lattice of stamps beyond this share of the interval may be the interval, of which samples are lost. Regular losses
-#: over a smaller share of the record may be another rate.
-_NEARLY = 0.9
 #: Samples in a period of losses, and changes of the rate, that a line tells of, at most.
 _OF_LOSSES, _IN_WORDS = 100, 3
 #: The way on for stamps of no use.
@@ -164,7 +170,7 @@ def remarks(clock: Clock) -> list[str]:
     gaps = np.flatnonzero(missing)
     regular = in_rhythm(gaps) or in_pattern(np.add(missing, 1.0))
     changes = rate_changes(time)
-    if changes and not (regular and np.ptp(gaps) > _NEARLY * time.size):
+    if changes and not (regular and np.ptp(gaps) > (1.0 - _AGREES) * time.size):  # else of a part
         after = ", ".join(
             f"{change.after_hz:.5g} Hz from {time[change.row]:.6g} s on" for change in changes[:_IN_WORDS]
         )
@@ -173,13 +179,13 @@ def remarks(clock: Clock) -> list[str]:
         lost, every, words = _losses(float(np.mean(missing[gaps[0] + 1 : gaps[-1] + 1])) + 1.0)
         other = float(f"{rate - rate * lost / every:.6g}")
         words = f"{words} {'are' if lost > 1 else 'is'} missing, at regular intervals"
-        alike = lattice * rate > _NEARLY and np.ptp(time - np.arange(time.size) / other) * other < 1.0
+        alike = lattice * rate > 1.0 - _AGREES and np.ptp(time - np.arange(time.size) / other) * other < 1.0
         return [words + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
     if gaps.size:
         return []
     if 0.0 < lattice * rate < 1.0 - SAME and steps.min() > 0.5 * lattice:
         turns = np.rint(steps / lattice)
-        if turns.min() == 1.0 and (lattice * rate > _NEARLY or in_pattern(turns)):
+        if turns.min() == 1.0 and (lattice * rate > 1.0 - _AGREES or in_pattern(turns)):
             other = float(f"{1.0 / lattice:.6g}")
             words = f"stamps of {lattice:.4g} s: {other:g} Hz that loses {_losses(float(turns.mean()))[2]} has the same"
             return [f"{words}: --rate {other:g} states that"]

@@ -27,7 +27,8 @@ from selfcal.base.output import together, whole
 from selfcal.logs.loaders import WRITTEN
 from selfcal.logs.loaders.table import heading, meta_place
 from selfcal.logs.recorded import Recording
-from selfcal.logs.timebase import ONE_INSTANT, Clock
+from selfcal.logs.sampling import ONE_INSTANT
+from selfcal.logs.timebase import Clock
 
 #: Headings, without a unit, of the columns that are not the recording's.
 SAMPLE, LATE = "sample", "late"
@@ -143,8 +144,8 @@ def clocks_of(
                 f"{path}: meta: clock {number + 1} does not fit the table, which was changed: convert the log again, "
                 "or give --rate HZ"
             )
-        at: Rows = np.asarray(on_grid, np.int64)
-        clock = Clock(rate, np.diff(at, prepend=np.int64(-1)) - 1, start_s=start)
+        places_of: Rows = np.asarray(on_grid, np.int64)
+        clock = Clock(rate, np.diff(places_of, prepend=np.int64(-1)) - 1, start_s=start)
         if stamped:
             clock = replace(clock, off_grid_s=stamps - clock.time_s if late is None else stamps)
         clocks.append((names, clock, rows))
@@ -190,10 +191,10 @@ def save(
             beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
 
 
-def _save_exact(place: Path, header: str, values: NDArray[np.float64]) -> None:
+def _save_exact(path: Path, header: str, values: NDArray[np.float64]) -> None:
     """Write values [rows, columns] as CSV by their shortest texts that are read back to the bit."""
-    opened = gzip.open if place.suffix == ".gz" else open
-    with opened(place, "wt", encoding="utf-8") as file:
+    opened = gzip.open if path.suffix == ".gz" else open
+    with opened(path, "wt", encoding="utf-8") as file:
         file.write(f"{header}\n")
         for begin in range(0, len(values), _LINES):
             lines = values[begin : begin + _LINES].tolist()

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.limits import FEWEST_ROWS
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model
 from selfcal.model.tables import GateTable, gate_table, make_tables
@@ -68,7 +69,7 @@ def gated(recording: Recording, model: Model) -> Recording:
         interval = places // tables.block
         moved = np.concatenate([interval[~used], (places[ended] + 1) // tables.block])
         used &= ~np.isin(interval, np.unique(moved))
-    if int(used.sum()) < 2:
+    if int(used.sum()) < FEWEST_ROWS:
         raise UserError(
             f"{recording.path}: --gate leaves no interval of rest: the sensor moves, or its noise is above N of `gate` "
             f"in {model.path.name}; choose a stretch with --start and --end"

@@ -38,8 +38,6 @@ LN_STUCK = -nats_of("stuck")
 #: Nats of the runs that are counted; times that there are as many as chance makes, at least. Beyond so many steps in
 #: the noise chance is not well known.
 HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 1.5, 0.8
-#: Samples on either side that make the level of one.
-AROUND = 32
 #: A reading that bears less than this share of an unclipped one's information bears none.
 INFORMATION_LEAST = 0.05
 #: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
@@ -386,10 +384,10 @@ def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]
     readings, row = many * cells, np.searchsorted(many, of_run)
     # Chance of the first repeat, and of each later one; those that are alone show both.
     p = many / size
-    pairs, single = float((p * readings).sum()), float(np.count_nonzero(lengths == 2))
-    alike = max(1.0, single / max(pairs * (1.0 - pairs / n) ** 2, 1.0))
+    pairs, (twos, threes) = float((p * readings).sum()), np.bincount(lengths, minlength=4)[2:4].tolist()
+    alike = max(1.0, twos / max(pairs * (1.0 - pairs / n) ** 2, 1.0))
     first = np.minimum(p * alike, 1.0 - 1.0 / n)
-    alone = float(np.count_nonzero(lengths == 3)) / max(float((readings * first * p * (1.0 - first) ** 2).sum()), 1.0)
+    alone = threes / max(float((readings * first * p * (1.0 - first) ** 2).sum()), 1.0)
     later = np.minimum(p * max(alike, alone), 1.0 - 1.0 / n)
     each, once = -np.log(later), -np.log(first)
     worth = np.zeros(lengths.size)
@@ -466,7 +464,7 @@ def _clipped(values: Array, lattice: Lattice | None) -> Clipped | None:
         return None
     y, step = _known(values), 0.0 if lattice is None else lattice.step
     sides = []
-    for side, edge in ((1, float(y.max())), (-1, float(y.min()))) if y.size >= 4 * AROUND else ():
+    for side, edge in ((1, float(y.max())), (-1, float(y.min()))) if y.size >= 2 * PIECE else ():
         at_edge = np.abs(values - edge) <= max(1e-9 * max(1.0, abs(edge)), 0.25 * step)
         others, count = values[np.isfinite(values) & ~at_edge], int(at_edge.sum())
         if count < CHANGED_LEAST or not (others.size and np.ptp(others) > 0.0):
@@ -549,7 +547,7 @@ def _smooth(values: Array, window: int) -> Array:
 def _quiet_window(y: Array) -> int:
     """Readings over which the mean of a record [n] is quietest: the averaging length of the least Allan variance. It is
     all of them where the longest that the record shows is the best."""
-    best, least, length = 2 * AROUND, math.inf, 2 * AROUND
+    best, least, length = PIECE, math.inf, PIECE
     means = block_means(y, length)
     while means.size >= FEWEST:
         variance = 0.5 * float((np.diff(means) ** 2).mean())

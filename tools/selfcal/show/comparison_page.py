@@ -72,7 +72,7 @@ def names_of(document: Mapping[str, Any]) -> dict[str, str]:
 def told_of(document: Mapping[str, Any]) -> dict[tuple[str, str], list[Told]]:
     """By pair of recordings the lines of all axes: causes that appeared or are gone, on all their axes; then numbers by
     their distance."""
-    found = {}
+    lines = {}
     for pair in pairwise(document["recordings"]):
         causes: dict[tuple[str, str], list[tuple[str, Mapping[str, Any]]]] = {}
         far: list[tuple[str, Mapping[str, Any]]] = []
@@ -82,8 +82,8 @@ def told_of(document: Mapping[str, Any]) -> dict[tuple[str, str], list[Told]]:
                     kind = change["quantity"], change["what"]
                     (far if kind[1] == "changed" else causes.setdefault(kind, [])).append((name, change))
         far.sort(key=lambda row: -abs(row[1]["distance_sd"]))
-        found[pair] = [*map(Told, causes.values()), *(Told([row]) for row in far)]
-    return found
+        lines[pair] = [*map(Told, causes.values()), *(Told([row]) for row in far)]
+    return lines
 
 
 @dataclass(frozen=True)

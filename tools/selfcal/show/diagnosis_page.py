@@ -30,8 +30,10 @@ from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outsi
 from selfcal.show.findings import before_after, notes
 from selfcal.show.template import number, render
 
-#: Length of the line in place of a picture, bytes.
-LINE = 140
+#: The line in place of a picture.
+LEFT_OUT = Markup(
+    "<p>This picture is left out to keep the page small: ask for this axis alone with <code>--axis</code>.</p>"
+)
 #: Name of the Allan figure, and the share of its points outside the band from which on the curve leaves it. Each point
 #: of a fitting record is outside the range of 20 with a probability of 2/21, neighbours together: 1 of 400 fitting
 #: records had more than this share outside, 9 more than a quarter.
@@ -91,6 +93,7 @@ def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], op
         "gained": _gained,
         "factor": _factor,
         "outside": _outside,
+        "LEFT_OUT": LEFT_OUT,
     }
     text = render("diagnosis.html", **values)
     # A page has 995 000 bytes at most.
@@ -207,7 +210,7 @@ def _leave_out(drawn: Sequence[_Picture], excess: int) -> bool:
         if excess <= 0 or math.isinf(picture.nats):
             break
         picture.left_out = True
-        excess -= len(_bytes(picture.html)) - LINE
+        excess -= len(_bytes(picture.html)) - len(LEFT_OUT)
     return any(picture.left_out for picture in drawn)
 
 

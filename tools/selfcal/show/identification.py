@@ -12,7 +12,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from selfcal.adequacy.document import as_typed
-from selfcal.adequacy.summary import MOST_REST, noisier
+from selfcal.adequacy.summary import MOST_TIMES, noisier
 from selfcal.bank.priors import OF_RECORD
 from selfcal.bank.result import FAINT, likeliest
 from selfcal.base import units
@@ -130,7 +130,7 @@ def _unidentified(axes: Mapping[str, Any]) -> list[str]:
     lines = [f"{what} not identified: {names}: {reason}" for (what, reason), names in by_reason.items()]
     for name, axis in axes.items():
         for parameter, rest_s in axis.get("halved_after_s", {}).items():
-            times = f"not even {MOST_REST:g} times this rest halves"
+            times = f"not even {MOST_TIMES:g} times this rest halves"
             how = times if rest_s is None else f"another {duration_words(rest_s)} would about halve"
             lines.append(f"{name}: {how} the interval of {parameter}")
     return lines
@@ -187,7 +187,7 @@ def _times(intervals: Sequence[Sequence[float]]) -> str:
 
 def _law_table(axes: Mapping[str, Any], left_out: int, datasheet: bool) -> Table:
     """The table without the intervals of its last `left_out` columns."""
-    brief = {name: place < left_out for place, name in enumerate(("alpha", "N", "K"))}
+    brief = {name: rank < left_out for rank, name in enumerate(("alpha", "N", "K"))}
     names = {name for axis in axes.values() for parameters in axis["parameters"].values() for name in parameters}
     drift = "K or sigma_m" if "B" not in names else "K, sigma_m or B"
     second = "1/alpha, s" + (", or ratio" if names & set(RATIOS) else "")

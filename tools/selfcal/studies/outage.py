@@ -212,19 +212,19 @@ def flights(known: Mapping[str, Known]) -> dict[str, dict[str, Any]]:
         noise.append(axis.noise)
     errors = np.stack(own, axis=1) * SCALE
     starts = np.linspace(first, last, FLIGHTS).astype(int)
-    at = np.arange(GPS_S + LONGEST_S)
+    flown = np.arange(GPS_S + LONGEST_S)
     rest = np.arange(-min(REST_S, first), 0)
-    part = Part.of_errors(errors[starts[:, None] + rest], np.repeat(errors[starts[:, None] + at], RATE_HZ, axis=1))
+    part = Part.of_errors(errors[starts[:, None] + rest], np.repeat(errors[starts[:, None] + flown], RATE_HZ, axis=1))
     filters = Filters(Noise.of([noise] * FLIGHTS), part)
     filters.rest()
-    place = slice(0, COORDINATES)
+    position = slice(0, COORDINATES)
     by_outage: dict[str, dict[str, Any]] = {}
     for outage, (off, covariance) in zip(OUTAGES_S, filters.fly(OUTAGES_S), strict=True):
-        squares = nees(off[:, place], covariance[:, place, place])
+        squares = nees(off[:, position], covariance[:, position, position])
         apart = max(1, (seconds - first) // (GPS_S + outage))  # flights that share no reading
         band = stats.chi2.ppf([0.025, 0.975], COORDINATES * apart) / apart
         by_outage[f"{outage}"] = {
-            "position_m": math.sqrt(float(np.mean(np.sum(off[:, place] ** 2, axis=1)))),
+            "position_m": math.sqrt(float(np.mean(np.sum(off[:, position] ** 2, axis=1)))),
             "nees": float(squares.mean()),
             "nees_band_95": band.tolist(),
         }

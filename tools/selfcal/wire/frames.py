@@ -21,6 +21,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
+import numpy as np
+
 from selfcal import _firmware, _library32
 from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, few, install
@@ -39,9 +41,8 @@ STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 #: Moduli of the counter and of the time, s. Beyond half of them forward and backward are alike.
 COUNTER, SECONDS = (1 << COMMON[name][1] for name in ("counter", "time"))
-#: Whole statuses in a row with another version, of a module that stated this version before.
-FOREIGN_STATUSES = 2
-#: Frames in a row, counted up, that restart the counter; a stream is no stranger's from then. Statuses of two modules.
+#: Frames in a row, counted up, that restart the counter; a stream is no stranger's from then. Statuses of two modules,
+#: or in a row of another version, of a module that stated this version before.
 RESYNC = 3
 
 
@@ -205,8 +206,7 @@ class AxisReport:
 
         def evidence(k: int) -> float:
             difference = v[f"h{k}_ln_evidence_diff"]
-            # The item's largest difference, nats, says that there is no evidence at all.
-            return best + (difference if difference > -(2**31) * 0.001 else -math.inf)
+            return best + (difference if difference > _no_evidence() else -math.inf)
 
         def parameters(k: int) -> dict[str, Estimate]:
             there = [place for place in PLACE_NAMES if f"h{k}_{place}_mean" in v]
@@ -384,7 +384,7 @@ class Decoder:
     def foreign(self) -> str:
         """What is wrong if the module speaks another version of the wire; empty if it does not.
 
-        A module that has spoken this version has to state another in FOREIGN_STATUSES whole statuses in a row.
+        A module that has spoken this version has to state another in RESYNC whole statuses in a row.
         """
         if self._other is None or self._ours:
             return ""
@@ -401,7 +401,7 @@ class Decoder:
     @property
     def surely_foreign(self) -> bool:
         """Whole statuses in a row have stated so, no lone frame."""
-        return bool(self.foreign) and self._others >= FOREIGN_STATUSES
+        return bool(self.foreign) and self._others >= RESYNC
 
     def feed(self, message: can.Message) -> list[AxisReport]:
         """Take a frame; return the reports that it closes (none, one or two)."""
@@ -473,7 +473,7 @@ class Decoder:
         if "frames_sent" in values:
             self._exact(int(values["frames_sent"]))
             self._others += self._other is not None
-            self._ours = self._ours and self._others < FOREIGN_STATUSES
+            self._ours = self._ours and self._others < RESYNC
         if self.foreign:
             self.status = {"wire_version": cast(float, self._other)}
             self._open = None
@@ -584,6 +584,13 @@ def _ahead(second: int, known: int, modulus: int) -> int:
 
 
 @lru_cache(maxsize=1)
+def _no_evidence() -> float:
+    """The least difference of evidence that its item holds, nats: it says that there is no evidence at all."""
+    signal = load_dbc().get_message_by_name(f"{AXES[0].upper()}_H0").get_signal_by_name("ln_evidence_diff")
+    return -(1 << signal.length - 1) * float(signal.scale)
+
+
+@lru_cache(maxsize=1)
 def _starts() -> tuple[int, ...]:
     """Place of the first frame of each part of a report among all frames that it may have, and of the last frame."""
     items = dict.fromkeys(range(len(_PARTS) + 1), 1)
@@ -608,12 +615,12 @@ def _possible(kind: _Kind, signal: str, value: float) -> bool:
     """Whether a module can mean this value.
 
     In an axis's messages a value that is not a number says that the module has none. A law without any evidence has
-    minus infinity; a hair beyond 1 is a probability's rounding in float32.
+    minus infinity; a hair beyond 1 is the rounding of a sum in float32.
     """
     if math.isnan(value):
         return kind.axis != ""
     if signal.endswith("probability"):
-        return 0.0 <= value <= 1.0 + 1e-6
+        return 0.0 <= value <= 1.0 + HYPOTHESES * float(np.finfo(np.float32).eps)
     if signal == "hypotheses":
         return 1.0 <= value <= HYPOTHESES
     return math.isfinite(value) or (signal == "ln_evidence" and value < 0.0)

@@ -11,6 +11,7 @@ import struct
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,7 @@ class _Bytes:
         for shift in range(0, 35, 7):
             byte = self.byte()
             value |= (byte & 0x7F) << shift
-            if byte < 0x80:
+            if not byte & 0x80:
                 return value & 0xFFFFFFFF
         raise _Damaged
 
@@ -76,7 +77,7 @@ def _three(data: _Bytes, wide: Sequence[Sequence[int]]) -> list[int]:
     """Three numbers of one tag: of the bits `wide` by the tag's number 0 to 2, or of 1 to 4 bytes each."""
     tag = data.byte()
     kind = tag >> 6
-    if kind == 3:
+    if kind == len(wide):
         return [data.little(1 + (tag >> 2 * k & 3)) for k in range(3)]
     bits = wide[kind]
     total = -(-(2 + sum(bits)) // 8) * 8
@@ -127,9 +128,7 @@ def _values(data: _Bytes, encodings: Sequence[int]) -> list[int]:
             case 3:  # 14 bits, negative
                 numbers.append(-_sign(data.unsigned() & 0x3FFF, 14))
             case 6:  # up to eight numbers, a tag says which are not 0
-                count = 1
-                while count < 8 and column + count < len(encodings) and encodings[column + count] == 6:
-                    count += 1
+                count = len([*takewhile(encodings[column].__eq__, encodings[column : column + 8])])
                 tag = data.byte() if count > 1 else 1
                 numbers += [data.signed() if tag >> k & 1 else 0 for k in range(count)]
             case 7:
@@ -227,33 +226,35 @@ class _Log:
         """The values with what they are predicted by. Raises _Damaged."""
         for column, predictor in enumerate(predictors):
             before, last = (frame[column] for frame in history) if history else (0, 0)
-            if predictor in self.constants:
-                values[column] += self.constants[predictor]
-            elif predictor == 5:
-                values[column] += values[self.motor]
-            elif predictor == 6:
-                values[column] += last + self.step if history else 0
-            elif history and predictor in (1, 2, 3):
-                values[column] += {1: last, 2: 2 * last - before, 3: int((last + before) / 2)}[predictor]
-            else:
-                raise _Damaged
+            match predictor:
+                case 1 if history:
+                    values[column] += last
+                case 2 if history:
+                    values[column] += 2 * last - before
+                case 3 if history:
+                    values[column] += int((last + before) / 2)
+                case 5:
+                    values[column] += values[self.motor]
+                case 6:
+                    values[column] += last + self.step if history else 0
+                case _ if predictor in self.constants:
+                    values[column] += self.constants[predictor]
+                case _:
+                    raise _Damaged
         return values
 
     def _event(self) -> bool:
         """Pass by an event; whether it is the log's end."""
+        if self.data.data.startswith(b"\xffEnd of log\0", self.data.at):
+            return True
         number = self.data.byte()
-        # A log's end is known by its text.
-        if number == 255:
-            if self.data.data[self.data.at : self.data.at + 11] == b"End of log\0":
-                return True
-            raise _Damaged
         if number not in _EVENTS:
             raise _Damaged
         for part in _EVENTS[number]:
             if part == "v":
                 self.data.unsigned()
             elif part == "b":
-                if self.data.byte() >= 0x80:
+                if self.data.byte() & 0x80:
                     self.data.little(4)
                 else:
                     self.data.signed()

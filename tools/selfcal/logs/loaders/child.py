@@ -110,8 +110,8 @@ def _received(pipe: int, size: int, ends: float) -> bytearray:
 
 def _bytes(path: Path) -> int:
     """Bytes of a file, or of a folder's files. A hole has none; a disk that packs files does so to a sixteenth."""
-    found = [part.stat() for part in parts_of(path)]
-    return sum(min(status.st_size, 16 * 512 * status.st_blocks) for status in found)
+    files = [part.stat() for part in parts_of(path)]
+    return sum(min(status.st_size, 16 * 512 * status.st_blocks) for status in files)
 
 
 def _seconds(path: Path) -> float:

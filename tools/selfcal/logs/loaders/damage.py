@@ -73,13 +73,13 @@ def walk(
     """
     size = len(data)
 
-    def begins(place: int) -> bool:
+    def begins(message: int) -> bool:
         # Without checksums three messages in a row make sure of a place.
         for _ in range(1 if checked else 3):
-            place = end_of(place)
-            if place in (0, size):
+            message = end_of(message)
+            if message in (0, size):
                 break
-        return place > 0
+        return message > 0
 
     held: tuple[int, int] | None = None  # sound, if the next one is
     while at < size:
@@ -105,12 +105,10 @@ def walk(
         yield *held, True
 
 
-def sifted(
-    data: Bytes, at: int, end_of: Callable[[int], int], *, checked: bool = False
-) -> tuple[Damaged, bytes | None]:
+def sifted(data: Bytes, at: int, end_of: Callable[[int], int]) -> tuple[Damaged, bytes | None]:
     """The damage of the messages from `at` on, and the file without it; None where all is sound."""
     damaged, kept, since = SOUND, list[bytes](), 0
-    for begin, end, sound in walk(data, at, end_of, checked=checked):
+    for begin, end, sound in walk(data, at, end_of):
         if not sound:
             damaged += Damaged(end - begin, 1)
             kept.append(data[since:begin])

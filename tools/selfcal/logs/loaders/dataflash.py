@@ -149,7 +149,7 @@ def _layout(layout: Any) -> tuple[list[int], list[float], list[str], int | None]
         )
         headings.append(f"{here}[{stated if other else unit}]")
     places = [names.index(name) for name in fields]
-    sizes = [float(layout.msg_mults[place] or 1.0) for place in places]
+    sizes = [float(layout.msg_mults[k] or 1.0) for k in places]
     return places, sizes, headings, names.index("I") if "I" in names else None
 
 
@@ -176,12 +176,13 @@ def _tlog(data: Bytes, lost: list[Damaged]) -> Iterator[tuple[str, str, list[str
 
     def end_of(at: int) -> int:
         head = data[at + 8 : at + 18]
-        if len(head) < 8 or head[0] not in (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2):
+        if len(head) < dialect.HEADER_LEN_V1 or head[0] not in (dialect.PROTOCOL_MARKER_V1, dialect.PROTOCOL_MARKER_V2):
             return 0
         second = head[0] == dialect.PROTOCOL_MARKER_V2
         number = int.from_bytes(head[7:10], "little") if second else head[5]
-        checked = at + 8 + head[1] + (12 if second else 8)
-        end = checked + (13 if second and head[2] & 1 else 0)  # a signature
+        header = dialect.HEADER_LEN_V2 if second else dialect.HEADER_LEN_V1
+        checked = at + 8 + header + head[1] + 2
+        end: int = checked + (dialect.MAVLINK_SIGNATURE_BLOCK_LEN if second and head[2] & 1 else 0)
         if end > len(data):
             return 0
         if number not in dialect.mavlink_map:

@@ -145,14 +145,14 @@ def _messages_in(path: Path, data: Bytes, lost: list[Damaged]) -> Iterator[tuple
     while data[at : at + len(_MAGIC)] != _MAGIC and at < len(data):
         begin = at
         try:
-            at, found, checked = _records(data, begin)
+            at, records, checked = _records(data, begin)
         except UnsupportedCompressionError:
             raise
         except Exception:  # whatever mcap stumbles over
             at = _next(data, begin)
             lost.append(Damaged(at - begin, 1))
             continue
-        for record in found:
+        for record in records:
             if isinstance(record, of.Schema):
                 schemas[record.id] = record
             elif isinstance(record, of.Channel):
@@ -200,11 +200,14 @@ def _records(data: Bytes, begin: int) -> tuple[int, list[Any], bool]:
 
 def _end(data: Bytes, begin: int) -> int:
     """The end that a record at a place states; 0 without a record."""
+    from mcap.opcode import Opcode
+
     if begin + _HEAD.size > len(data):
         return 0
     kind, length = _HEAD.unpack_from(data, begin)
     end = begin + _HEAD.size + length
-    return end if (0 < kind < 16 or kind > 127) and end <= len(data) else 0
+    known = kind in {*Opcode} or kind & 0x80  # of others
+    return end if known and end <= len(data) else 0
 
 
 def _next(data: Bytes, begin: int) -> int:

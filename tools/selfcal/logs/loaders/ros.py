@@ -81,9 +81,9 @@ def _axes(values: NDArray[np.float64]) -> Mapping[str, NDArray[np.float64]]:
         if none.mean() > 0.1:
             triads["g"] = np.where((triads["g"] == 0.0).all(axis=1, keepdims=True), np.nan, triads["g"])
     return {
-        f"{letter}{axis}[{_AXES[letter][1]}]": triad[:, place]
+        f"{letter}{axis}[{_AXES[letter][1]}]": triad[:, k]
         for letter, triad in triads.items()
-        for place, axis in enumerate("xyz")
+        for k, axis in enumerate("xyz")
     }
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from selfcal.base.errors import UserError, few, short
 from selfcal.base.limits import (
     BLOCK_BYTES,
+    FEWEST_ROWS,
     MOST_COLUMNS,
     MOST_GROWTH,
     MOST_NUMBERS,
@@ -210,7 +211,7 @@ def room(data: bytes) -> int:
 
 def check_rows(where: str, count: int) -> None:
     """Raise UserError for fewer rows than a recording needs. `where`: the file, and the place in it."""
-    if count < 2:
+    if count < FEWEST_ROWS:
         raise UserError(f"{where}{'one row only' if count else 'no rows'}, a recording needs two or more")
 
 

@@ -83,7 +83,7 @@ def _cut(path: Path) -> Damaged:
             if len(head) < lead or head[:4] != b"TDSm":
                 return Damaged(size - begin, 1)
             length = struct.unpack(f"{'>' if head[4] & 0x40 else '<'}{_LEAD}", head)[3]
-            if length == 2**64 - 1:  # the writer did not come to its end
+            if length == np.iinfo(np.uint64).max:  # the writer did not come to its end
                 return Damaged()
             begin += lead + length
     return Damaged(begin - size, 1, begin) if begin > size else Damaged()

@@ -167,7 +167,7 @@ class TextReader:
     def in_turn(self) -> list[tuple[str, str]]:
         """The column by which the rows of several sensors take turns, and its cell for each of them; none of one."""
         rows = [cells for line in self._batch[:LOOKED_AT] if len(cells := self._cells(line)) == len(self.keys)]
-        return in_turn(self.keys, [[row[place].strip(_QUOTED) for row in rows] for place in range(len(self.keys))])
+        return in_turn(self.keys, [[row[column].strip(_QUOTED) for row in rows] for column in range(len(self.keys))])
 
     def only(self, key: str, cell: str) -> None:
         """Read only the rows that have this cell in a column."""
@@ -210,16 +210,16 @@ class TextReader:
             if blank and filled and not self._skip_bad:
                 self._fail(lines, None, "an empty line")
             blank = blank or filled < len(batch)
-            wanted = [place for place, part in enumerate(parts) if part is not None]
+            wanted = [k for k, part in enumerate(parts) if part is not None]
             bound_numbers(self.path, (rows + filled) * len(wanted))
             skipped = len(self._skipped)
             dated = None if time is None else wanted.index(time)
-            table = self._parse(batch[:filled], [index[place] for place in wanted], dated)
+            table = self._parse(batch[:filled], [index[k] for k in wanted], dated)
             if table is None:
                 table = self._scan(batch[:filled], lines, index, names, optional, time, parts)
-                wanted = [place for place in wanted if parts[place] is not None]
-            for place, column in zip(wanted, table.T, strict=True):
-                cast(list[NDArray[np.float64]], parts[place]).append(np.ascontiguousarray(column))
+                wanted = [k for k in wanted if parts[k] is not None]
+            for k, column in zip(wanted, table.T, strict=True):
+                cast(list[NDArray[np.float64]], parts[k]).append(np.ascontiguousarray(column))
             if self._skip_bad:
                 left_out = np.array(self._skipped[skipped:], np.int64) - lines
                 places.append(np.delete(np.arange(lines, lines + filled), left_out))
@@ -243,17 +243,17 @@ class TextReader:
             return batch
         again = {line for line in set(batch) if line.strip() in self._heads} if self._heads else set()
         if again:
-            first = next(place for place, line in enumerate(batch) if line in again)
+            first = next(row for row, line in enumerate(batch) if line in again)
             note(f"{self.path}: line {self._row + before + first} repeats the header: the log goes on there")
             self.restarts.append(before + first)
             batch, count = [line for line in batch if line not in again], len(batch)
             self._row += count - len(batch)
         if self._only is not None:
-            place, cell = self._only
+            column, cell = self._only
             batch = [
                 line
                 for line in batch
-                if len(cells := self._cells(line)) <= place or cells[place].strip(_QUOTED) == cell
+                if len(cells := self._cells(line)) <= column or cells[column].strip(_QUOTED) == cell
             ]
         return batch
 
@@ -261,22 +261,22 @@ class TextReader:
         """The header line, its number, and the first row's; the lines after it are the rest."""
         batch = self._lines.more()
         comment, plain = -1, -1
-        for place, line in enumerate(batch):
-            if place >= MOST_LEADING_LINES + 1:
+        for row, line in enumerate(batch):
+            if row >= MOST_LEADING_LINES + 1:
                 break
             if not line.strip():
                 continue
             bare = _bare(line)
             if plain < 0:
                 if bare != line.strip(" "):
-                    comment = place
+                    comment = row
                 else:
-                    plain = place
-            if _is_header(bare, batch[place + 1 : place + 2], knows):
-                return self._begins(batch, place, place + 1, bare)
-            named = _with_units(bare, batch[place + 1 : place + 2])
-            if named and _is_header(named, batch[place + 2 : place + 3], knows):
-                return self._begins(batch, place, place + 2, named)
+                    plain = row
+            if _is_header(bare, batch[row + 1 : row + 2], knows):
+                return self._begins(batch, row, row + 1, bare)
+            named = _with_units(bare, batch[row + 1 : row + 2])
+            if named and _is_header(named, batch[row + 2 : row + 3], knows):
+                return self._begins(batch, row, row + 2, named)
         if comment >= 0 and plain >= 0 and _ROW.fullmatch(batch[plain]):
             return self._begins(batch, comment, plain, _bare(batch[comment]))
         if 0 <= plain < MOST_LEADING_LINES:
@@ -315,16 +315,16 @@ class TextReader:
     def _stated(self, headings: list[str]) -> list[str]:
         """The headings with the units that the cells of the first row have after their numbers: `0.02 sec`."""
         cells = self._cells(self._batch[0])
-        for place, (heading, cell) in enumerate(zip(headings, cells, strict=False)):
+        for column, (heading, cell) in enumerate(zip(headings, cells, strict=False)):
             match = _WITH_UNIT.fullmatch(cell)
             if match is not None and units.known(unit := units.plain(match[1])) and not set("[(") & set(heading):
-                self._ending[place] = match[1]
-                headings[place] = f"{heading.strip(_QUOTED)} [{unit}]"
+                self._ending[column] = match[1]
+                headings[column] = f"{heading.strip(_QUOTED)} [{unit}]"
         return headings
 
-    def _heading(self, cell: str, number: int, place: int) -> str:
-        where = f"{self.path}: line {number}: column {place + 1}: "
-        if place >= MOST_COLUMNS:
+    def _heading(self, cell: str, number: int, column: int) -> str:
+        where = f"{self.path}: line {number}: column {column + 1}: "
+        if column >= MOST_COLUMNS:
             raise UserError(f"{where}more than {MOST_COLUMNS} columns")
         heading = _unquoted(cell)
         if heading is None:
@@ -382,15 +382,15 @@ class TextReader:
             try:
                 cells = self._row_of(line)
                 values = []
-                for place, column in enumerate(index):
-                    if parts[place] is None:
+                for k, column in enumerate(index):
+                    if parts[k] is None:
                         value = math.nan
-                    elif place < len(optional) and optional[place]:
-                        value = self._optional(cells[column], place, parts)
+                    elif k < len(optional) and optional[k]:
+                        value = self._optional(cells[column], k, parts)
                     elif column in self._ending:
-                        value = self._value(cells[column].strip().removesuffix(f" {self._ending[column]}"), place)
+                        value = self._value(cells[column].strip().removesuffix(f" {self._ending[column]}"), k)
                     else:
-                        value = self._value(cells[column], place, dated=place == time)
+                        value = self._value(cells[column], k, dated=k == time)
                     values.append(value)
                 rows.append(values)
             except _Bad as bad:
@@ -405,13 +405,13 @@ class TextReader:
                         f"of its columns; this one: {bad.what}"
                     ) from None
         table = np.array(rows, np.float64).reshape(len(rows), len(index))
-        return table[:, [place for place in range(len(index)) if parts[place] is not None]]
+        return table[:, [k for k in range(len(index)) if parts[k] is not None]]
 
-    def _optional(self, cell: str, place: int, parts: list[list[NDArray[np.float64]] | None]) -> float:
+    def _optional(self, cell: str, k: int, parts: list[list[NDArray[np.float64]] | None]) -> float:
         try:
-            return self._value(cell, place)
+            return self._value(cell, k)
         except _Bad:
-            parts[place] = None
+            parts[k] = None
             return math.nan
 
     def _row_of(self, line: str) -> list[str]:
@@ -423,26 +423,26 @@ class TextReader:
             raise _Bad(None, f"{what}: --skip-bad leaves such lines out")
         return cells
 
-    def _value(self, text: str, place: int, dated: bool = False) -> float:
+    def _value(self, text: str, k: int, dated: bool = False) -> float:
         cell = _unquoted(text)
         if cell is None:
-            raise _Bad(place, f"an unclosed quote: '{short(text.strip())}'")
+            raise _Bad(k, f"an unclosed quote: '{short(text.strip())}'")
         if dated:
             try:
                 return self._date(cell)
             except (ValueError, TypeError):
-                raise _Bad(place, f"'{short(cell)}' is no date like the first") from None
+                raise _Bad(k, f"'{short(cell)}' is no date like the first") from None
         if _MISSING.fullmatch(cell):
             return math.nan
         for sign in ",.":
             if self._separator != "," and sign in cell:
                 if self._decimal not in (None, sign) or (sign == "," and "." in cell):
-                    raise _Bad(place, f"'{short(cell)}': both ',' and '.' are used as decimal sign")
+                    raise _Bad(k, f"'{short(cell)}': both ',' and '.' are used as decimal sign")
                 self._decimal = sign
                 cell = cell.replace(",", ".")
                 break
         if not _NUMBER.fullmatch(cell) and not _NOT_FINITE.fullmatch(cell):
-            raise _Bad(place, f"'{short(cell)}' is not a number")
+            raise _Bad(k, f"'{short(cell)}' is not a number")
         return float(cell)
 
     def _date(self, cell: str) -> float:
@@ -474,11 +474,11 @@ def in_turn(keys: Sequence[str], columns: Sequence[Sequence[str]]) -> list[tuple
     `columns`: the cells of the first LOOKED_AT rows."""
     numbering = number_of(keys)
     for key, cells in zip(keys, columns, strict=True):
-        found = list(dict.fromkeys(cells))
-        if not 1 < len(found) <= 16 < len(cells) / 4 or not all(map(_WORD.fullmatch, found)):
+        words = list(dict.fromkeys(cells))
+        if not 1 < len(words) <= 16 < len(cells) / 4 or not all(map(_WORD.fullmatch, words)):
             continue
-        if key == numbering or not (any(map(_ROW.fullmatch, found)) or _keeps(cells)):
-            return [(key, cell) for cell in found]
+        if key == numbering or not (any(map(_ROW.fullmatch, words)) or _keeps(cells)):
+            return [(key, cell) for cell in words]
     return []
 
 

@@ -57,7 +57,7 @@ class TextTable(Table):
             reader = TextReader(path, files, self.knows(self.text), skip_bad=self.skip_bad, opened=self.text.open)
             if self.only is not None:
                 reader.only(*self.only)
-            dated = next((place for place, wanted in enumerate(fields) if wanted.dates), None)
+            dated = next((k for k, wanted in enumerate(fields) if wanted.dates), None)
             pairs = [(field.key, field.name) for field in fields]
             read = reader.columns(pairs, [wanted.optional for wanted in fields], dated)
         fields = [wanted for wanted, column in zip(fields, read, strict=True) if column is not None]

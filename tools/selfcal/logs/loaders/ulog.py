@@ -44,19 +44,19 @@ def read(path: Path, _: Hints) -> list[Table]:
         damaged, sound = sifted(data, 16, _ends(data))
     with path.open("rb") if sound is None else BytesIO(sound) as stream:
         log = ULog(stream, [*_SOURCES, "sensor_selection"])
-    found: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
+    topics_of: dict[tuple[str, int], dict[str, Mapping[str, NDArray[Any]]]] = {}
     order = list(_SOURCES)
     known = [topic for topic in log.data_list if topic.name in _SOURCES]
     for topic in sorted(known, key=lambda topic: order.index(topic.name)):
-        found.setdefault((_SOURCES[topic.name], topic.multi_id), {})[topic.name] = topic.data
-    if not found:
+        topics_of.setdefault((_SOURCES[topic.name], topic.multi_id), {})[topic.name] = topic.data
+    if not topics_of:
         raise UserError(f"{path}: no topic {', '.join(_SOURCES)}")
     lost = [dropout.duration for dropout in log.dropouts]
     notes = (f"the logger dropped out {len(lost)} times, {sum(lost) / 1000:.3g} s together",) if lost else ()
     serial = log.msg_info_dict.get("sys_uuid", "")
     meta = {"serial": serial} if isinstance(serial, str) and serial else {}
     tables = []
-    for (source, instance), topics in found.items():
+    for (source, instance), topics in topics_of.items():
         name = source if source == "sensor_combined" else f"{source}.{instance}"
         tables += [of_arrays(name, _columns(topic, data), meta, notes, damaged) for topic, data in topics.items()]
     return tables
@@ -114,11 +114,11 @@ def _columns(topic: str, data: Mapping[str, NDArray[Any]]) -> Columns:
         case "sensor_accel":
             columns |= _triad("a", [data[axis] for axis in "xyz"])
         case "sensor_combined":
-            columns |= _triad("g", [data[f"gyro_rad[{place}]"] for place in range(3)])
-            columns |= _triad("a", [data[f"accelerometer_m_s2[{place}]"] for place in range(3)])
+            columns |= _triad("g", [data[f"gyro_rad[{k}]"] for k in range(3)])
+            columns |= _triad("a", [data[f"accelerometer_m_s2[{k}]"] for k in range(3)])
         case _:
-            columns |= _triad("g", [_rate(data, "delta_angle", place) for place in range(3)])
-            columns |= _triad("a", [_rate(data, "delta_velocity", place) for place in range(3)])
+            columns |= _triad("g", [_rate(data, "delta_angle", k) for k in range(3)])
+            columns |= _triad("a", [_rate(data, "delta_velocity", k) for k in range(3)])
     if "temperature" in data and np.isfinite(data["temperature"]).any():
         columns["temp[degC]"] = data["temperature"]
     return columns
@@ -129,20 +129,20 @@ def _triad(letter: str, values: Sequence[NDArray[Any]]) -> Columns:
     return {f"{letter}{axis}[{unit}]": column for axis, column in zip("xyz", values, strict=True)}
 
 
-def _rate(data: Mapping[str, NDArray[Any]], name: str, place: int) -> NDArray[np.float64]:
+def _rate(data: Mapping[str, NDArray[Any]], name: str, k: int) -> NDArray[np.float64]:
     """An increment over the interval that it was summed over, us; NaN for an interval of 0."""
     interval = np.asarray(data[f"{name}_dt"], np.float64) * 1e-6
-    increment = np.asarray(data[f"{name}[{place}]"], np.float64)
+    increment = np.asarray(data[f"{name}[{k}]"], np.float64)
     return np.asarray(np.where(interval > 0.0, increment / np.where(interval > 0.0, interval, 1.0), np.nan))
 
 
 def _fifo(topic: str, data: Mapping[str, NDArray[Any]], stamps: NDArray[Any]) -> Columns:
     """The samples of a FIFO's messages: each message has `samples` of them, the last at its stamp, `dt` us apart."""
     depth = 1 + max(int(key[2:-1]) for key in data if key.startswith("x["))
-    place = np.arange(depth)
+    turn = np.arange(depth)
     count = np.asarray(data["samples"], np.int64)[:, None]
-    used = place < count
-    time = stamps[:, None].astype(np.float64) - (count - 1 - place) * np.asarray(data["dt"], np.float64)[:, None]
+    used = turn < count
+    time = stamps[:, None].astype(np.float64) - (count - 1 - turn) * np.asarray(data["dt"], np.float64)[:, None]
     columns: Columns = {"t[us]": time[used]}
     scale = np.asarray(data["scale"], np.float64)[:, None]
     counts = [np.stack([data[f"{axis}[{k}]"] for k in range(depth)], axis=1) for axis in "xyz"]

@@ -8,7 +8,6 @@ from collections.abc import Callable
 
 import numpy as np
 
-from selfcal.model.file import Prior
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, probabilities, weighted
 
@@ -42,7 +41,8 @@ def filtered(problem: Problem, law: str, begin: Begin, step: Step) -> tuple[Floa
     """ln parameters [d, particles], their weights, and the ln evidence of all samples but the first, which gives the
     level."""
     rng = np.random.default_rng(1)
-    ln_theta = np.array([_draw(problem.group.priors[name], rng) for name in NAMED[law].parameters])
+    priors = [problem.group.priors[name] for name in NAMED[law].parameters]
+    ln_theta = np.log([[prior.at(u) for u in rng.random(PARTICLES).tolist()] for prior in priors])
     state = begin(problem, law, ln_theta, rng)
     ln_weight = np.zeros(PARTICLES)
     evidence = 0.0
@@ -86,11 +86,3 @@ def step(
     drift = phi * drift + np.sqrt(variance) * rng.standard_normal(PARTICLES)
     noise = np.exp(2.0 * ln_theta[0]) / problem.dt_s
     return -0.5 * ((value - level - drift) ** 2 / noise + np.log(2.0 * math.pi * noise)), np.stack([level, drift])
-
-
-def _draw(prior: Prior, rng: np.random.Generator) -> Floats:
-    if prior.law == "log_normal":
-        return np.log([prior.at(u) for u in rng.random(PARTICLES).tolist()])
-    if prior.law == "uniform":
-        return np.asarray(np.log(rng.uniform(prior.min, prior.max, PARTICLES)))
-    return np.asarray(rng.uniform(math.log(prior.min), math.log(prior.max), PARTICLES))

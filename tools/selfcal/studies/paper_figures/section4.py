@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from selfcal.adequacy.drawn import simulate_bank_samples
+from selfcal.adequacy.summary import NOISIER
 from selfcal.bank.result import HALF_90, AxisResult, Estimate
 from selfcal.base.grid import Array
 from selfcal.logs.recording import as_float, load
@@ -20,7 +21,7 @@ from selfcal.show.chart import Band, Curve, Figure, Panel
 from selfcal.studies.methods.allan import fit
 from selfcal.studies.methods.problem import Problem, Value
 from selfcal.studies.paper_figures.reproduction import Reproduction
-from selfcal.studies.paper_figures.section3 import PAPER, over_time
+from selfcal.studies.paper_figures.section3 import PAPER, by_chance, over_time
 
 AXIS = "ax"
 #: The paper's result, of which the simulated records are made: m/s^2/sqrt(Hz), m/s^3/sqrt(Hz).
@@ -46,10 +47,8 @@ TRUTHS = {
     "random_walk": {"N": PAPER_N, "K": PAPER_K},
     "gauss_markov": {"N": PAPER_N, "sigma_m": PAPER_K * math.sqrt(SLOW_S / 2.0), "alpha": 1.0 / SLOW_S},
 }
-#: A computed rms is consistent if it is this near to the real one; of SCATTER records that is 2.4 standard errors.
-NEAR = 1.25
-#: Factor between a median and the middle one from which on its record is named.
-FAR_OFF = 2.0
+#: A computed rms is consistent if it is this near to the real one, which SCATTER records know no better.
+NEAR = 1.0 + by_chance(1) / math.sqrt(2.0 * SCATTER)
 #: Section 4.2, four areas: rms in mGal, correlation interval in min, white noise in mGal. The paper's Fig. 8 has 1 to
 #: 2, 50 to 200 and below 0.012. It does not give the interval between samples.
 AREAS = {
@@ -181,7 +180,7 @@ def _far_off(titles: Iterable[str], last_of: Mapping[str, Sequence[Estimate]]) -
             [estimate.median for estimate in estimates]
         )
         k = int(np.argmax(np.abs(np.log(times))))
-        if max(times[k], 1.0 / times[k]) > FAR_OFF:
+        if max(times[k], 1.0 / times[k]) > NOISIER:
             factor = f"{times[k]:.2g} times" if times[k] > 1.0 else f"1/{1.0 / times[k]:.2g} of"
             said.append(
                 f"{name} of {list(titles)[k]} is {factor} the middle one: its interval, "
