@@ -44,7 +44,7 @@ def in_order(time: Array, tick_s: float, mend: bool) -> Order:
     within their neighbourhood, those of damaged and repeated stamps left out. Stamps may fall in what comes back."""
     rows = np.arange(time.size)
     notes: list[str] = []
-    if time.size > 1 and np.median(np.diff(time)) < 0.0 and time[-1] < time[0]:
+    if time.size > 2 and np.median(np.diff(time)) < 0.0 and time[-1] < time[0]:
         rows, time = rows[::-1], time[::-1]
         notes.append("the rows are newest first: read from the last one on")
     time, remark = unwrapped(time, tick_s)
