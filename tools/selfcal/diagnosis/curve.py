@@ -19,15 +19,13 @@ from selfcal.likelihood import columns
 from selfcal.likelihood.columns import SMALLER, Shape, Tried
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.fit import left as left_of
-from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, net
+from selfcal.likelihood.state import ABREAST, NET_LEAST, Look, Regressor, State, net
 from selfcal.likelihood.statemodel import Array
 
 #: Knots of the splines, even over the channel's range.
 KNOTS = (6, 12, 36)
 #: Places of a hinge or a jump, even over the range; numbers of all their columns at most; terms of a curve at most.
 PLACES, NUMBERS_MOST, TERMS_MOST = 300, 20_000_000, 40
-#: Columns that are whitened at once.
-ABREAST = 30
 #: Half the width of a jump, of the distance between places.
 JUMP = 0.05
 #: The form's name in the model file.

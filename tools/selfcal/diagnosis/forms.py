@@ -25,7 +25,7 @@ from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, Number, Shape, Tried
 from selfcal.likelihood.fit import left
-from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, ln_looks
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State, ln_looks
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, POWER, curved, formed, slope
@@ -333,7 +333,7 @@ def _noiseless(channel: Channel, shape: Shape, state: State) -> dict[str, Any]:
 
 def _constant(state: State, trial: Tried) -> bool:
     """Whether each column of a form has one coefficient at all frequencies, as far as the record shows."""
-    return trial.net < 3.0 or _inconstant(state, trial) < NET_LEAST
+    return trial.net < ALIKE or _inconstant(state, trial) < NET_LEAST
 
 
 def _inconstant(state: State, trial: Tried) -> float:

@@ -25,7 +25,7 @@ from selfcal.diagnosis.statistics import judged
 from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import edges, work
 from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, Regressor, State
+from selfcal.likelihood.state import ALIKE, NET_LEAST, SLOW_S, Look, Regressor, State
 from selfcal.readings.motion import Moved
 
 #: Looks that one round tries on an axis.
@@ -221,7 +221,7 @@ def _louder(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[s
     states = dict(record.axes)
     for number in range(FIRST_LOUD, FIRST_LOUD + (variance_change.CAUSE.grouping.most or ROUNDS)):
         event = module.louder(states)
-        if event is None or not _give(record, found, states, event, number, module.MEANS_S):
+        if event is None or not _give(record, found, states, event, number, SLOW_S):
             break
     changed = {name: state.r / record.axes[name].r for name, state in states.items() if state is not record.axes[name]}
     return replace(_with(record, found, states), apart={name: rarer(ratio) for name, ratio in changed.items()})
@@ -325,7 +325,7 @@ def _fast(record: Record, found: Mapping[str, Diagnosed]) -> Record:
     """What acts on several axes faster than means show."""
     states = dict(record.axes)
     for number, line in enumerate(module.fast_lines(states), 1 + module.MOST):
-        _give(record, found, states, line, number, module.MEANS_S)
+        _give(record, found, states, line, number, SLOW_S)
     return _with(record, found, states)
 
 

@@ -27,7 +27,7 @@ from selfcal.diagnosis.causes.variance_change import Power, filtered, ln_changes
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, shape_of, side_of, variants_of
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
-from selfcal.likelihood.columns import LN_EITHER, LN_SLOW
+from selfcal.likelihood.columns import FITTED, LN_EITHER, LN_SLOW
 from selfcal.likelihood.edges import EDGE, peaks, scan, white_of
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
@@ -45,15 +45,13 @@ from selfcal.likelihood.joint import (
     refitted,
     without_lines,
 )
-from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, State
+from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, SLOW_S, State
 from selfcal.likelihood.statemodel import Array, Mask
 
 #: Chance makes an evidence of T nats and more on this times e^-T of modules on which nothing acts (`make module-null`).
 NULL = 0.05
 #: Evidence of a candidate that is named, nats.
 NAMED = math.log(NULL) + EVIDENT
-#: Means of this length at least, s: whatever the rate, what is slow is in them.
-MEANS_S = 1.0
 #: Means that the joint model takes at least, and the share of them that an axis may lack.
 LEAST, GAPS = 600, 0.3
 #: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
@@ -64,8 +62,6 @@ SPIKE, SPIKE_OF = 7.0, 5
 PASSING = 6
 #: Events of a module at most, those of one axis among them.
 MOST = 16
-#: Candidates of a search beside which the drifts are fitted anew: those fitted without have swallowed a part of them.
-REFITTED = 3
 #: Places beside the best one that share its evidence.
 NEAR = 30
 #: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
@@ -412,7 +408,7 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
     if len(names) < 2 or len(grids) > 1:
         return []
     ((n, dt),) = grids
-    if dt >= MEANS_S:
+    if dt >= SLOW_S:
         return []
     w = np.array([np.nan_to_num(states[name].whitened) for name in names])
     work.count(n, 2 * len(names))
@@ -424,7 +420,7 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
     gain = (power.conj() * (inverse.astype(np.float32) @ power)).sum(axis=0).real / n
     gain[(np.abs(power) ** 2).max(axis=0) > CLEAR_LINE * n] = 0.0
     gain -= ln_lines(np.arange(gain.size) * n / padded, n, np.ones(1))
-    gain[: 1 + int(0.5 / MEANS_S * padded * dt)] = gain[-4:] = 0.0
+    gain[: 1 + int(0.5 / SLOW_S * padded * dt)] = gain[-4:] = 0.0
     found = []
     for _ in range(FAST_LINES):
         at = int(np.argmax(gain))
@@ -559,7 +555,7 @@ def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Ar
     drifts are fitted anew."""
     columns, score, known = scored
     gain = full(score, known)
-    for k in np.argsort(-gain)[:REFITTED]:
+    for k in np.argsort(-gain)[:FITTED]:
         if gain[k] < NET_LEAST:
             return
         cause, theta, _, price = shapes[k]
@@ -727,7 +723,7 @@ class Search:
             found = _best_of(candidate for each in left.values() for candidate in each)
             last = found is None or found.evidence < least
             if last:
-                jumps = [_ranked(left[name])[:REFITTED] for name in JUMPS]
+                jumps = [_ranked(left[name])[:FITTED] for name in JUMPS]
                 found = _best_of(
                     beside(self.seen, candidate) for each in jumps for candidate in each if candidate.evidence > 0.0
                 )
@@ -792,7 +788,7 @@ def together(
     weighed its wandering looks like events: those need be beyond doubt. With it in the model, or where it is not there,
     the usual limit holds."""
     dt = max((state.dt for state in states.values()), default=1.0)
-    block = max(1, round(MEANS_S / dt))
+    block = max(1, round(SLOW_S / dt))
     rest = calmed({name: state for name, state in states.items() if not state.below_lattice}, apart)
     found = {name: half_means(values, block)[0] for name, values in rest.items()}
     found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}

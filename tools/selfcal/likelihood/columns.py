@@ -40,8 +40,8 @@ LN_SLOW = 1.8
 LN_EITHER = math.log(2.0)
 #: Drifts at which shapes are ranked beside the fitted one: its size over e to these. The last is for slow shapes alone.
 SMALLER = (1.5, 3.0)
-#: Forms of a family that are fitted: those that rank best. After the first one only forms whose score is within so many
-#: nats, and this share of the best, of what a form needs to be taken, or to be as likely as the best.
+#: Forms of a family, or events of a search, that are fitted: those that rank best. After the first one only forms whose
+#: score is within so many nats, and this share of the best, of what a form needs to be taken, or to be as likely.
 FITTED, FIT_ADDS, COARSE = 3, 3.0, 0.05
 #: Numbers between those of the grid: steps of their logarithms, the first and the last.
 STEP_FIRST, STEP_LAST = 0.35, 0.005
