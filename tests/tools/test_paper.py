@@ -19,6 +19,7 @@ from selfcal.adequacy.allan import overlapping
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.bank.result import Estimate
 from selfcal.base.errors import UserError
+from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.show.chart import Figure, Panel
 from selfcal.studies.paper import show
@@ -137,20 +138,17 @@ def test_a_track_left_out_is_an_interpolation_of_the_others() -> None:
         assert found[k] == pytest.approx(measured[own] - mapped)
 
 
-def test_the_tracks_are_recordings_of_gravity(tmp_path: Path) -> None:
-    """`part` and `identify` read a track in mGal. Their priors are wider than the page's, which holds N low: sigma_m is
-    within 30 % of the page's, two of its sd after 100 samples."""
+def test_a_track_is_a_recording_of_gravity(tmp_path: Path) -> None:
+    """`part` and `identify` read a track in mGal, a row every 600 s. Their priors are wider than the page's, which holds N
+    low: sigma_m is within 30 % of the page's, two of its sd after 100 samples."""
     errors = survey.left_out(11, np.random.default_rng(2))
-    survey.write_tracks(tmp_path / "tracks", {"area 1": errors})
-    log, model = tmp_path / "tracks" / "area-1-track-02.csv", tmp_path / "survey.yaml"
-    assert log.read_text().startswith("t[s],gravity[mGal]\n")
+    log, model = tmp_path / "track.csv", tmp_path / "survey.yaml"
+    save(log, {"gravity": ("mGal", errors[1])}, 1.0 / section4.AREA_STEP_S)
     part([log], model, axes=["gravity"])
     answer = identify(log, model=model)["axes"]["gravity"]
     _, (rms, _, _) = section4.of_map_error(section4.map_tables(Model.load(section3.PAPER)), 1e-5 * errors[1])
     sigma = answer["parameters"]["gauss_markov"]["sigma_m"]
     assert (sigma["median"], sigma["unit"]) == (pytest.approx(rms, rel=0.3), "mGal")
-    with pytest.raises(UserError, match="cannot make this folder"):
-        survey.write_tracks(tmp_path / "no" / "tracks", {"area 1": errors})
 
 
 def test_reports_over_time_are_those_of_the_whole_record() -> None:

@@ -24,9 +24,6 @@ def paper(
     seed: Annotated[int, option("Same seed, same page", metavar="N", min=0)] = 1,
     scheduler: Scheduler = None,
     results: Results = None,
-    tracks: Annotated[
-        Path | str | None, option("Folder for the map errors of Section 4.2, a recording a track", metavar="DIR")
-    ] = None,
 ) -> list[Reproduction]:
     """Write the page to `output`; returns its figures.
 
@@ -47,8 +44,6 @@ def paper(
     if data is not None and not folder.is_dir():
         raise UserError(f"--data {folder}: there is no such folder")
     areas = survey.surveys(seed)
-    if tracks is not None:
-        survey.write_tracks(Path(tracks), areas)
     priors, default = Model.load(section3.PAPER), section4.two_laws(Model.load())
     rows = section3.ensemble(priors, seeds, seed, scheduler, results)
     figures = [section3.figure_1(rows), section3.figure_2(rows), *section3.figures_3_and_4(seed)]

@@ -13,14 +13,10 @@ The map maker knows the field's covariance, and counts the slow error as white n
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 
 import numpy as np
 
-from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
-from selfcal.base.output import check_place
-from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.show.chart import Curve, Figure, Panel
 from selfcal.studies.paper_figures.reproduction import Reproduction
@@ -63,19 +59,6 @@ def differences(covariance: Array, measured: Array, tracks: int) -> Array:
 def surveys(seed: int) -> dict[str, Array]:
     """By area: the differences of its tracks, mGal, [tracks, AREA_SAMPLES]."""
     return {area: left_out(count, np.random.default_rng([seed, count])) for area, count in TRACKS.items()}
-
-
-def write_tracks(folder: Path, areas: Mapping[str, Array]) -> None:
-    """A recording a track, `gravity[mGal]` every AREA_STEP_S, in a folder that exists or whose parent does."""
-    try:
-        folder.mkdir(exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--tracks {folder}: cannot make this folder ({error.strerror})") from error
-    for area, errors in areas.items():
-        for k, track in enumerate(errors, start=1):
-            path = folder / f"{area.replace(' ', '-')}-track-{k:02d}.csv"
-            check_place(path)
-            save(path, {"gravity": ("mGal", track)}, 1.0 / AREA_STEP_S, t=AREA_STEP_S * np.arange(track.size))
 
 
 def figure(model: Model, areas: Mapping[str, Array]) -> Reproduction:
