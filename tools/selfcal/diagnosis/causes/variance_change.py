@@ -14,6 +14,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from scipy.ndimage import uniform_filter1d
 
 from selfcal.base.grid import Rows
 from selfcal.diagnosis.cause import (
@@ -39,6 +40,7 @@ from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
+from selfcal.readings.motion import LEVEL
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
@@ -66,9 +68,12 @@ class Power:
 
     @classmethod
     def of(cls, whitened: Array) -> Power:
-        """Of residual innovations [m, n] of standard deviation 1, NaN where they are missing."""
+        """Of residual innovations [m, n] of standard deviation 1, NaN where they are missing. What a jump of the bias
+        leaves is no noise: they are taken about their mean nearby, less which white noise has a little less power."""
         there = np.isfinite(whitened)
-        square = np.where(there, np.minimum(whitened**2, MOST) + 1e-12, 0.0)
+        known, near = (uniform_filter1d(rows, LEVEL, axis=1) for rows in (there.astype(float), np.nan_to_num(whitened)))
+        apart = (whitened - near / np.maximum(known, 1e-9)) / np.sqrt(1.0 - 1.0 / LEVEL)
+        square = np.where(there, np.minimum(apart**2, MOST) + 1e-12, 0.0)
         total, count = (np.cumsum(np.pad(rows, ((0, 0), (1, 0))), axis=1) for rows in (square, there.astype(float)))
         return cls(total, count, np.flatnonzero(there.any(axis=0)))
 
@@ -87,12 +92,14 @@ class Power:
         return np.maximum(square, 1e-12) / np.maximum(n, 1.0), n
 
     def gain(self, begin: Rows | int, end: Rows | int) -> Array:
-        """Gain of ln likelihood [m, k] by a level of their own of stretches; 0 of few samples."""
+        """Gain of ln likelihood [m, k] by a level of their own of stretches; 0 of few samples in them or at an end."""
         (level, n), every = self.levels(begin, end), self.count[:, -1:]
         mean = self.total[:, -1:] / np.maximum(every, 1.0)
-        least = np.maximum(EDGE_SAMPLES, np.round(every * EDGE_SHARE))
         found = 0.5 * (every * np.log(np.maximum(mean, 1e-12)) - (n * np.log(level)).sum(axis=0))
-        return np.where((n >= least).all(axis=0), found, 0.0)
+        before, after = (self.count[:, np.atleast_1d(at)] for at in (begin, end))
+        after = np.where(np.atleast_1d(end) < self.n, every - after, math.inf)  # it may last
+        least = np.maximum(EDGE_SAMPLES, np.round(every * EDGE_SHARE))
+        return np.where(np.minimum(np.minimum(before, after), n[0]) >= least, found, 0.0)
 
     def wide(self, states: Sequence[State], begin: int, end: int) -> Array:
         """Times [m] that the null is wider than of normal noise, by the kurtosis of the squares beside the levels of a
@@ -321,7 +328,7 @@ def _extend(at: Extension) -> None:
 def _alike(a: Look, b: Look) -> bool:
     if a.when is None or b.when is None:
         return a.when is b.when and a.estimate["channel"] == b.estimate["channel"]
-    return abs(a.when[0] - b.when[0]) < ONE_EVENT_S
+    return all(abs(one - two) < ONE_EVENT_S for one, two in zip(a.when, b.when, strict=True))
 
 
 CAUSE = Cause(
