@@ -139,8 +139,8 @@ def test_a_track_left_out_is_an_interpolation_of_the_others() -> None:
 
 
 def test_a_track_is_a_recording_of_gravity(tmp_path: Path) -> None:
-    """`part` and `identify` read a track in mGal, a row every 600 s. Their priors are wider than the page's, which holds N
-    low: sigma_m is within 30 % of the page's, two of its sd after 100 samples."""
+    """`part` and `identify` read a track in mGal, a row every 600 s. Their priors are wider than the page's, which
+    holds N low: sigma_m is within 30 % of the page's, two of its sd after 100 samples."""
     errors = survey.left_out(11, np.random.default_rng(2))
     log, model = tmp_path / "track.csv", tmp_path / "survey.yaml"
     save(log, {"gravity": ("mGal", errors[1])}, 1.0 / section4.AREA_STEP_S)
