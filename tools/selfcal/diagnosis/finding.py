@@ -98,8 +98,8 @@ class Diagnosed:
     def loud(self) -> Mask:
         """[n]: when its noise is louder than most of the time, for a while."""
         ratio = self.state.r / self.first.r
-        once = any("r" in finding.look.changes and finding.look.when for finding in self.findings)
-        found: Mask = (ratio > ratio.min()) & rarer(ratio) & once
+        passes = any("r" in each.look.changes and "duration_s" in each.look.estimate for each in self.findings)
+        found: Mask = (ratio > ratio.min()) & rarer(ratio) & passes
         return found
 
     @property
