@@ -20,7 +20,7 @@ from selfcal.model.file import HiddenInput, Model
 
 
 def add_biases(document: dict[str, Any], recording: Recording, model: Model, stated: HiddenInput) -> None:
-    """Put `together` into `bias_now` of the axes of `identify` that the quantity moves, where two or more are there."""
+    """Put `together` into `bias_now` of the axes of `identify` that the quantity moves."""
     try:
         record = of_recording(recording, model, min(RATE_HZ, recording.rate_hz, MOST / recording.duration_s))
     except UserError:  # too short
@@ -30,7 +30,7 @@ def add_biases(document: dict[str, Any], recording: Recording, model: Model, sta
         if name in stated.loadings and "error" not in document["axes"].get(name, {"error": ""}):
             with suppress(UserError):
                 states[name] = (state.masked(record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
-    if len(states) < 2:
+    if not states:
         return
     y = np.array([state.rest for state in states.values()])
     scale = np.nanstd(np.diff(y, axis=1), axis=1) / np.sqrt(2.0)

@@ -14,6 +14,8 @@ from selfcal.verbs._shared import ModelFile
 REPORT_S, FASTEST = 10.0, 1000.0
 #: python-can's own group and port, so that its tools listen there without more.
 GROUP, PORT = "239.74.163.2", 43113
+#: Time that the firmware waits for a host, s: longer than anybody does.
+FOREVER_S = 999_999.0
 
 
 def demo(
@@ -34,7 +36,6 @@ def demo(
     import shlex
     import tempfile
 
-    import numpy as np
     from rich.console import Console
 
     from selfcal.adequacy.identify import chosen_axes
@@ -56,8 +57,7 @@ def demo(
     recording = recording.along(*names)
     with Console(stderr=True).status("building the firmware"):
         firmware = build(loaded, recording.rate_hz, names)
-    forever_s = int(np.iinfo(np.int32).max) // 1000  # the firmware counts ms
-    more = ["--realtime", f"{speed:g}", "--timeout", f"{forever_s}", "--node", str(node)]
+    more = ["--realtime", f"{speed:g}", "--timeout", f"{FOREVER_S:g}", "--node", str(node)]
     if transport == "can":
         more += ["--can", channel or f"{GROUP}:{PORT}"]
         watch = (

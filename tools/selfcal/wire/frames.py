@@ -41,8 +41,9 @@ STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE = "STATUS", "CORRECTED", "COMMAND", "
 STATISTICS = ("mean", "median", "sd", "q05", "q95")
 #: Moduli of the counter and of the time, s. Beyond half of them forward and backward are alike.
 COUNTER, SECONDS = (1 << COMMON[name][1] for name in ("counter", "time"))
-#: Frames in a row, counted up, that restart the counter; a stream is no stranger's from then. Statuses of two modules,
-#: or in a row of another version, of a module that stated this version before.
+#: Whole statuses in a row with another version, of a module that stated this version before.
+FOREIGN_STATUSES = 2
+#: Frames in a row, counted up, that restart the counter; a stream is no stranger's from then. Statuses of two modules.
 RESYNC = 3
 
 
@@ -384,7 +385,7 @@ class Decoder:
     def foreign(self) -> str:
         """What is wrong if the module speaks another version of the wire; empty if it does not.
 
-        A module that has spoken this version has to state another in RESYNC whole statuses in a row.
+        A module that has spoken this version has to state another in FOREIGN_STATUSES whole statuses in a row.
         """
         if self._other is None or self._ours:
             return ""
@@ -401,7 +402,7 @@ class Decoder:
     @property
     def surely_foreign(self) -> bool:
         """Whole statuses in a row have stated so, no lone frame."""
-        return bool(self.foreign) and self._others >= RESYNC
+        return bool(self.foreign) and self._others >= FOREIGN_STATUSES
 
     def feed(self, message: can.Message) -> list[AxisReport]:
         """Take a frame; return the reports that it closes (none, one or two)."""
@@ -473,7 +474,7 @@ class Decoder:
         if "frames_sent" in values:
             self._exact(int(values["frames_sent"]))
             self._others += self._other is not None
-            self._ours = self._ours and self._others < RESYNC
+            self._ours = self._ours and self._others < FOREIGN_STATUSES
         if self.foreign:
             self.status = {"wire_version": cast(float, self._other)}
             self._open = None

@@ -36,11 +36,12 @@ def mixed(state: State, record: Record) -> list[Look]:
     present = np.isfinite(w)
     x = w[present]
     n = x.size
-    if n < 50 or np.abs(x).max() < 3.5:
+    far = int(np.count_nonzero(np.abs(x) > 3.5))
+    if n < 50 or not far:
         return []
     if state.lsb <= 0.0 and float(np.mean(np.diff(state.y) == 0.0)) > REPEATS_MOST:
         return []  # a dead band: without the readings beyond it no noise is left
-    share, wide, core = max(1.0, float((np.abs(x) > 4.0).sum())) / n, max(3.0, float(np.abs(x).max()) / 2.0), 1.0
+    share, wide, core = far / n, max(3.0, float(np.abs(x).max()) / 2.0), 1.0
     plain = -0.5 * (x**2).sum() / np.mean(x**2) - n * 0.5 * math.log(float(np.mean(x**2)))
     weight = np.zeros(n)
     before = -math.inf

@@ -44,6 +44,8 @@ from selfcal.readings.motion import LEVEL
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0
+#: ln of the variance over that of the rest, at most: readings that are so much quieter have no noise, they repeat.
+LOUDEST = math.log(1e3)
 #: Places among which the two ends of a stretch are looked for first.
 PLACES = 120
 #: A squared innovation counts as so many variances at most: one wild sample is no change of the noise.
@@ -200,6 +202,8 @@ def _look(state: State, level: Level) -> Look:
     wide = float(Power.of(changed.whitened[None]).wide([state], 0, state.y.size)[0])
     gain = changed.best.ln_likelihood - state.best.ln_likelihood
     worth = net(gain / wide, 1, level.price(gain))
+    if abs(slope) * float(np.ptp(level.values)) > LOUDEST:
+        worth = 0.0
     return Look("variance_change", gain, worth, level.told(slope, sd, wide), {"r": changed.r}, when=level.when)
 
 
