@@ -27,7 +27,8 @@ def add_biases(document: dict[str, Any], recording: Recording, model: Model, sta
         return
     states = {}
     for name, state in record.axes.items():
-        if name in stated.loadings and "error" not in document["axes"].get(name, {"error": ""}):
+        judged = "error" not in document["axes"].get(name, {"error": ""}) and not state.below_lattice
+        if judged and name in stated.loadings:
             with suppress(UserError):
                 states[name] = (state.masked(record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
     if not states:
