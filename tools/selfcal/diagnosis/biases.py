@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
@@ -10,9 +9,7 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
-from selfcal.diagnosis.record import of_recording
-from selfcal.diagnosis.suspicion import MOST, RATE_HZ
-from selfcal.likelihood.fit import ROUGH_FTOL
+from selfcal.diagnosis.suspicion import rough
 from selfcal.likelihood.joint import Joint, bins_of, fitted, last
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
@@ -21,16 +18,11 @@ from selfcal.model.file import HiddenInput, Model
 
 def add_biases(document: dict[str, Any], recording: Recording, model: Model, stated: HiddenInput) -> None:
     """Put `together` into `bias_now` of the axes of `identify` that the quantity moves."""
+    judged = [name for name, axis in document["axes"].items() if "error" not in axis and name in stated.loadings]
     try:
-        record = of_recording(recording, model, min(RATE_HZ, recording.rate_hz, MOST / recording.duration_s))
-    except UserError:  # too short
+        record, states = rough(recording, model, judged)
+    except UserError:
         return
-    states = {}
-    for name, state in record.axes.items():
-        judged = "error" not in document["axes"].get(name, {"error": ""}) and not state.below_lattice
-        if judged and name in stated.loadings:
-            with suppress(UserError):
-                states[name] = (state.masked(record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
     if not states:
         return
     y = np.array([state.rest for state in states.values()])

@@ -120,12 +120,12 @@ def add_findings(
         for finding, entry in zip(diagnosed.by_gain, document["axes"][name]["findings"], strict=True):
             members.append(Member(name, finding, entry, factor, _plain(diagnosed, finding, recording, factor)))
     events = grouped(members, quantity)
-    drifts = {name: axis.hidden.in_drift(axis.state) for name, axis in found.items() if axis.hidden is not None}
+    drifts = {name: axis.drift for name, axis in found.items()}
     for event in events:
         acted = {*(event.entry or {"axes": ()})["axes"], *(member.axis for member in event.members)}
         event.axes = [axis for axis in document["axes"] if axis in acted]
         event.changes = {
-            axis: _changes(event, axis, document["axes"][axis]["unit"], known.get(axis), drifts.get(axis))
+            axis: _changes(event, axis, document["axes"][axis]["unit"], known.get(axis), drifts[axis])
             for axis in event.axes
         }
     events.sort(key=lambda event: event.order)
@@ -149,8 +149,7 @@ def add_findings(
         axis["verdict"] = "inadequate" if material or UNEXPLAINED in axis["causes"] else "adequate"
         axis["small_findings"] = len(own) - len(material) - axis["causes"].count(UNEXPLAINED)
         of_axis = [member for member in members if member.axis == name]
-        drift = drifts.get(name, (diagnosed.state, diagnosed.state))
-        axis["numbers"] = _before_and_after(diagnosed, drift, of_axis, axis["unit"], known.get(name))
+        axis["numbers"] = _before_and_after(diagnosed, drifts[name], of_axis, axis["unit"], known.get(name))
 
 
 def grouped(members: Sequence[Member], quantity: dict[str, Any] | None = None) -> list[Event]:
@@ -221,7 +220,7 @@ def _calm(before: State, after: State) -> float:
 
 
 def _changes(
-    event: Event, axis: str, unit: str, known: Identified | None, drift: tuple[State, State] | None
+    event: Event, axis: str, unit: str, known: Identified | None, drift: tuple[State, State]
 ) -> dict[str, Any]:
     """What an event does to an axis: N, K and B without it over with it (infinite: with it the record shows none), the
     bias, its error ahead where that is known; and which of them it moves by as much as matters. `drift`: the axis with
@@ -229,7 +228,7 @@ def _changes(
     own = [member for member in event.members if member.axis == axis]
     entry = {} if event.entry is None else event.entry["axes"].get(axis, {})
     pairs = [member.sides for member in own]
-    if event.entry is not None and drift is not None and drift[0] is not drift[1]:
+    if event.entry is not None and drift[0] is not drift[1]:
         factor = units.factor(drift[0].unit, unit)
         pairs.append(_sides(*drift, factor, 1.0))
     found: dict[str, Any] = {}

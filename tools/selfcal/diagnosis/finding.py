@@ -103,6 +103,11 @@ class Diagnosed:
         return found
 
     @property
+    def drift(self) -> tuple[State, State]:
+        """The axis with the jumps of a hidden quantity in its drift, and without them."""
+        return (self.state, self.state) if self.hidden is None else self.hidden.in_drift(self.state)
+
+    @property
     def by_gain(self) -> list[Finding]:
         """The findings, the one that gains most first."""
         return sorted(self.findings, key=lambda finding: finding.look.gain, reverse=True)

@@ -125,7 +125,7 @@ class Hidden:
     def jumps(self) -> list[dict[str, float]]:
         return self.jumped[0]
 
-    @property
+    @cached_property
     def rest(self) -> Array:
         """The records [m, k] less the jumps."""
         return np.asarray(self.y - np.outer(self.model.loading, self.jumped[1]))

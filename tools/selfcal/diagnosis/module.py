@@ -23,7 +23,7 @@ from selfcal.base.grid import half_means
 from selfcal.diagnosis.alias import WANDERS
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
-from selfcal.diagnosis.causes.variance_change import Power, filtered, ln_changes
+from selfcal.diagnosis.causes.variance_change import ln_changes, stretches
 from selfcal.diagnosis.forms import FORMS, LN_FORMS, shape_of, side_of, variants_of
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
@@ -446,10 +446,8 @@ def louder(states: Mapping[str, State]) -> Event | None:
     if len({(states[name].y.size, states[name].dt) for name in names}) != 1 or len(names) < 2:
         return None
     of, dt = [states[name] for name in names], states[names[0]].dt
-    first, found = Power.of(np.array([state.whitened for state in of])), list[Event]()
-    for stretch in first.best():
-        power = filtered(of, first, *stretch)
-        begin, end = power.moved(*stretch)
+    found = list[Event]()
+    for power, (begin, end) in stretches(of):
         level, n = (rows[:, :, 0] for rows in power.levels(begin, end))
         wide = power.wide(of, begin, end)
         gain, widths = power.gain(begin, end) / wide[:, None], np.array(WIDTHS)

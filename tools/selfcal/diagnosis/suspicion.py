@@ -16,9 +16,9 @@ from selfcal.bank.priors import add_sources, for_record
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import UNEXPLAINED
 from selfcal.diagnosis.loop import LOOKS
-from selfcal.diagnosis.record import of_recording
+from selfcal.diagnosis.record import Record, of_recording
 from selfcal.likelihood.fit import ROUGH_FTOL
-from selfcal.likelihood.state import NET_LEAST, Look
+from selfcal.likelihood.state import NET_LEAST, Look, State
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import bank_block, make_tables
@@ -32,19 +32,23 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
 
     The fits are rough: they rank causes, and their sizes lay a prior at most."""
     try:
-        record = of_recording(recording, model, min(RATE_HZ, recording.rate_hz, MOST / recording.duration_s))
+        record, states = rough(recording, model, axes)
     except UserError:
         return {}
     found: dict[str, Look] = {}
-    for name in axes:
-        if name not in record.axes or record.axes[name].below_lattice:
-            continue
-        state = record.axes[name]
-        state = (state.masked(record.moving) if record.moving.any() else state).refit(ftol=ROUGH_FTOL)
+    for name, state in states.items():
         shown = [look for cause in LOOKS for look in cause(state, record) if look.net >= NET_LEAST]
         if shown:  # what has no name is the suspicion where nothing has
             found[name] = max(shown, key=lambda look: (look.cause != UNEXPLAINED, look.net))
     return found
+
+
+def rough(recording: Recording, model: Model, axes: Sequence[str]) -> tuple[Record, dict[str, State]]:
+    """Means of 1 s, and a rough fit of each of the axes that can be judged, less the motion. Raises UserError for a
+    record that is too short."""
+    record = of_recording(recording, model, min(RATE_HZ, recording.rate_hz, MOST / recording.duration_s))
+    states = {name: record.axes[name] for name in axes if name in record.axes and not record.axes[name].below_lattice}
+    return record, {name: state.masked(record.moving).refit(ftol=ROUGH_FTOL) for name, state in states.items()}
 
 
 #: Intervals at most that the laws of `models/sums.yaml` are weighed on: their filters cost twenty times the others'.

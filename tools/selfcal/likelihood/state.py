@@ -111,7 +111,7 @@ class State:
 
     def masked(self, mask: Mask) -> State:
         """The state without the samples of `mask` [n]."""
-        return replace(self, y=np.where(mask, np.nan, self.y))
+        return replace(self, y=np.where(mask, np.nan, self.y)) if mask.any() else self
 
     @property
     def rest(self) -> Array:

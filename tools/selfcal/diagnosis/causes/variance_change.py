@@ -159,8 +159,7 @@ def looks(state: State, record: Record) -> list[Look]:
     if present.sum() < 4 * EDGE_SAMPLES:
         return []
     square = np.minimum(state.whitened[present] ** 2, MOST) + 1e-12
-    power = Power.of(state.whitened[None])
-    times = [_of_time(state, record, *filtered([state], power, *ends).moved(*ends)) for ends in power.best()]
+    times = [_of_time(state, record, *ends) for _, ends in stretches([state])]
     best: dict[str, tuple[float, Level]] = {}
     for level in (*times, *levels(state, record)):
         gain = slope_of(square, level.values[present])[1]
@@ -188,6 +187,14 @@ def filtered(states: Sequence[State], power: Power, begin: int, end: int) -> Pow
         white = run(series, best.terms, best.theta, innovations=True)[1]
         rows.append((white[:, 0] - white[:, 1:] @ best.c) / best.sigma * np.sqrt(raise_by))
     return Power.of(np.array(rows))
+
+
+def stretches(states: Sequence[State]) -> Iterator[tuple[Power, tuple[int, int]]]:
+    """The likeliest change that lasts, and the likeliest stretch: the power of the axes beside it, and its ends."""
+    first = Power.of(np.array([state.whitened for state in states]))
+    for ends in first.best():
+        power = filtered(states, first, *ends)
+        yield power, power.moved(*ends)
 
 
 def _look(state: State, level: Level) -> Look:
