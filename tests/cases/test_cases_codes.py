@@ -55,6 +55,14 @@ def axis_of(path: Path) -> dict[str, object]:
     return found
 
 
+@pytest.mark.parametrize("times", [300.0, 5000.0])
+def test_a_step_in_the_very_middle_is_no_misreading(times: float) -> None:
+    """As many readings at one level as at the other: their median lies between the two, far from all of them."""
+    y = quiet(np.random.default_rng(4), 900)
+    y[450:] += times * SD
+    assert codes_of(y, lattice_of(y, 1.0)) is None
+
+
 @pytest.mark.parametrize(("q", "width"), [(0.15, 0.4), (0.35, 0.8), (0.6, 0.7), (0.0, 0.25), (0.0, 1.3)])
 def test_a_dead_band_is_named_with_its_place_and_share(q: float, width: float) -> None:
     """On a lattice of q noises or on none, half a band of `width` noises. The share of readings that it moves lies in

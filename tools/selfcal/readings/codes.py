@@ -151,7 +151,7 @@ class Cells:
         # A code has an upper and a lower half: that is enough for a cast.
         self.parts = 2 if self.width < 1.5 * self.step else PARTS
         code = np.rint((y - self.origin) / self.width).astype(np.int64)
-        middle = int(np.median(code))
+        middle = int(np.quantile(code, 0.5, method="lower"))  # one of them: a mean of two may lie far from all
         self.kept = np.abs(code - middle) < CODES // self.parts
         code = code[self.kept]
         low, high = int(code.min()), int(code.max())
