@@ -140,7 +140,7 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
 def _times(energy: Energy, stretch: Stretch, recording: Recording) -> tuple[float, float]:
     """Begin and end of a stretch, s, a margin more on either side."""
     begin, end, length_s = stretch.begin * energy.piece_s, stretch.end * energy.piece_s, recording.duration_s
-    margin_s = max(MARGIN_S, 3.0 * energy.piece_s)  # the first loud samples may look like single wild ones
+    margin_s = max(MARGIN_S, 2.0 * energy.piece_s)  # 99 of 100 ends of a loud stretch lie within two pieces
     return begin - margin_s if begin > EDGE_S else 0.0, end + margin_s if end < length_s - EDGE_S else length_s
 
 
@@ -305,7 +305,7 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
         looks = math.log(used.size * pieces / length)
         singly = alone.max(axis=0) - looks - math.log(axes * len(lengths))
         for net, several in ((others.max(axis=0) - looks + FEWER, True), (singly, False)):
-            for window in np.flatnonzero(net > (CLEARLY if several else -math.log(SHARE))):
+            for window in np.flatnonzero(net > CLEARLY):
                 which = loudest[:, window] > CLEARLY if several else np.arange(axes) == np.argmax(alone[:, window])
                 if several == (which.sum() > 1):
                     loud.append((float(net[window]), int(begin[window]), length, which))
@@ -321,10 +321,17 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
-    nets = sorted((each.net for each in [*known, *apart] if each.several and each.net <= sure), reverse=True)
-    # At rest exp(-net) stretches of several axes are beyond a net: the fewest that are together no chance.
-    least = [net for many, net in enumerate(nets, 1) if gammainc(many, math.exp(-net)) < SHARE]
-    return [each for each in apart if each.net > sure or (each.several and each.net >= max(least, default=sure))]
+    enough: list[Stretch] = []
+    for several in (True, False):
+        alike = [each for each in apart if each.several == several]
+        weak = [each for each in [*known, *alike] if each.several == several and each.net <= sure]
+        nets = sorted((each.net for each in weak), reverse=True)
+        # At rest exp(-net) stretches are beyond a net: the fewest that are together no chance. Those of one axis depend
+        # on each other, as its noise is not normal: for them by Simes' bound.
+        chances = (gammainc(k, math.exp(-net)) if several else math.exp(-net) / k for k, net in enumerate(nets, 1))
+        least = max((net for net, chance in zip(nets, chances, strict=True) if chance < SHARE), default=sure)
+        enough += [each for each in alike if each.net > sure or each.net >= least]
+    return enough
 
 
 def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
