@@ -318,11 +318,20 @@ def _counted(stamps: _Stamps, _: float) -> _Fit:
         else 0.0
         for before, after in pairwise(parts)
     ]
-    dt = _slope(index, time, [cut for cut, seconds in zip(cuts, lost, strict=True) if seconds])
+    dt = _slope(index, time, [cut for cut, seconds in zip(cuts, lost, strict=True) if seconds], trimmed=True)
     missing[cuts] = np.maximum(0, np.rint(np.array(lost) / dt)).astype(np.int64)
     kept = steps[~stamps.asleep]
-    nats = stamps.ln_values(kept) + 3.0 * math.log(index.size) if kept.size else 0.0
+    nats = 3.0 * math.log(index.size) + min(stamps.ln_values(kept), _ln_batches(stamps, kept)) if kept.size else 0.0
     return stamps.put_back(_Fit(dt, missing, nats))
+
+
+def _ln_batches(stamps: _Stamps, steps: Floats) -> float:
+    """Nats that write steps [m] within batches and those between them apart from each other."""
+    between = steps > stamps.typical
+    many = int(np.count_nonzero(between))
+    if not 0 < _AWAKE * many < steps.size:
+        return math.inf
+    return stamps.ln_values(steps[between]) + stamps.ln_values(steps[~between]) - float(betaln(many, steps.size))
 
 
 def _stepped(stamps: _Stamps, dt: float) -> _Fit | None:
@@ -350,7 +359,7 @@ def _phased(stamps: _Stamps, dt: float) -> _Fit | None:
     ahead = np.minimum.accumulate(ahead[::-1])[::-1]
     ahead = np.rint(isotonic_regression(np.clip(turns, ahead - 1.0, ahead + 1.0)).x).astype(np.int64)
     cuts = (np.flatnonzero(stamps.asleep) + 1).tolist()
-    dt = _slope(index + ahead, stamps.awake, cuts, turns - ahead)
+    dt = _slope(index + ahead, stamps.awake, cuts, trimmed=True)
     fit = stamps.fit(dt, np.diff(ahead, prepend=ahead[0]), (turns - ahead) * dt)
     pieces = 0.5 * math.log(_PIECE_OF_GRID) * (index.size // _PIECE_OF_GRID)
     return replace(fit, nats=fit.nats + pieces - _ln_line(stamps, dt))
@@ -391,7 +400,9 @@ def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
         phase = float(np.median((stamps.time - sample * dt)[:_NEAR_FIRST])) + 0.5 * slack
         first = (phase - 0.1 * slack, phase + 0.1 * slack)
         fitted = _slope(sample, stamps.time)
-        nats = stamps.fit(fitted, np.where(asleep, 0, missing), stamps.time - sample * fitted).nats
+        slopes = (fitted, _straightest(sample, stamps.time, fitted, stamps.lattice))
+        errors = min((stamps.time - sample * slope for slope in slopes), key=stamps.ln_values)
+        nats = stamps.fit(fitted, np.where(asleep, 0, missing), errors).nats
         if best is None or nats < best.nats:
             best = _Fit(fitted, missing, nats)
         elif again > 1:
@@ -514,17 +525,31 @@ def overlapping(time: Floats) -> bool:
     return batches and float(np.median(around)) < 6.0 * float(np.median(steps))
 
 
-def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), off: Floats | None = None) -> float:
-    """The slope of `time` against `index` by least squares, with a level of its own after each of the rows `cuts`. Rows
-    whose errors `off` [n] are far off are left out."""
-    part = np.repeat(np.arange(len(cuts) + 1), np.diff([0, *cuts, time.size]))
-    if off is not None:
-        kept = np.abs(off) <= _FAR * float(np.median(np.abs(off))) + 1e-9
-        part, index, time = part[kept], index[kept], time[kept]
-    count = np.maximum(np.bincount(part), 1)
-    x = index - (np.bincount(part, index) / count)[part]
-    y = time - (np.bincount(part, time) / count)[part]
-    return float(x @ y / (x @ x))
+def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), trimmed: bool = False) -> float:
+    """The slope of `time` against `index` by least squares, with a level of its own after each of the rows `cuts`;
+    `trimmed`: without the rows that are far off, such as those of a stall."""
+    parts = len(cuts) + 1
+    part = np.repeat(np.arange(parts), np.diff([0, *cuts, time.size]))
+    kept = np.ones(time.size, bool)
+    while True:
+        count = np.maximum(np.bincount(part[kept], minlength=parts), 1)
+        x, y = (each - (np.bincount(part[kept], each[kept], parts) / count)[part] for each in (index, time))
+        slope = float(x[kept] @ y[kept] / (x[kept] @ x[kept]))
+        off = np.abs(y - slope * x)
+        near = kept & (off <= _FAR * float(np.median(off[kept])) + 1e-9)
+        if not trimmed or (near == kept).all():
+            return slope
+        kept = near
+
+
+def _straightest(sample: Places, time: Floats, dt: float, lattice: float) -> float:
+    """The slope near `dt` about which the errors reach least far: of rounded stamps it is closer than least squares."""
+    from scipy.optimize import minimize_scalar  # a quarter of a second to import: for coarse stamps alone
+
+    around = lattice / max(1, int(sample[-1]))
+    bounds, exact = (dt - around, dt + around), {"xatol": 1e-3 * around}
+    reach = minimize_scalar(lambda slope: float(np.ptp(time - slope * sample)), bounds=bounds, options=exact)
+    return float(reach.x)
 
 
 def _usual(steps: Floats) -> float:
@@ -579,12 +604,13 @@ def _changes(time: Floats, least: int) -> list[Change]:
     if min(np.diff(rows)) < 2 * _STEPS:
         return []
     intervals = [_interval(time[a:b][:_HEAD], lattice) for a, b in pairwise(rows)]
+    unsure = 4.0 * lattice / min(intervals) / min(np.diff(rows)) ** 1.5  # four sd of a slope of rounded stamps
     scatter, changes = max(CHANGE, _scatter(value, parts)), list[Change]()
     for row, (before, after) in zip(rows[1:-1], pairwise(intervals), strict=True):
         ratio = math.log(after / before)
         # A burst after a stall makes up for it: samples of one rate, stamped late.
         late = steps[max(0, row - 3) : row + 2].max() > _STEPS * max(before, after)
-        if late or abs(ratio) < 0.5 * CHANGE:
+        if late or abs(ratio) < max(0.5 * CHANGE, unsure):
             return []
         nats = min(1e6, 0.5 * time.size * (ratio / scatter) ** 2)
         changes.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
