@@ -14,13 +14,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
-from scipy.special import logsumexp, softmax
+from scipy.special import softmax
 
 from selfcal import _joint
 from selfcal.likelihood import work
@@ -456,13 +456,11 @@ def act(score: Array, known: Array) -> Act:
     widths = np.array(WIDTHS)
 
     def ln_bf(sets: NDArray[np.intp]) -> Array:
-        count = sets.shape[1]
-        rho = R[:, sets[:, :, None], sets[:, None, :]]
-        firm = rho + np.eye(count) / widths[:, None, None, None, None] ** 2
-        x = np.broadcast_to(z[:, sets, None], (widths.size, p, len(sets), count, 1))
-        explained = 0.5 * (x * np.linalg.solve(firm, x)).sum(axis=(1, 3, 4))
-        volume = np.linalg.slogdet(firm)[1].sum(axis=1) + 2.0 * p * count * np.log(widths)[:, None]
-        return np.asarray(logsumexp(explained - 0.5 * volume, axis=0) - math.log(widths.size))
+        values, ways = np.linalg.eigh(R[:, sets[:, :, None], sets[:, None, :]])
+        firm = values + widths[:, None, None, None] ** -2.0
+        explained = 0.5 * (np.einsum("psj,psjk->psk", z[:, sets], ways) ** 2 / firm).sum(axis=(1, 3))
+        volume = np.log(firm).sum(axis=(1, 3)) + 2.0 * values.size / len(sets) * np.log(widths)[:, None]
+        return np.asarray(explained - 0.5 * volume)
 
     total, probability = _over_sets(m, ln_bf)
     held = np.flatnonzero((probability >= 0.5) & shown.all(axis=0))
@@ -477,27 +475,26 @@ def act(score: Array, known: Array) -> Act:
 def act_apart(ln_bf: Array, size: Array, sd: Array) -> Act:
     """Of a column on axes whose drifts have nothing in common, by the ln Bayes factors [m, widths] of each alone, its
     size and that one's standard deviation [m]."""
-    total, probability = _over_sets(
-        size.size, lambda sets: np.asarray(logsumexp(ln_bf[sets].sum(axis=1), axis=1)) - math.log(len(WIDTHS))
-    )
+    total, probability = _over_sets(size.size, lambda sets: ln_bf[sets].sum(axis=1).T)
     held = probability >= 0.5
     return Act(total, probability, np.where(held, size, 0.0)[None], np.where(held, sd, math.inf))
 
 
 def _over_sets(m: int, ln_bf: Callable[[NDArray[np.intp]], Array]) -> tuple[float, Array]:
-    """Evidence of a column on some of m axes, and the probability [m] of each, by ln Bayes factors [s] of sets of axes
-    [s, count].
+    """Evidence of a column on some of m axes, and the probability [m] of each, by ln Bayes factors [widths, s] of sets
+    of axes [s, count].
 
     The evidence is a sum over the sets of axes, of which every number of axes is as likely before the record. The
     probability of an axis is what its own readings say, whatever the others do."""
-    values, members, priors = [], [], []
-    for count in range(1, m + 1):
-        sets = np.array(list(combinations(range(m), count)))
-        values.append(ln_bf(sets))
-        priors.append(np.full(len(sets), -math.log(len(sets)) - math.log(m)))
-        inside = np.zeros((len(sets), m))
-        np.put_along_axis(inside, sets, 1.0, axis=1)
-        members.append(inside)
-    worth, member = np.concatenate(values), np.vstack(members)
-    total = float(logsumexp(worth + np.concatenate(priors)))
+    sets, ln_prior, member = _sets(m)
+    worth = np.logaddexp.reduce(np.hstack([ln_bf(each) for each in sets]), axis=0) - math.log(len(WIDTHS))
+    total = float(np.logaddexp.reduce(worth + ln_prior))
     return total, np.asarray(softmax(worth + LN_ODDS * member.sum(axis=1)) @ member)
+
+
+@lru_cache(maxsize=8)
+def _sets(m: int) -> tuple[list[NDArray[np.intp]], Array, Array]:
+    """Sets of m axes [s, count] by their number, ln of the prior of each set, and whether it has each axis [s, m]."""
+    sets = [np.array(list(combinations(range(m), count))) for count in range(1, m + 1)]
+    ln_prior = np.concatenate([np.full(len(each), -math.log(len(each) * m)) for each in sets])
+    return sets, ln_prior, np.array([np.isin(range(m), held) for each in sets for held in each], np.float64)
