@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -182,15 +182,6 @@ class Seen:
         t = (np.arange(self.n) + 0.5) / self.n
         shapes: list[Shape] = [("", (), np.cos(math.pi * half * t), math.log(CURVES)) for half in range(1, CURVES + 1)]
         return max((candidate.evidence for candidate in _weighed(self, shapes, _scored(self, shapes))), default=0.0)
-
-    @cached_property
-    def axes(self) -> list[State]:
-        """Each axis by itself."""
-        return [self.alone(row).refit() for row in self.y]
-
-    def alone(self, row: Array) -> State:
-        """A record [n] by itself, not fitted."""
-        return State("", "", row, self.dt, 0.0, np.ones(self.n))
 
     @property
     def edge(self) -> int:
@@ -531,7 +522,7 @@ def channels(seen: Seen) -> Iterator[Candidate]:
     for cause, values in seen.channels.items():
         side = replace(side_of(cause, "", values), forms=CHANNEL_FORMS)
         shapes: list[Shape] = []
-        plain = seen.alone(seen.y[0])
+        plain = State("", "", seen.y[0], seen.dt, 0.0, np.ones(seen.n))
         for variant in variants_of(side, plain):
             shape = shape_of(side, plain, *variant)
             column = shape.columns[-1] - shape.columns[-1].mean()
@@ -565,9 +556,17 @@ def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Ar
         )
 
 
+@lru_cache(maxsize=8)
+def _alone(row: bytes, dt: float) -> State:
+    """A record by itself. A finding of some axes leaves those of the others as they were."""
+    y = np.frombuffer(row)
+    return State("", "", y, dt, 0.0, np.ones(y.size)).refit()
+
+
 def apart(seen: Seen, candidate: Candidate) -> Candidate:
     """A slow candidate over the drifts of each axis that its record leaves possible."""
-    each = [state.bayes(candidate.columns[0], np.array(WIDTHS)) for state in seen.axes]
+    states = [_alone(row.tobytes(), seen.dt) for row in seen.y]
+    each = [state.bayes(candidate.columns[0], np.array(WIDTHS)) for state in states]
     return replace(candidate, act=act_apart(*map(np.array, zip(*each, strict=True))), more=0.0)
 
 
