@@ -21,7 +21,7 @@ from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, Shape
 from selfcal.likelihood.fit import ROUGH_FTOL, finish
-from selfcal.likelihood.state import MEANS_MOST, NET_LEAST, State
+from selfcal.likelihood.state import MEANS_MOST, NET_LEAST, SCREEN, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
@@ -76,7 +76,7 @@ def _check(
 ) -> dict[str, Any]:
     """The best of some shapes: what it is worth net of the search, and what is `stated` of it. It is worth nothing if
     it explains no `drift`: a drift must be clearly likelier than none, and with the shape a smaller one."""
-    trials = columns.tried(state, shapes, slow=True).values()
+    trials = columns.tried(state, shapes, slow=True, least=SCREEN).values()
     best = max(trials, key=lambda trial: trial.net, default=None)
     shape, worth = (shapes[0], 0.0) if best is None else (best.shape, best.net)
     if worth > NET_LEAST and drift:

@@ -15,8 +15,9 @@ import numpy as np
 from scipy.fft import rfft
 from scipy.ndimage import uniform_filter1d
 
+from selfcal.likelihood.columns import FIT_ADDS, NEARLY
 from selfcal.likelihood.fit import Fit, best, finish, left, moved
-from selfcal.likelihood.state import SCREEN, State, net
+from selfcal.likelihood.state import State, net
 from selfcal.likelihood.statemodel import PERIOD_LIMITS
 from selfcal.model.laws import DAMPING_LIMITS, SWING_LEAST
 
@@ -61,17 +62,19 @@ class Swing:
 
 
 def found(state: State, *, slow: bool) -> Swing | None:
-    """The swing that promises most, the drift fitted with it, if it is worth one nat."""
+    """The swing that promises most, the drift fitted with it, if it is worth one nat. None where it cannot be named: a
+    fit adds no more than a drift of two terms alone gains, and FIT_ADDS."""
     n, span = state.y.size, state.y.size * state.dt
     border = span / max(PERIOD_LIMITS[0], SWING_LEAST * state.dt)
     low, high = (max(TURNS_LEAST, span / PERIOD_LIMITS[1]), border) if slow else (border, 0.5 * n)
     start = _search(state, low, high, SIZES if slow else SIZES[:1], 1.0 if slow else NARROW)
-    if start is None:
+    price = max(0.0, math.log(max(high - low, 1.0)) - LN_FEWER)
+    if start is None or net(start[2] + FIT_ADDS, 3, price) < NEARLY:
         return None
     gain, fits = state.with_terms(start[0], start[1], oscillation=True, bands=held(state))
     if slow and not state.extras.flicker:  # a poor drift model makes some nats of any slow term
         gain -= max(0.0, state.rich.ln_likelihood - state.best.ln_likelihood)
-    swing = Swing(fits, gain, net(gain, 3, max(0.0, math.log(max(high - low, 1.0)) - LN_FEWER)))
+    swing = Swing(fits, gain, net(gain, 3, price))
     period, damping, _ = swing.numbers
     inside = low < span / period < high and (slow or damping < NARROW)
     return swing if swing.net >= 1.0 and inside else None
@@ -84,14 +87,14 @@ def held(state: State) -> tuple[tuple[float, float, float], ...]:
 
 def _search(
     state: State, low: float, high: float, sizes: Sequence[float], most: float
-) -> tuple[dict[str, float], float] | None:
-    """ln of period, damping and size of the likeliest swing of `low` to `high` turns and a damping of `most`, and by
-    how much the drift beside it is smaller. Each mean of the periodogram has its best place; of these the filter finds
-    the likeliest."""
+) -> tuple[dict[str, float], float, float] | None:
+    """ln of period, damping and size of the likeliest swing of `low` to `high` turns and a damping of `most`, by how
+    much the drift beside it is smaller, and its gain before a fit. Each mean of the periodogram has its best place; of
+    these the filter finds the likeliest."""
     n, fit = state.y.size, state.best
     place = np.arange(n // 2 + 1)
     terms = replace(fit.terms, oscillation=True, bands=held(state))
-    chosen, least = None, SCREEN
+    tried: list[tuple[dict[str, float], float, float]] = []
     for less in sizes:
         drift = fit.shrunk(less)
         white = left(state.series, drift, np.empty((0, n)))[:, 0]
@@ -107,6 +110,5 @@ def _search(
             damping = math.log(min(SHARE * width / at, DAMPING_LIMITS[1]))
             own = {"ln_period": math.log(n * state.dt / at), "ln_damping": damping, "ln_swing": size}
             value = finish(state.series, terms, moved(drift, terms, own)).ln_likelihood - fit.ln_likelihood
-            if value > least:
-                chosen, least = (own, less), value
-    return chosen
+            tried.append((own, less, value))
+    return max(tried, key=lambda each: each[2], default=None)

@@ -151,9 +151,9 @@ def fitted(state: State, shape: Shape) -> Tried:
     return Tried(shape, *state.with_columns(shape.columns))
 
 
-def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = SCREEN) -> dict[str, Tried]:
+def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = NET_LEAST) -> dict[str, Tried]:
     """The best shape of each form that ranks high enough, in the order of the forms. `slow`: it is looked for in means,
-    and its gain must hold over the drifts that the record leaves possible."""
+    and its gain must hold over the drifts that the record leaves possible, if it is worth `least` or nearly."""
     means, block = state.slow if slow else (state, 1)
     if block > 1:
         found = tried(means, [shape.in_means(block) for shape in shapes], slow=slow, least=least)
@@ -164,7 +164,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
     blocks = [shape.columns for shape in shapes]
     drifts = [state.best, *(drift for by in SMALLER[: 1 + slow] for drift in state.stiffer(by))]
     gains = np.max([state.scores(blocks, drift) for drift in drifts], axis=0)
-    if gains.max() < least:
+    if gains.max() < min(SCREEN, least):
         return {}
     done: dict[str, Tried] = {}
     for _ in range(FITTED):
@@ -181,7 +181,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = S
         if better != k and gains[better] > best.gain:
             best = fitted(state, shapes[better])
         best = between(state, best)
-        if slow and best.net >= 1.0:
+        if slow and best.net >= max(1.0, least - ALIKE):
             best = replace(best, gain=min(best.gain, state.average_gain(best.shape.columns)))
         done[best.shape.form] = best
     # A form whose score alone is known is fitted by who takes it: only a finding needs that.
