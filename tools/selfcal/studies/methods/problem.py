@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from selfcal.adequacy.allan import LONGEST, STEP, Terms, overlapping, terms_of
+from selfcal.adequacy.allan import LONGEST, Terms, overlapping, terms_of
 from selfcal.bank.result import HALF_90
 from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Group, Prior
@@ -170,7 +170,8 @@ def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> P
 def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
     """Second derivatives by central differences."""
     d = theta.size
-    step = np.eye(d) * STEP * 10.0
+    size = np.finfo(float).eps ** 0.25  # rounding and curvature err alike
+    step = np.eye(d) * size
     matrix = np.empty((d, d))
     for i in range(d):
         for j in range(i, d):
@@ -178,7 +179,7 @@ def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
                 objective(theta + a * step[i] + b * step[j])
                 for a, b in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
             ]
-            matrix[i, j] = matrix[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * (STEP * 10.0) ** 2)
+            matrix[i, j] = matrix[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * size**2)
     return matrix
 
 
