@@ -23,8 +23,8 @@ from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Mask,
 COLUMNS_MOST = _likelihood.COLUMNS_MAX - 1
 #: Products of matrices that numpy leaves to one thread.
 ONE_THREAD = 200_000
-#: A column of which the others leave less than this share is one of theirs.
-SPENT = 1e-9
+#: A column of which the others leave less than this share is one of theirs: half of a double's digits are left.
+SPENT = math.sqrt(np.finfo(float).eps)
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
 #: ... of a quick look, which ranks causes and measures none: their evidence differs by more.

@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 
 #: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
 REACH = 1e5
+#: Step in the ln of a parameter for a curvature: a smaller one shows the rounding of an Allan variance.
+STEP = 0.01
 #: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
 LEVEL_SD = 10.0
 
@@ -170,8 +172,7 @@ def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> P
 def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
     """Second derivatives by central differences."""
     d = theta.size
-    size = np.finfo(float).eps ** 0.25  # rounding and curvature err alike
-    step = np.eye(d) * size
+    step = np.eye(d) * STEP
     matrix = np.empty((d, d))
     for i in range(d):
         for j in range(i, d):
@@ -179,7 +180,7 @@ def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
                 objective(theta + a * step[i] + b * step[j])
                 for a, b in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
             ]
-            matrix[i, j] = matrix[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * size**2)
+            matrix[i, j] = matrix[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * STEP**2)
     return matrix
 
 
