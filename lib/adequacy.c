@@ -152,7 +152,7 @@ void selfcal_adequacy_report(selfcal_adequacy_t *self, const selfcal_model_t *mo
             continue;
         }
         const size_t at = watch->next.states++;
-        const selfcal_wide_t rate = bandwidth_of(term, second) * dt, pole = exp(-fmin(rate, ALPHA_DT_MAX));
+        const selfcal_wide_t rate = bandwidth_of(term, second) * dt, pole = exp(-fmin(rate, SELFCAL_ALPHA_DT_MAX));
         const selfcal_wide_t stationary = (selfcal_wide_t)selfcal_averaged((selfcal_real_t)rate, model->block).gain *
                                           markov_variance(law, term, square, second, dt);
         watch->next.pole[at] = (selfcal_real_t)pole;

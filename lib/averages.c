@@ -10,8 +10,8 @@ static selfcal_wide_t averaged_walk(uint32_t block) {
 selfcal_averaged_t selfcal_averaged(selfcal_real_t x, uint32_t block) {
     selfcal_averaged_t of = {R(1.0), R(1.0), R(0.0)};
     if (block > 1U) {
-        const selfcal_real_t m = (selfcal_real_t)block, held = r_fmin(x, (selfcal_real_t)ALPHA_DT_MAX),
-                             of_sample = r_fmin(x / m, (selfcal_real_t)ALPHA_DT_MAX);
+        const selfcal_real_t m = (selfcal_real_t)block, held = r_fmin(x, (selfcal_real_t)SELFCAL_ALPHA_DT_MAX),
+                             of_sample = r_fmin(x / m, (selfcal_real_t)SELFCAL_ALPHA_DT_MAX);
         const selfcal_real_t beta = -r_expm1(-held), b = -m * r_expm1(-of_sample);
         of.now = (R(1.0) - beta) * b / (beta * (R(1.0) - b / m));
         of.gain = beta / (b * of.now);
@@ -25,8 +25,8 @@ static selfcal_wide_t averaged_rest(selfcal_wide_t x, uint32_t block) {
     if (block == 1U || x < 1e-3) {
         return averaged_walk(block) * x / 3.0; /* right to x^2/20 */
     }
-    const selfcal_wide_t m = (selfcal_wide_t)block, beta = -expm1(-fmin(x, ALPHA_DT_MAX)),
-                         b = -m * expm1(-fmin(x / m, ALPHA_DT_MAX)), of_sample = 1.0 - b / m;
+    const selfcal_wide_t m = (selfcal_wide_t)block, beta = -expm1(-fmin(x, SELFCAL_ALPHA_DT_MAX)),
+                         b = -m * expm1(-fmin(x / m, SELFCAL_ALPHA_DT_MAX)), of_sample = 1.0 - b / m;
     const selfcal_wide_t gain = beta * beta * of_sample / ((1.0 - beta) * b * b);
     return fmax(gain - (1.0 + of_sample - 2.0 * of_sample * beta / b) / b, 0.0);
 }

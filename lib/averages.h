@@ -18,9 +18,8 @@
 #include "arithmetic.h"
 #include "laws.h"
 
-/* Drift that forgets within an interval is held at phi = e^-6.9 = 1e-3: the drift now is the prediction over phi, and
- * neighbours correlated by 1e-3 are beyond telling from white ones. */
-#define ALPHA_DT_MAX 6.9
+/* Drift that forgets within an interval is held at phi = exp(-SELFCAL_ALPHA_DT_MAX) = 1e-3: the drift now is the
+ * prediction over phi, and neighbours correlated by 1e-3 are beyond telling from white ones. */
 
 /* Of a Gauss-Markov drift, as above; `after`: the variance that it has more at the interval's end. */
 typedef struct {

@@ -26,16 +26,14 @@
 #define SETTLED R(1e-7)
 #define U_ZERO R(1e-20)
 
-/* ln of what a prior may reach, 1e-20 to 1e20 of any unit: rounding alone would carry wider limits out of a float's
- * range. */
-#define LN_LIMIT 46.0F
-
 /* s; a bank interval of a microsecond or of ten days is no sensor's. */
 #define DT_MIN 1e-6F
 #define DT_MAX 1e6F
 
+/* Rounding alone would carry wider limits out of a float's range. False for NaN. */
 static bool valid_prior(const selfcal_prior_t *prior) {
-    return prior->ln_min >= -LN_LIMIT && prior->ln_max <= LN_LIMIT && prior->ln_min < prior->ln_max; /* false for NaN */
+    const float limit = (float)SELFCAL_LN_LIMIT;
+    return prior->ln_min >= -limit && prior->ln_max <= limit && prior->ln_min < prior->ln_max;
 }
 
 static bool valid_priors(const selfcal_prior_t prior[], size_t axes) {
@@ -48,7 +46,7 @@ static bool valid_priors(const selfcal_prior_t prior[], size_t axes) {
 }
 
 static bool valid_grid(const selfcal_grid_t *grid, uint16_t most) {
-    return grid->nodes >= 6U && grid->nodes <= most && grid->fit != NULL;
+    return grid->nodes >= SELFCAL_GRID_MIN && grid->nodes <= most && grid->fit != NULL;
 }
 
 selfcal_place_t selfcal_bank_place(const selfcal_t *self, uint16_t index) {
@@ -137,7 +135,8 @@ void selfcal_bank_start_node(selfcal_t *self, uint16_t index) {
     const selfcal_wide_t variance = has_drift(law) ? exp(2.0 * (selfcal_wide_t)place.ln_rho) : 0.0; /* rho^2 */
     selfcal_wide_t beta = 0.0;
     if (has_decay(law)) {
-        beta = -expm1(-fmin(exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s, ALPHA_DT_MAX));
+        beta = -expm1(
+            -fmin(exp((selfcal_wide_t)place.ln_alpha) * (selfcal_wide_t)self->model->dt_s, SELFCAL_ALPHA_DT_MAX));
     }
     const selfcal_wide_t one_less_phi_sq = beta * (2.0 - beta);
     selfcal_wide_t q = 0.0;       /* drift variance per interval */

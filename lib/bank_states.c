@@ -199,7 +199,7 @@ static void start_node(selfcal_t *self, size_t j, selfcal_place_t place) {
             const selfcal_averaged_t of = selfcal_averaged((selfcal_real_t)rate, self->model->block);
             const selfcal_wide_t variance =
                 (selfcal_wide_t)of.gain * markov_variance(law, term, square, second, dt_s); /* stationary */
-            node->beta[a] = (selfcal_real_t)-expm1(-fmin(rate, ALPHA_DT_MAX));
+            node->beta[a] = (selfcal_real_t)-expm1(-fmin(rate, SELFCAL_ALPHA_DT_MAX));
             const selfcal_wide_t beta = (selfcal_wide_t)node->beta[a];
             node->q[a] = (selfcal_real_t)(variance * beta * (2.0 - beta));
             node->p[term_pair(a, a)] = variance;
@@ -658,17 +658,21 @@ static bool states_sound(const selfcal_t *self) {
 
 /* --- laws --- */
 
-/* Of a term's deviation and bandwidth. */
-#define FACTOR_MIN 1e-3F
-#define FACTOR_MAX 1e3F
+#define TWO_PI 6.283185307179586
 
-/* Bank intervals that a stated correlation time lasts at most: 1 - phi keeps its digits. */
-#define TIME_MAX 1e6F
+/* Room for the rounding of a stated number to float. */
+#define MORE (1.0 + 1e-6)
+#define LESS (1.0 - 1e-6)
 
-/* w of an oscillation, over dt_s, at most: eight bank intervals a period; and its damping. */
-#define SWING_MAX 0.7854
-#define DAMPING_MIN 1e-3
-#define DAMPING_MAX 0.7
+static bool valid_factor(float factor) {
+    return factor >= (float)(1.0 / SELFCAL_FACTOR_MAX) && factor <= (float)SELFCAL_FACTOR_MAX;
+}
+
+/* Of a stated bandwidth: 1 - phi keeps its digits. */
+static bool valid_time(const selfcal_term_t *term, float dt_s, selfcal_wide_t most) {
+    const selfcal_wide_t interval = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
+    return interval <= most * MORE && interval * SELFCAL_TIME_MAX >= LESS;
+}
 
 /* The two terms of an oscillation. */
 static bool valid_swing(const selfcal_term_t *term, size_t count, float dt_s) {
@@ -677,21 +681,17 @@ static bool valid_swing(const selfcal_term_t *term, size_t count, float dt_s) {
         second->by_ratio != term->by_ratio || !term->stated || !second->stated) {
         return false;
     }
-    const selfcal_wide_t turn = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
     const selfcal_wide_t damping = (selfcal_wide_t)second->bandwidth / (selfcal_wide_t)term->bandwidth;
-    return turn <= SWING_MAX * (1.0 + 1e-6) && turn * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6 &&
-           damping >= DAMPING_MIN * (1.0 - 1e-6) && damping <= DAMPING_MAX * (1.0 + 1e-6);
+    return valid_time(term, dt_s, TWO_PI / SELFCAL_PERIOD_MIN) && damping >= SELFCAL_DAMPING_MIN * LESS &&
+           damping <= SELFCAL_DAMPING_MAX * MORE;
 }
 
 static bool valid_term(const selfcal_term_t *term, float dt_s) {
     const bool swing = term->kind == SELFCAL_OSCILLATION || term->kind == SELFCAL_DAMPING;
-    const bool factor = term->bandwidth >= FACTOR_MIN && term->bandwidth <= FACTOR_MAX;
-    const selfcal_wide_t interval = (selfcal_wide_t)term->bandwidth * (selfcal_wide_t)dt_s;
-    const bool time = interval <= ALPHA_DT_MAX * (1.0 + 1e-6) && interval * (selfcal_wide_t)TIME_MAX >= 1.0 - 1e-6;
+    const bool sound = term->stated ? valid_time(term, dt_s, SELFCAL_ALPHA_DT_MAX) : valid_factor(term->bandwidth);
     const bool walk = term->kind == SELFCAL_WALK && term->bandwidth == 0.0F && !term->stated && !term->by_ratio;
-    return is_bool(&term->stated) && is_bool(&term->by_ratio) && term->deviation >= FACTOR_MIN &&
-           term->deviation <= FACTOR_MAX &&
-           (walk || swing || (term->kind == SELFCAL_MARKOV && (term->stated ? time : factor)));
+    return is_bool(&term->stated) && is_bool(&term->by_ratio) && valid_factor(term->deviation) &&
+           (walk || swing || (term->kind == SELFCAL_MARKOV && sound));
 }
 
 /* A sum that there are filters for. A ratio belongs to one thing: to the noise, or to terms beside another. */

@@ -4,8 +4,8 @@
 /* Sizes of selfcal_config.h that the code can do with. */
 SELFCAL_STATIC_ASSERT(axes, SELFCAL_AXES_MAX >= 1 && SELFCAL_AXES_MAX <= 16);
 SELFCAL_STATIC_ASSERT(hypotheses, SELFCAL_HYPOTHESES_MAX >= 1 && SELFCAL_HYPOTHESES_MAX <= 16);
-SELFCAL_STATIC_ASSERT(grid_has_a_spline, SELFCAL_GRID_MAX >= 6 && SELFCAL_GRID_MAX <= 64);
-SELFCAL_STATIC_ASSERT(alpha, SELFCAL_ALPHA_MAX >= 6 && SELFCAL_ALPHA_MAX <= SELFCAL_GRID_MAX);
+SELFCAL_STATIC_ASSERT(grid_has_a_spline, SELFCAL_GRID_MAX >= SELFCAL_GRID_MIN && SELFCAL_GRID_MAX <= 64);
+SELFCAL_STATIC_ASSERT(alpha, SELFCAL_ALPHA_MAX >= SELFCAL_GRID_MIN && SELFCAL_ALPHA_MAX <= SELFCAL_GRID_MAX);
 SELFCAL_STATIC_ASSERT(nodes_of_one,
                       SELFCAL_HYPOTHESIS_NODES_MAX >= SELFCAL_GRID_MAX && SELFCAL_HYPOTHESIS_NODES_MAX <= 65535);
 SELFCAL_STATIC_ASSERT(nodes_of_all, SELFCAL_NODES_MAX >= SELFCAL_HYPOTHESIS_NODES_MAX && SELFCAL_NODES_MAX <= 65535);
@@ -38,7 +38,7 @@ SELFCAL_STATIC_ASSERT(bytes_an_axis_of_a_sum,
 /* No drift's variance per interval is greater, see LN_RHO_MAX. */
 #define Q_MAX R(1e12)
 
-/* No drift forgets more, see ALPHA_DT_MAX: 1 - e^-6.9. */
+/* No drift forgets more, see SELFCAL_ALPHA_DT_MAX: 1 - e^-6.9. */
 #define BETA_MAX R(0.999)
 
 /* Beneath it a float is a denormal, whose rounding is not relative. */

@@ -11,7 +11,6 @@
 
 #define BINS (SELFCAL_COLUMN_BINS + 2U)
 #define TWO_PI R(6.283185307179586)
-#define LIKELY 0.05F /* least probability of a law that may state a coefficient */
 
 static selfcal_wide_t interval_of(const selfcal_model_t *model) {
     return (selfcal_wide_t)model->dt_s / (selfcal_wide_t)model->block;
@@ -362,7 +361,7 @@ void selfcal_widest_coefficients(const selfcal_report_t *report, const selfcal_m
         sent[k].sd = NAN;
         for (uint8_t h = 0; h < model->hypotheses; h++) {
             const float mean = coefficients[h].mean[k], sd = coefficients[h].sd[k];
-            if (report->hypothesis[h].probability >= LIKELY && isfinite(mean) && !(sd <= sent[k].sd)) {
+            if (report->hypothesis[h].probability >= (float)SELFCAL_LIKELY && isfinite(mean) && !(sd <= sent[k].sd)) {
                 sent[k].mean = mean;
                 sent[k].sd = sd;
             }

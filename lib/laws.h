@@ -96,7 +96,7 @@ static inline selfcal_wide_t markov_variance(const selfcal_law_t *law, const sel
     return has_walk(law) ? variance / (bandwidth_of(first, second) * dt_s) : variance; /* rho^2 = K^2 dt / sigma_v^2 */
 }
 
-/* ln of 1e3: beyond, 1 + theta or 1 - theta of coloured noise is no longer a float. */
+/* ln of SELFCAL_RATIO_MAX, rounded up: beyond, 1 + theta or 1 - theta of coloured noise is no longer a float. */
 #define LN_RATIO_MAX 6.91F
 
 /* Priors of an axis under a hypothesis. */

@@ -18,7 +18,7 @@ static selfcal_real_t ln_prior_density(const selfcal_prior_t *prior) {
     if (prior->law == SELFCAL_UNIFORM) {
         return -hi - r_log(-r_expm1(-width));
     }
-    /* 8 / sqrt(2 pi) over the part of the normal within 4 sd */
+    /* ln of 2 reach / sqrt(2 pi) over the part of the normal within SELFCAL_LOG_NORMAL_REACH sd */
     return (prior->law == SELFCAL_LOG_NORMAL ? R(1.1605664) : R(0.0)) - r_log(width);
 }
 

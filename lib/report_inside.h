@@ -96,7 +96,8 @@ static inline uint16_t step_part(selfcal_work_t *work, unsigned step, uint16_t w
 static inline selfcal_real_t prior_shape(const selfcal_prior_t *prior, selfcal_real_t ln_value) {
     if (prior->law == SELFCAL_LOG_NORMAL) {
         const selfcal_real_t lo = (selfcal_real_t)prior->ln_min, hi = (selfcal_real_t)prior->ln_max;
-        const selfcal_real_t sds = (ln_value - R(0.5) * (lo + hi)) * (R(8.0) / (hi - lo));
+        const selfcal_real_t sds =
+            (ln_value - R(0.5) * (lo + hi)) * ((selfcal_real_t)(2.0 * SELFCAL_LOG_NORMAL_REACH) / (hi - lo));
         return R(-0.5) * sds * sds;
     }
     return prior->law == SELFCAL_UNIFORM ? ln_value : R(0.0);

@@ -435,9 +435,12 @@ selfcal_status_t selfcal_telemetry_init(selfcal_telemetry_t *self, const selfcal
  * changes, while frames are still to be fetched. */
 selfcal_status_t selfcal_telemetry_node(selfcal_telemetry_t *self, uint8_t node);
 
+/* Least probability of a law that may be true. */
+#define SELFCAL_LIKELY 0.05
+
 /* Mean and sd of each column's coefficient, of a report made with all of them in use, under the law that leaves it most
- * open, of those with a probability of 0.05 or more. A record of an hour does not tell a walk from a Gauss-Markov
- * drift, beside which a ramp seems known two to four times better: an average over the laws holds too few. */
+ * open, of those that may be true. A record of an hour does not tell a walk from a Gauss-Markov drift, beside which a
+ * ramp seems known two to four times better: an average over the laws holds too few. */
 void selfcal_widest_coefficients(const selfcal_report_t *report, const selfcal_model_t *model,
                                  const selfcal_coefficients_t coefficients[], float probability,
                                  selfcal_sent_coefficient_t sent[]);

@@ -22,8 +22,8 @@ extern "C" {
  * selfcal_config.h has the sizes. `selfcal codegen` writes it. Whatever it sets may be set on the command line instead.
  *   SELFCAL_AXES_MAX              axes of a bank, 1 to 16. Six inertial axes share every gain.
  *   SELFCAL_HYPOTHESES_MAX        hypotheses of a model, 1 to 16
- *   SELFCAL_GRID_MAX              nodes of a grid dimension, 6 to 64
- *   SELFCAL_ALPHA_MAX             nodes of alpha or of a ratio, 6 to SELFCAL_GRID_MAX
+ *   SELFCAL_GRID_MAX              nodes of a grid dimension, SELFCAL_GRID_MIN to 64
+ *   SELFCAL_ALPHA_MAX             nodes of alpha or of a ratio, SELFCAL_GRID_MIN to SELFCAL_GRID_MAX
  *   SELFCAL_HYPOTHESIS_NODES_MAX  nodes of a hypothesis: 16 bytes each in a report's scratch
  *   SELFCAL_NODES_MAX             nodes of all hypotheses: 12 bytes each in a report's scratch
  *   SELFCAL_REGRESSORS_MAX        regressors of a model, 1 to 6
@@ -56,6 +56,18 @@ typedef double selfcal_wide_t;
 
 /* --- model --- */
 
+/* Limits of a model's numbers; selfcal_init() refuses others. The host's tools take them from here. */
+#define SELFCAL_LN_LIMIT 46.0        /* ln of a parameter that a prior reaches, either way: 1e-20 to 1e20 */
+#define SELFCAL_LOG_NORMAL_REACH 4.0 /* sd from the middle of a log-normal prior to its limits */
+#define SELFCAL_FACTOR_MAX 1e3       /* factors of a deviation and a bandwidth; the least one is its inverse */
+#define SELFCAL_RATIO_MAX 1e3        /* a law's ratio; the least one is its inverse */
+#define SELFCAL_TIME_MAX 1e6         /* bank intervals of a stated correlation time, and of 1 / w of an oscillation */
+#define SELFCAL_ALPHA_DT_MAX 6.9     /* correlation times in a bank interval, see averages.h */
+#define SELFCAL_PERIOD_MIN 8.0       /* bank intervals in a period of an oscillation */
+#define SELFCAL_DAMPING_MIN 1e-3     /* damping ratio of an oscillation */
+#define SELFCAL_DAMPING_MAX 0.7
+#define SELFCAL_GRID_MIN 6 /* nodes of a grid dimension: a quintic spline needs them */
+
 /* A law is data: the terms of its drift, and the kind of its white noise.
  *   SELFCAL_WALK:   x_i = x_(i-1) + K sqrt(dt) w_i,  x_0 = 0                                             (23)
  *   SELFCAL_MARKOV: x_i = phi x_(i-1) + sigma_m sqrt(1 - phi^2) w_i,  phi = exp(-bandwidth dt), stationary
@@ -70,18 +82,17 @@ typedef enum { SELFCAL_WALK = 0, SELFCAL_MARKOV = 1, SELFCAL_OSCILLATION = 2, SE
 
 typedef struct {
     selfcal_term_kind_t kind;
-    float deviation; /* times the drift parameter: this term's K or sigma_m; 1e-3 to 1e3.
+    float deviation; /* times the drift parameter: this term's K or sigma_m; to SELFCAL_FACTOR_MAX.
                         Beside a walk, a Gauss-Markov term has sigma_m = deviation K / sqrt(bandwidth),
                         and an oscillation's standard deviation is deviation K / sqrt(w). */
-    float bandwidth; /* of a Gauss-Markov term: times alpha, 1e-3 to 1e3; if stated, 1/s. 0 of a walk */
-    bool stated;     /* the model states the bandwidth: 1e-6 to 6.9 over dt_s. Always of an oscillation, whose w is
-                        1e-6 to 0.79 over dt_s, and whose damping is 1e-3 to 0.7 */
+    float bandwidth; /* of a Gauss-Markov term: times alpha, to SELFCAL_FACTOR_MAX; if stated, 1/s. 0 of a walk */
+    bool stated;     /* the model states the bandwidth. Always of an oscillation */
     bool by_ratio;   /* the law's ratio multiplies the deviation */
 } selfcal_term_t;
 
 /* A law of one plain term or of none takes the fast filters. Others are sums, see selfcal_law_is_sum().
  * Coloured: instead of v_i, (e_i + theta e_(i-1)) / (1 + theta) with e_i ~ N(0, sigma_v^2). N is then the density at
- * low frequency. The law's ratio is (1 + theta) / (1 - theta), its prior within 1e-3 to 1e3. */
+ * low frequency. The law's ratio is (1 + theta) / (1 - theta), its prior within SELFCAL_RATIO_MAX. */
 #define SELFCAL_LAW_TERMS 3
 typedef struct {
     uint8_t terms; /* those used; with coloured noise 1 or 2 */
@@ -103,12 +114,12 @@ typedef enum {
 } selfcal_parameter_t;
 
 /* Between two limits: uniform in the logarithm, or in the parameter itself, or normal in the logarithm. The mean of the
- * normal is the middle of the limits, which lie 4 sd away: they hold all but 6e-5 of it. */
+ * normal is the middle of the limits, which lie SELFCAL_LOG_NORMAL_REACH sd away: they hold all but 6e-5 of it. */
 typedef enum { SELFCAL_LOG_UNIFORM = 0, SELFCAL_UNIFORM = 1, SELFCAL_LOG_NORMAL = 2 } selfcal_prior_law_t;
 
 /* Proper prior of one parameter. */
 typedef struct {
-    float ln_min, ln_max; /* ln of the parameter in the units above, within 46 of 0: 1e-20 to 1e20 */
+    float ln_min, ln_max; /* ln of the parameter in the units above, within SELFCAL_LN_LIMIT of 0 */
     selfcal_prior_law_t law;
     bool measured; /* the limits are those of an earlier record: the parameter counts as identified at once */
 } selfcal_prior_t;

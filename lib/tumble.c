@@ -4,7 +4,7 @@
  * intervals apart from each other, with middles m and lengths L, a walk has K^2 min(m_i, m_j), on the diagonal
  * K^2 (end + L/3). A Gauss-Markov drift moves from there by m(t) - m(0), so it has
  *     sigma^2 (e(i, j) - e(i) - e(j) + 1),  e: means of exp(-alpha |t|) over the intervals.
- * A square of the scale adds SQUARE_SD^2 x_i^2 x_j^2, x the reading without its bias. The residual of a rest is |f| - g
+ * A square of the scale adds square_sd^2 x_i^2 x_j^2, x the reading without its bias. The residual of a rest is |f| - g
  * with derivatives J and the covariance R = sum over axes of w_i w_j C_ij, w = (T K)' f / |f|. With R = L L', whitened
  * columns L^-1 J and residuals L^-1 r, in units of the prior's sd, a step solves
  *     (J' J + 1) step = -(J' r + theta).
@@ -19,19 +19,14 @@ typedef selfcal_wide_t wide_t;
 
 enum { ACCEL = SELFCAL_TUMBLE_ACCEL, GYRO = SELFCAL_TUMBLE_GYRO, ALL = 3, ROUNDS = 30, FEWEST = 3 };
 
-/* sd of the priors; variance that leaves a parameter unidentified, of priors so many times as wide. */
-#define BIAS_SD 0.98
-#define SCALE_SD 0.02
-#define ANGLE_SD 0.02
+/* sd of the priors. */
+#define BIAS_SD SELFCAL_TUMBLE_BIAS_SD
+#define SCALE_SD SELFCAL_TUMBLE_SCALE_SD
+#define ANGLE_SD SELFCAL_TUMBLE_ANGLE_SD
 #define GYRO_BIAS_SD 0.17453292519943295
 #define G_SD (1.7453292519943296e-3 / 9.80665)
-#define SQUARE_SD 5e-5
-#define LEFT 0.2
-#define WIDER 8.0
 /* The last step, in units of the prior's sd. A mean beyond `LARGEST` is no reading. */
 #define SETTLED 1e-10
-/* A parameter beyond so many sd of its prior is none of an accelerometer. */
-#define REACH 10.0
 #define LARGEST 1e6F
 
 static size_t packed(size_t row, size_t column) {
@@ -171,11 +166,11 @@ static wide_t take_step(selfcal_tumble_work_t *work, size_t parameters, size_t c
 static uint16_t identified(selfcal_tumble_work_t *work, size_t parameters, size_t count) {
     wide_t *const normal = work->factor;
     uint16_t bits = 0;
-    normal_of(work, parameters, count, 1.0 / (WIDER * WIDER), normal);
+    normal_of(work, parameters, count, 1.0 / (SELFCAL_TUMBLE_WIDER * SELFCAL_TUMBLE_WIDER), normal);
     if (factorize(normal, parameters)) {
         invert(normal, parameters);
         for (size_t i = 0; i < parameters; i++) {
-            bits = (uint16_t)(bits | (unsigned)(normal[packed(i, i)] <= LEFT) << i);
+            bits = (uint16_t)(bits | (unsigned)(normal[packed(i, i)] <= SELFCAL_TUMBLE_LEFT) << i);
         }
     }
     return bits;
@@ -349,7 +344,7 @@ static bool find_accel(const selfcal_tumble_part_t *part, const selfcal_tumble_r
     }
     bool sound = far >= 0.0 && far < SETTLED;
     for (size_t i = 0; i < ACCEL; i++) {
-        sound = sound && fabs(theta[i]) <= REACH;
+        sound = sound && fabs(theta[i]) <= SELFCAL_TUMBLE_REACH;
     }
     return sound;
 }
@@ -368,7 +363,7 @@ static bool fit_accel(selfcal_tumble_t *found, const selfcal_tumble_part_t *part
                       size_t count, wide_t theta[ACCEL], selfcal_tumble_work_t *work) {
     wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, straight[ACCEL];
     wide_t(*const M)[3] = (wide_t(*)[3])work->factor; /* at the end: less stack */
-    if (!find_accel(part, rests, count, SQUARE_SD, theta, normal, work)) {
+    if (!find_accel(part, rests, count, SELFCAL_TUMBLE_SQUARE_SD, theta, normal, work)) {
         return false;
     }
     found->accel_identified = identified(work, ACCEL, count);
@@ -435,7 +430,7 @@ uint16_t selfcal_tumble_known(const selfcal_tumble_part_t *part, const selfcal_t
                               selfcal_tumble_work_t *work, float found[45]) {
     wide_t normal[ACCEL * (ACCEL + 1) / 2] = {0.0}, theta[ACCEL] = {0.0};
     if (count > 0U) {
-        lay(part, rests, count, ALL, theta, SQUARE_SD, work);
+        lay(part, rests, count, ALL, theta, SELFCAL_TUMBLE_SQUARE_SD, work);
     }
     if (take_step(work, ACCEL, count, theta, normal) < 0.0) {
         return 0U;

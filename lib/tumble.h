@@ -49,6 +49,19 @@ extern "C" {
 
 enum { SELFCAL_TUMBLE_ACCEL = 9, SELFCAL_TUMBLE_GYRO = 4 };
 
+/* The priors; `selfcal tumble` on the host takes them from here. sd of the accelerometers' bias, m/s^2 (100 mg), scale
+ * and angle, rad; of the square of the scale, s^2/m: 0.5 mg at 1 g. Data sheets' 0.1 to 0.5 % of a range of 2 to 16 g
+ * are 0.1 to 1. */
+#define SELFCAL_TUMBLE_BIAS_SD 0.98
+#define SELFCAL_TUMBLE_SCALE_SD 0.02
+#define SELFCAL_TUMBLE_ANGLE_SD 0.02
+#define SELFCAL_TUMBLE_SQUARE_SD 5e-5
+/* A parameter beyond so many sd of its prior is none of an accelerometer. */
+#define SELFCAL_TUMBLE_REACH 10.0
+/* An identified parameter keeps this part of its prior variance at most, were every prior so many times as wide. */
+#define SELFCAL_TUMBLE_LEFT 0.2
+#define SELFCAL_TUMBLE_WIDER 8.0
+
 /* Why there is no result. */
 typedef enum {
     SELFCAL_TUMBLE_OK = 0,

@@ -18,6 +18,7 @@
 
 #include "selfcal.h"
 #include "tables.hpp"
+#include "tumble.h"
 
 namespace nb = nanobind;
 using Rows = nb::ndarray<const float, nb::ndim<2>, nb::c_contig, nb::device::cpu>;
@@ -409,6 +410,24 @@ NB_MODULE(MODULE_NAME, m) {
     m.attr("REGRESSORS_MAX") = SELFCAL_REGRESSORS_MAX;
     m.attr("REPORT_MIN") = SELFCAL_REPORT_MIN;
     m.attr("SAMPLE_MAX") = SELFCAL_SAMPLE_MAX;
+    m.attr("HYPOTHESES_MAX") = SELFCAL_HYPOTHESES_MAX;
+    m.attr("TERMS_MAX") = SELFCAL_TERMS_MAX;
+    m.attr("GRID_MIN") = SELFCAL_GRID_MIN;
+    m.attr("LN_LIMIT") = SELFCAL_LN_LIMIT;
+    m.attr("LOG_NORMAL_REACH") = SELFCAL_LOG_NORMAL_REACH;
+    m.attr("FACTORS") = nb::make_tuple(1.0 / SELFCAL_FACTOR_MAX, SELFCAL_FACTOR_MAX);
+    m.attr("RATIOS") = nb::make_tuple(1.0 / SELFCAL_RATIO_MAX, SELFCAL_RATIO_MAX);
+    m.attr("TIMES") = nb::make_tuple(1.0 / SELFCAL_ALPHA_DT_MAX, SELFCAL_TIME_MAX);
+    m.attr("PERIOD_MIN") = SELFCAL_PERIOD_MIN;
+    m.attr("DAMPINGS") = nb::make_tuple(SELFCAL_DAMPING_MIN, SELFCAL_DAMPING_MAX);
+    m.attr("LIKELY") = SELFCAL_LIKELY;
+    m.attr("TUMBLE_BIAS_SD") = SELFCAL_TUMBLE_BIAS_SD;
+    m.attr("TUMBLE_SCALE_SD") = SELFCAL_TUMBLE_SCALE_SD;
+    m.attr("TUMBLE_ANGLE_SD") = SELFCAL_TUMBLE_ANGLE_SD;
+    m.attr("TUMBLE_SQUARE_SD") = SELFCAL_TUMBLE_SQUARE_SD;
+    m.attr("TUMBLE_REACH") = SELFCAL_TUMBLE_REACH;
+    m.attr("TUMBLE_LEFT") = SELFCAL_TUMBLE_LEFT;
+    m.attr("TUMBLE_WIDER") = SELFCAL_TUMBLE_WIDER;
     m.attr("IDENTIFIED") = static_cast<int>(SELFCAL_IDENTIFIED);
     m.attr("AT_MIN") = static_cast<int>(SELFCAL_AT_MIN);
     m.attr("AT_MAX") = static_cast<int>(SELFCAL_AT_MAX);

@@ -149,6 +149,6 @@ NB_MODULE(MODULE_NAME, m) {
     m.def("shifts", &shifts, "y"_a, "z"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "lost"_a, "driver"_a);
     m.def("slopes", &slopes, "y"_a, "r"_a, "F"_a, "Q"_a, "h"_a, "P0"_a, "R"_a, "lost"_a, "F_by"_a, "Q_by"_a, "h_by"_a,
           "P0_by"_a, "R_by"_a, "lost_by"_a, "driver"_a);
-    m.attr("STATES_MAX") = states_max;
     m.attr("COLUMNS_MAX") = columns_max;
+    m.attr("SLOPES_MAX") = width;
 }

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-STATES_MAX: int
 COLUMNS_MAX: int
+SLOPES_MAX: int
 
 def run(
     y: NDArray[np.float64],

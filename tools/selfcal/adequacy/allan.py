@@ -23,7 +23,7 @@ from scipy.special import gammaincinv, ndtri
 
 from selfcal.bank.blocks import Blocks
 from selfcal.bank.result import HALF_90, AxisResult, Estimate
-from selfcal.base.grid import bisected
+from selfcal.base.grid import SLOPE_STEP, bisected
 from selfcal.model.file import Group
 from selfcal.model.laws import FORGOTTEN, KINDS, Law, named
 from selfcal.model.tables import Tables
@@ -32,8 +32,6 @@ _Floats = NDArray[np.float64]
 
 #: Least length of a record over its longest averaging time: fewer windows say little.
 LONGEST = 5
-#: Step in the ln of a parameter for derivatives.
-STEP = 1e-3
 #: Least share of a variance S that S - V keeps: nearly equal numbers have a small difference.
 LEFT_LEAST = 0.2
 #: Number of draws of a posterior.
@@ -162,9 +160,9 @@ def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floa
 
 def _slopes(terms_at: Callable[[_Floats], Terms], ln_theta: _Floats, of: Callable[[Terms], _Floats]) -> _Floats:
     """Derivatives [d, t] of the logarithm of a curve `of` terms [t] in each ln parameter."""
-    steps = np.eye(ln_theta.size) * STEP
+    steps = np.eye(ln_theta.size) * SLOPE_STEP
     sides = [(of(terms_at(ln_theta + step)), of(terms_at(ln_theta - step))) for step in steps]
-    return np.array([np.log(up / down) for up, down in sides]) / (2.0 * STEP)
+    return np.array([np.log(up / down) for up, down in sides]) / (2.0 * SLOPE_STEP)
 
 
 def information_of(

@@ -17,7 +17,7 @@ from selfcal.model.file import Group, Model
 from selfcal.model.tables import Tables, make_tables
 from selfcal.readings.readings import mostly_beyond
 
-#: Bank intervals, gaps included, that the checks and the reference compute one by one.
+#: Intervals of an even grid, gaps included, that are computed one by one.
 MOST_DENSE = 10_000_000
 #: Fewest bank samples that are checked.
 FEWEST = 20

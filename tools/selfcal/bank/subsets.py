@@ -9,13 +9,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal import _library32
 from selfcal.bank.result import HALF_90, AxisResult, of_mixture
 from selfcal.model.regressors import Choice, coefficient_unit, ln_prior
 
 #: Least probability of a law that may be true. The widest of these laws of a subset states the coefficient. If a record
 #: does not separate a walk from a Gauss-Markov drift, a ramp is 2 to 4 times as uncertain under it. An average over
 #: the laws would cover 77 to 85 % of truths with a walk (tests/noise_coverage.py).
-LIKELY = 0.05
+LIKELY: float = _library32.LIKELY
 
 
 @dataclass(frozen=True)

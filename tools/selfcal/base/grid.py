@@ -18,6 +18,8 @@ Rows = NDArray[np.int64]
 
 #: Median absolute deviation of a normal with the standard deviation 1.
 MEDIAN_SD = NormalDist().inv_cdf(0.75)
+#: Step of a central difference by a number of about 1: rounding and curvature err alike.
+SLOPE_STEP = float(np.cbrt(np.finfo(float).eps))
 
 
 def bisected(holds: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from selfcal import _library32
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask, slices
 from selfcal.calibration.earth import Place
@@ -19,10 +20,13 @@ from selfcal.calibration.rests import ACCEL, REST_S, Tumble
 from selfcal.calibration.tumble_fit import Fit, Problem, fit
 from selfcal.readings.budget import FALSE_ALARM
 
-#: Stated priors, sd: bias, m/s^2 (100 mg); scale; angle, rad; temperature coefficient, m/s^2/degC (1 mg/degC).
-BIAS_SD, SCALE_SD, ANGLE_SD, THERMAL_SD = 0.98, 0.02, 0.02, 0.01
-#: sd of the square of the scale, s^2/m: 0.5 mg at 1 g. Data sheets' 0.1 to 0.5 % of a range of 2 to 16 g are 0.1 to 1.
-SQUARE_SD = 5e-5
+#: Stated priors, sd, of lib/tumble.h: bias, m/s^2 (100 mg); scale; angle, rad; square of the scale, s^2/m.
+BIAS_SD: float = _library32.TUMBLE_BIAS_SD
+SCALE_SD: float = _library32.TUMBLE_SCALE_SD
+ANGLE_SD: float = _library32.TUMBLE_ANGLE_SD
+SQUARE_SD: float = _library32.TUMBLE_SQUARE_SD
+#: sd of the temperature coefficient, m/s^2/degC (1 mg/degC).
+THERMAL_SD = 0.01
 #: Numbers of the parameters, and their places; that of gravity's one is an index.
 SIZES = (3, 3, 3, 1, 3)
 BIAS, SCALE, ANGLE, _, THERMAL = slices(SIZES)
@@ -32,7 +36,7 @@ PLACES = ((0, 1), (0, 2), (1, 2))
 #: sd of a parameter that the logs do not have: not 0, so that the prior has an inverse.
 NONE = float(np.finfo(float).eps)
 #: Largest distance of a parameter from its prior's mean, sd: no accelerometer has a larger one.
-REACH = 10.0
+REACH: float = _library32.TUMBLE_REACH
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import solve_triangular
 from scipy.stats import chi2
 
+from selfcal import _library32
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask
 from selfcal.readings.budget import FALSE_ALARM
@@ -24,7 +25,8 @@ UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in 
 NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
 #: Largest share of its prior variance that the data leave an identified parameter, and the factor by which priors are
 #: wider then.
-IDENTIFIED, WIDER = 0.2, 8.0
+IDENTIFIED: float = _library32.TUMBLE_LEFT
+WIDER: float = _library32.TUMBLE_WIDER
 
 
 @dataclass(frozen=True)

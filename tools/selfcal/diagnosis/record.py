@@ -10,6 +10,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter1d
 
 from selfcal import _library32
+from selfcal.bank.blocks import MOST_DENSE
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Rows
 from selfcal.likelihood.state import Regressor, State
@@ -33,8 +34,8 @@ from selfcal.readings.readings import (
     thinned,
 )
 
-#: Samples that a diagnosis needs at least, and takes at most, gaps included.
-LEAST, MOST = 200, 10_000_000
+#: Samples that a diagnosis needs at least.
+LEAST = 200
 #: Largest reading over the sensor's range: beyond, the unit is wrong, or the file.
 BEYOND = 100.0
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
@@ -175,10 +176,10 @@ def _grid_of(recording: Recording, decimate: float | None, axes: Sequence[str]) 
     n = int(base.place[-1] - float(base.place[0]) + 1) // block
     if n < LEAST:
         raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
-    if n > MOST:
+    if n > MOST_DENSE:
         raise UserError(
-            f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST:,}: cut it at its gaps, or "
-            "take a lower --decimate"
+            f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST_DENSE:,}: "
+            "cut it at its gaps, or take a lower --decimate"
         )
     return _Grid(base, block, n)
 

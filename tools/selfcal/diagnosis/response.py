@@ -25,6 +25,7 @@ from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import POWER
 from selfcal.model.regressors import coefficient_unit
+from selfcal.readings.budget import FALSE_ALARM
 from selfcal.readings.held import updates
 from selfcal.readings.lattice import step_of
 
@@ -36,8 +37,6 @@ SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 RECORDS = 20
 #: Rounds in which each of several inputs is searched beside the others.
 ROUNDS = 2
-#: Records for each false misfit.
-MISFIT = 500.0
 #: Quantiles of an interval.
 ENDS = tuple(0.5 + end * PROBABILITY / 2.0 for end in (-1.0, 0.0, 1.0))
 #: How the readings of a held input were taken.
@@ -242,11 +241,11 @@ class Pooled:
 
 
 def _misfits(left_over: float, held_out: float, methods: Mapping[str, Any]) -> list[str]:
-    """What contradicts the structure, in words. Where it holds, each is so by chance once in MISFIT records."""
+    """What contradicts the structure, in words. Where it holds, each is so by chance in FALSE_ALARM of records."""
     said = []
-    if left_over > math.log(MISFIT):
+    if left_over > -math.log(FALSE_ALARM):
         said.append("the residuals still go with the input")
-    if held_out < -math.log(MISFIT):
+    if held_out < math.log(FALSE_ALARM):
         said.append("by the part before, the last third is predicted worse with the input than without")
     for name, method in methods.get("methods", {}).items():
         if not method["agrees"]:
@@ -255,7 +254,7 @@ def _misfits(left_over: float, held_out: float, methods: Mapping[str, Any]) -> l
             what = {"gain": "a static gain", "delay_s": "a delay"}[key]
             said.append(f"{name} finds {what} of {method[key]:.3g}, where {low:.3g} to {high:.3g} was due")
     spectra = methods.get("spectra")
-    if spectra and spectra["hold_answer"] < binom.ppf(1.0 / MISFIT, spectra["bands"], PROBABILITY):
+    if spectra and spectra["hold_answer"] < binom.ppf(FALSE_ALARM, spectra["bands"], PROBABILITY):
         said.append(f"{spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")
     return said
 

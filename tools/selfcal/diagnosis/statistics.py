@@ -30,8 +30,8 @@ FEWEST = 8
 LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}
 #: Times at least that the drift forgets in a record in which jumps are looked for.
 TURNS_LEAST = 50.0
-#: Whitened residuals beyond are of a model that does not describe the readings at all, which `SPREAD` states.
-FAR_OFF, SPREAD = 1e9, "innovation_spread"
+#: Name of the statistic of a model that does not describe the readings at all.
+SPREAD = "innovation_spread"
 #: Samples of the blocks whose sums show slow correlation.
 BLOCKS = (4, 16, 64, 256)
 #: The longest averaging time of an Allan deviation is this part of a record.
@@ -69,8 +69,9 @@ def all_statistics(w: Array, y: Array | None, lsb: float, jumps: Callable[[Array
     n = x.size
     if n < 50:
         return {}
-    sd = float(np.clip(x, -FAR_OFF, FAR_OFF).std())
-    if not sd > 0.0:
+    with np.errstate(over="ignore"):
+        sd = float(x.std())
+    if not 0.0 < sd < math.inf:
         return {SPREAD: math.inf}
     x = (x - x.mean()) / sd
     filled = np.where(present, (w - np.nanmean(w)) / sd, 0.0)

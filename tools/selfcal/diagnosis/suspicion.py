@@ -12,19 +12,16 @@ import yaml
 from selfcal.adequacy.document import to_document
 from selfcal.adequacy.identify import identify_axis
 from selfcal.bank.blocks import FEWEST
-from selfcal.bank.priors import add_sources, for_record
+from selfcal.bank.priors import MOST_INTERVALS, add_sources, for_record
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import UNEXPLAINED
 from selfcal.diagnosis.loop import LOOKS
 from selfcal.diagnosis.record import Record, of_recording
 from selfcal.likelihood.fit import ROUGH_FTOL
-from selfcal.likelihood.state import NET_LEAST, Look, State
+from selfcal.likelihood.state import NET_LEAST, SLOW_S, Look, State
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import bank_block, make_tables
-
-#: Rate of the means that are looked at, Hz, and how many of them at most: a longer record has longer ones.
-RATE_HZ, MOST = 1.0, 20_000
 
 
 def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[str, Look]:
@@ -44,9 +41,9 @@ def suspicions(recording: Recording, model: Model, axes: Sequence[str]) -> dict[
 
 
 def rough(recording: Recording, model: Model, axes: Sequence[str]) -> tuple[Record, dict[str, State]]:
-    """Means of 1 s, and a rough fit of each of the axes that can be judged, less the motion. Raises UserError for a
-    record that is too short."""
-    record = of_recording(recording, model, min(RATE_HZ, recording.rate_hz, MOST / recording.duration_s))
+    """Means of SLOW_S, or MOST_INTERVALS longer ones, and a rough fit of each of the axes that can be judged, less the
+    motion. Raises UserError for a record that is too short."""
+    record = of_recording(recording, model, min(1.0 / SLOW_S, recording.rate_hz, MOST_INTERVALS / recording.duration_s))
     states = {name: record.axes[name] for name in axes if name in record.axes and not record.axes[name].below_lattice}
     return record, {name: state.masked(record.moving).refit(ftol=ROUGH_FTOL) for name, state in states.items()}
 

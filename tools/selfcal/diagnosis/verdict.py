@@ -14,7 +14,7 @@ from typing import Any
 
 from scipy.special import ndtr
 
-from selfcal.adequacy.checks import against
+from selfcal.adequacy.checks import HIDDEN_MOST, against
 from selfcal.diagnosis.causes import shared
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
@@ -27,8 +27,6 @@ from selfcal.readings.budget import AXES, OF_MODULES
 SHOWN = (("innovation_mean", "innovation_means"), ("innovation_ln_variance", "noise_level"))
 #: Probability that the statistics call an axis of a fitting record inadequate, and that a channel's coherence does.
 P_FAMILY, P_COHERENCE = (OF_MODULES[name] / AXES for name in ("statistics", "coherence"))
-#: Drift within a block of means over its white noise from which on the means alone show nothing: sqrt(6), less a tenth.
-WITHIN = 2.2
 #: A first ensemble screens: axes below this have a second one, which knows its tail, unless there is no doubt.
 P_SCREEN, P_CERTAIN, AGAIN = 2e-2, 1e-12, 240
 
@@ -88,10 +86,10 @@ def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted:
 def moves_within(state: State, block_s: float) -> bool:
     """Whether the drift moves so far within a block, s, that no model of point drift and white noise has its means.
 
-    Means of a walk are a walk at points and white noise less a sixth of its step: none is left beyond sqrt(6) N."""
+    Means of a walk are a walk at points and white noise less a sixth of its step, which takes HIDDEN_MOST of N^2."""
     fit = state.best
     markov = fit.sigma_m * math.sqrt(2.0 * fit.alpha) if fit.terms.markov else 0.0
-    return math.hypot(fit.K, markov) * block_s > WITHIN * fit.N
+    return (math.hypot(fit.K, markov) * block_s) ** 2 / 6.0 > HIDDEN_MOST * fit.N**2
 
 
 def coherence(state: State, record: Record) -> list[Statistic]:

@@ -14,11 +14,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from selfcal.bank.result import HALF_90
+import numpy as np
+
+from selfcal.bank.result import FAINT, HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.limits import read_text, reading
-from selfcal.model.file import LONGEST_TEXT, Model
+from selfcal.model.file import LONGEST_TEXT, MOST_HYPOTHESES, Model
 from selfcal.model.laws import PARAMETERS, PLACES, RATIOS
 from selfcal.model.tables import HypothesisTable, PriorLaw, PriorRow, RegressorTable, Tables
 
@@ -30,12 +32,10 @@ WIDENED = REACH / math.sqrt(3.0)
 #: temperature.
 RUN_TO_RUN = {"N": 0.05, "K": 0.2, "sigma_m": 0.2, "B": 0.2}
 RUN_TO_RUN_COEFFICIENT = 0.1
-#: Probability below which one record says nothing. Such a law keeps the model's priors. Such a regressor may be in use
-#: in the next record all the same, and one that is sure may not: odds of 99 to 1 at most.
-LEAST_PROBABILITY = 0.01
-MOST_LN_ODDS = math.log1p(-LEAST_PROBABILITY) - math.log(LEAST_PROBABILITY)
-#: How far rounding takes a sum of probabilities beyond 1.
-ROUNDING = 1e-6
+#: Most ln odds of a regressor: one that is FAINT may be in use in the next record, and one that is sure may not.
+MOST_LN_ODDS = math.log1p(-FAINT) - math.log(FAINT)
+#: How far rounding takes a sum of probabilities beyond 1: the bank reports floats.
+ROUNDING = MOST_HYPOTHESES * float(np.finfo(np.float32).eps)
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class _Reader:
         limits: dict[str, dict[str, tuple[float, float]]] = {}
         share = {law: self.probability(hypotheses, law, f"{where}.hypotheses") for law in laws}
         for law in sorted(laws, key=lambda law: -share[law]):
-            if share[law] < LEAST_PROBABILITY:
+            if share[law] < FAINT:
                 # What such a law says of N is wrong, and a wider prior would have it win where N has changed.
                 likeliest = next(iter(limits.values()), {})
                 limits[law] = {"N": likeliest["N"]} if "N" in likeliest else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from selfcal.base.errors import few
@@ -98,8 +98,6 @@ LATER = (
     *("harmonics", "width_hz", "form", "form_also_possible", "lag_s", "width", "time_constant_s", "tau_2_s"),
     *("band_hz", "clipped"),
 )
-#: Half of a coefficient's 90 % interval over it, below which it is applied and not recorded again.
-APPLIED = 0.05
 #: The largest sensitivity of a gyroscope to acceleration in data sheets, deg/s per m/s^2 (0.2 deg/s per g).
 G_SENSITIVITY = 0.02
 
@@ -289,7 +287,7 @@ def action(finding: Mapping[str, Any]) -> str:
     sure = [axis for axis, on_axis in finding["axes"].items() if _sure(on_axis["estimate"].get("coefficient"))]
     if finding.get("next_record") or "source" in finding["estimate"] or not sure:
         return str(finding["record_next"])
-    applied = f"known to {100.0 * APPLIED:.0f} %. --write-model states it."
+    applied = f"known to {100.0 * MATTERS:.0f} %. --write-model states it."
     if len(sure) == len(finding["axes"]):
         return f"Apply it: it is {applied}"
     rest = " ".join(axis for axis in finding["axes"] if axis not in sure)
@@ -315,9 +313,10 @@ def planned(record: Mapping[str, Any] | None, else_: str) -> str:
 
 
 def _sure(coefficient: Mapping[str, Any] | None) -> bool:
-    return coefficient is not None and coefficient["q95"] - coefficient["q05"] < 2.0 * APPLIED * abs(
-        coefficient["median"]
-    )
+    """Whether half of its 90 % interval is less than what matters: it is applied, and not recorded again."""
+    if coefficient is None:
+        return False
+    return bool(coefficient["q95"] - coefficient["q05"] < 2.0 * MATTERS * abs(coefficient["median"]))
 
 
 def small(findings: Sequence[Mapping[str, Any]]) -> str:
@@ -337,13 +336,13 @@ def ratio(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f}".format) -> str:
+def evidence(finding: Mapping[str, Any]) -> str:
     """What a finding gained when it was found, over the model with the findings of earlier rounds."""
     found = finding.get("found_in_round", 0)
     gain = finding["evidence_gain_nats"]
-    text = f"{number(math.inf if gain is None else gain)} nats" + (f" in round {found}" if 1 <= found <= ROUNDS else "")
+    text = f"{math.inf if gain is None else gain:.1f} nats" + (f" in round {found}" if 1 <= found <= ROUNDS else "")
     net = finding.get("net_nats")
-    return text if net is None or not math.isfinite(net) else f"{text}, {number(net)} net of the search"
+    return text if net is None or not math.isfinite(net) else f"{text}, {net:.1f} net of the search"
 
 
 def carried(finding: Mapping[str, Any]) -> list[str]:

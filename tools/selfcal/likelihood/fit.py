@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from selfcal import _likelihood
+from selfcal.base.grid import SLOPE_STEP
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Mask, Terms, matrices
 
-#: Columns that the compiled filter takes in one pass (bindings/likelihood.cpp).
-COLUMNS_MOST = 39
+#: Columns that the compiled filter takes in one pass beside the record.
+COLUMNS_MOST = _likelihood.COLUMNS_MAX - 1
 #: Products of matrices that numpy leaves to one thread.
 ONE_THREAD = 200_000
-#: A column of which the others leave less than this share is one of theirs.
-SPENT = 1e-9
+#: A column of which the others leave less than this share is one of theirs: half of a double's digits are left.
+SPENT = math.sqrt(np.finfo(float).eps)
 #: A fit has settled when a step changes ln likelihood by less than this: a hundredth of the smallest evidence told.
 FTOL = 0.01
 #: ... of a quick look, which ranks causes and measures none: their evidence differs by more.
@@ -35,10 +36,6 @@ NODES = (-2.0, -1.0, 0.0, 1.0, 2.0)
 HARDLY, NODE_STEP, POSSIBLE, PLATEAU, NODES_FARTHEST = 0.7, 0.6, 4.0, 0.02, 18.0
 #: Longer records know their parameters well enough: the best ones stand for all.
 NODES_MOST = 100_000
-#: The slopes of a model's matrices are taken over this much of each parameter: exact to 1e-8.
-NEAR = 1e-4
-#: Parameters that one pass takes the slopes by (bindings/likelihood.cpp).
-TOGETHER = 4
 #: Steps of a fit at most, how far one goes at most in any parameter, and how much shorter one is that went too far.
 STEPS, FARTHEST, SHORTER = 40, 3.0, 0.25
 #: A step that promises less than this share of `ftol` is not taken.
@@ -327,16 +324,16 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
     m = matrices(terms, theta, series.dt, series.duration_s, series.block)
     near = [
         [matrices(terms, theta + sign * move, series.dt, series.duration_s, series.block) for sign in (1.0, -1.0)]
-        for move in NEAR * np.eye(theta.size)
+        for move in SLOPE_STEP * np.eye(theta.size)
     ]
     by = [
-        np.array([(getattr(ahead, name) - getattr(back, name)) / (2.0 * NEAR) for ahead, back in near])
+        np.array([(getattr(ahead, name) - getattr(back, name)) / (2.0 * SLOPE_STEP) for ahead, back in near])
         for name in ("F", "Q", "h", "P0", "R", "lost")
     ]
     whole, k = series.y - at.c @ series.columns, theta.size
     pairs = [[j, j + 1][: k - j] for j in range(0, k, 2)]
     rss, n, rss_by, D_by, innovations, spread = 0.0, 0.0, *np.empty((2, k)), *np.empty((2, k, k))
-    for part in [[*range(k)]] if k <= TOGETHER else [a + b for a, b in combinations(pairs, 2)]:
+    for part in [[*range(k)]] if k <= _likelihood.SLOPES_MAX else [a + b for a, b in combinations(pairs, 2)]:
         F, Q, h, P0, R, lost = (each[part] for each in by)
         rss, _, n, rss_by[part], D_by[part], innovations[np.ix_(part, part)], spread[np.ix_(part, part)] = (
             _likelihood.slopes(whole, series.r, m.F, m.Q, m.h, m.P0, m.R, m.lost, F, Q, h, P0, R, lost, m.driver)

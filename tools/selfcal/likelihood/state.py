@@ -17,6 +17,7 @@ from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
 from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Mask, Terms
 from selfcal.readings.budget import OF_MODULES, P_LOOK
+from selfcal.readings.lattice import OFF
 
 if TYPE_CHECKING:
     from selfcal.likelihood.columns import Shape
@@ -30,8 +31,6 @@ EVIDENT = -math.log(OF_MODULES["together"])
 FAR = 40.0
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
-#: Difference of two lattices over one of them from which on they are two.
-SAME_LATTICE = 0.02
 #: Score gains below this are not worth a refit: the refit gains about as much.
 SCREEN = 2.0
 #: Columns that one pass of the filter takes beside the model's.
@@ -107,7 +106,7 @@ class State:
     @property
     def lattice_is_stated(self) -> bool:
         """Whether the model file states the lattice that the values lie on."""
-        return self.stated_lsb > 0.0 and abs(self.lsb / self.stated_lsb - 1.0) < SAME_LATTICE
+        return self.stated_lsb > 0.0 and abs(self.lsb / self.stated_lsb - 1.0) < OFF
 
     def masked(self, mask: Mask) -> State:
         """The state without the samples of `mask` [n]."""

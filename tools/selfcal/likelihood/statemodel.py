@@ -14,13 +14,14 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal.model.file import ABOUT_N
 from selfcal.model.laws import DAMPING_LIMITS, lost_of, swing
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-#: A Gauss-Markov drift keeps within these correlation rates, 1/s: faster ones are coloured noise.
-ALPHA_LIMITS = (2e-4, 0.2)
+#: A Gauss-Markov drift keeps within the default model's correlation rates, 1/s: faster ones are coloured noise.
+ALPHA_LIMITS = ABOUT_N["alpha"][:2]
 #: Sizes relative to the white noise of one sample.
 SIZE_LIMITS = (1e-5, 1e2)
 #: A drift that oscillates keeps within these periods, s: faster ones are a band.

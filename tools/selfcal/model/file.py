@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from selfcal import _library32
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
-from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
+from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_RATE_HZ, read_text, reading
 from selfcal.base.units import SENSORS
 from selfcal.model.forms import FORMS, HOST_FORMS, INPUTS, NUMBER, POWER, Knots
 from selfcal.model.laws import (
@@ -44,9 +44,8 @@ DEFAULT_PART = "adis16405"
 #: Prior limits of parameters that no law of the file has: as in the default model at 1 Hz; and whether they multiply
 #: the limits of N.
 ABOUT_N = {"K": (0.02, 0.04, True), "sigma_m": (0.5, 1.0, True), "alpha": (2e-4, 0.2, False)}
-#: Least nodes of a grid dimension, as a quintic spline needs them; and the limits of a dimension.
-LEAST_NODES = 6
-NODES = (LEAST_NODES, _library32.GRID_MAX)
+#: Limits of the nodes of a grid dimension.
+NODES: tuple[int, int] = (_library32.GRID_MIN, _library32.GRID_MAX)
 #: Largest sd of a bias prior over the least N: a scatter below 1e-9 of its sd counts as none (lib/report_node.c).
 WIDEST_BIAS = 1e8
 #: Most characters of a name or another text.
@@ -55,12 +54,12 @@ LONGEST_TEXT = 200
 MOST_AXES, MOST_TAPS = 64, 1024
 #: Largest number of any kind: its square is still a float.
 LARGEST = 1e18
-#: Largest ln of a parameter that a prior may reach, as a float: LN_LIMIT in lib/bank.c.
-LN_LIMIT = 46.0
+#: Largest ln of a parameter that a prior may reach, as a float.
+LN_LIMIT: float = _library32.LN_LIMIT
 #: Smallest number but 0: what a prior may reach, to one digit.
 SMALLEST = float(f"{math.exp(-LN_LIMIT):.0e}")
-#: sd from the middle of a log-normal prior to its limits: SELFCAL_LOG_NORMAL in lib/selfcal_tables.h.
-LOG_NORMAL_REACH = 4.0
+#: sd from the middle of a log-normal prior to its limits.
+LOG_NORMAL_REACH: float = _library32.LOG_NORMAL_REACH
 #: Limits of the sd of a log-normal prior: below, the limits of large logarithms are equal floats.
 LOG_NORMAL_SD = (1e-4, 5.0)
 #: Kinds of regressors, and the keys of an entry of each apart from name, kind, sd and probability.
@@ -73,8 +72,8 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
     "turn_on": ("tau_s",),
     "pulse": ("start_s", "end_s"),
 }
-#: Most hypotheses of one model: SELFCAL_HYPOTHESES_MAX of the host's library, and what the wire has places for.
-MOST_HYPOTHESES = 8
+#: Most hypotheses of one model, in the host's library and on the wire.
+MOST_HYPOTHESES: int = _library32.HYPOTHESES_MAX
 #: Most columns of a bank's regressors together, and most that a model file may state.
 MOST_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
 
@@ -363,8 +362,8 @@ class _Loader(yaml.SafeLoader):
         below = [node.value] if isinstance(node, yaml.ScalarNode) else node.value
         parts = [part for entry in below for part in (entry if isinstance(entry, tuple) else (entry,))]
         size = 1 + sum(1 if isinstance(part, str) else self._values[id(part)] for part in parts)
-        if size > MOST_MODEL_VALUES:
-            what = f"more than {MOST_MODEL_VALUES} values, aliases counted as often as they stand"
+        if size > MOST_MODEL_BYTES:  # a file without aliases has a byte a value at least
+            what = f"more than {MOST_MODEL_BYTES} values, aliases counted as often as they stand"
             raise yaml.constructor.ConstructorError(None, None, what, node.start_mark)
         self._values[id(node)] = size
         return node

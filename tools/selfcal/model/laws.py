@@ -15,28 +15,30 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from selfcal import _library32
+
 _Floats = NDArray[np.float64]
 
-#: Most terms of one law, states of its drift and coloured noise together: SELFCAL_LAW_TERMS, SELFCAL_TERMS_MAX of 3.
-MOST_TERMS = 3
-#: Limits of the factors of a deviation and a bandwidth: FACTOR_MIN, FACTOR_MAX in lib/bank_states.c.
-FACTORS = (1e-3, 1e3)
+#: Most terms of one law, states of its drift and coloured noise together.
+MOST_TERMS: int = _library32.TERMS_MAX
+#: Limits of the factors of a deviation and a bandwidth.
+FACTORS: tuple[float, float] = _library32.FACTORS
 #: Parameters of every group's priors, in the order of `selfcal_parameter_t`.
 PARAMETERS = ("N", "K", "sigma_m", "alpha")
 #: Place of each parameter there. No law has two of one place.
 PLACES = {"N": 0, "K": 1, "sigma_m": 2, "B": 2, "alpha": 3, "spectral_ratio": 3, "markov_ratio": 3}
 #: Parameters without a unit, and their limits: beyond, 1 + theta or 1 - theta is no longer a float.
 RATIOS = ("spectral_ratio", "markov_ratio")
-RATIO_LIMITS = (1e-3, 1e3)
+RATIO_LIMITS: tuple[float, float] = _library32.RATIOS
 
 #: Correlation times in an interval beyond which the means of a drift count as white: neighbours' correlate by 0.02.
 FORGOTTEN = 20.0
 
-#: Least bank intervals in a period of an oscillation, and limits of its damping ratio (SWING_MAX, DAMPING_MIN and
-#: DAMPING_MAX in lib/bank_states.c).
-SWING_LEAST, DAMPING_LIMITS = 8.0, (1e-3, 0.7)
-#: Bank intervals of a correlation time: ALPHA_DT_MAX in lib/averages.h, TIME_MAX in lib/bank_states.c.
-TIMES = (1.0 / 6.9, 1e6)
+#: Least bank intervals in a period of an oscillation, and limits of its damping ratio.
+SWING_LEAST: float = _library32.PERIOD_MIN
+DAMPING_LIMITS: tuple[float, float] = _library32.DAMPINGS
+#: Limits of a correlation time, bank intervals.
+TIMES: tuple[float, float] = _library32.TIMES
 #: (kind, deviation, bandwidth, stated, by_ratio) of each term, and whether the noise is coloured: for the bindings.
 LawTuple = tuple[list[tuple[int, float, float, bool, bool]], bool]
 

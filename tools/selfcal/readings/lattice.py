@@ -31,7 +31,7 @@ ROUNDED = 1e-8
 COARSEST = 1.0
 #: Below this many steps in the noise the lattice is that of the number's digits, and shows in nothing.
 FINE = 0.01
-#: Largest distance of a value from its lattice, in steps.
+#: Largest distance of a value from its lattice, in steps; largest difference of two steps that are one, over one.
 OFF = 0.02
 #: Last digits of printed values in a step at least, for it to show.
 PRINTED = 3.0

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import optimize
+from scipy.special import exprel
 
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
@@ -42,8 +43,6 @@ FIGURES = {
 }
 #: s over which the identified drift is as uncertain as the bank states: the outage, and the flight.
 HORIZONS_S = (float(OUTAGE_S), float(GPS_S + OUTAGE_S))
-#: A slower drift is a walk, 1/s; the least growth of a variance, as a share of it.
-SLOWEST, TINY = 1e-6, 1e-9
 #: Parts whose filters run side by side.
 TOGETHER = 25
 
@@ -92,15 +91,16 @@ def matched(now: float, near: float, far: float) -> dict[str, float]:
     """The drift whose variance grows from `now` to `near` and `far` over HORIZONS_S: Gauss-Markov, or a walk where the
     growth does not slow down."""
     first, last = HORIZONS_S
-    grown, whole = max(near - now, TINY * now), max(far - now, TINY * now)
+    least = float(np.finfo(np.float32).eps) * now  # the bank reports floats
+    grown, whole = max(near - now, least), max(far - now, least)
 
     def slower(alpha: float) -> float:
-        return math.expm1(-2.0 * alpha * last) / math.expm1(-2.0 * alpha * first) - whole / grown
+        return float(last / first * exprel(-2.0 * alpha * last) / exprel(-2.0 * alpha * first)) - whole / grown
 
-    if slower(SLOWEST) <= 0.0:
+    if slower(0.0) <= 0.0:
         return {"K": math.sqrt(whole / last)}
     fastest = 1.0 / first
-    alpha = optimize.brentq(slower, SLOWEST, fastest) if slower(fastest) < 0.0 else fastest
+    alpha = optimize.brentq(slower, 0.0, fastest) if slower(fastest) < 0.0 else fastest
     return {"sigma_m": math.sqrt(now - grown / math.expm1(-2.0 * alpha * first)), "alpha": alpha}
 
 

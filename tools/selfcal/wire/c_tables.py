@@ -13,7 +13,7 @@ from selfcal.base.output import whole
 from selfcal.base.templates import of_code
 from selfcal.base.units import factor
 from selfcal.logs.recording import SIDE_CHANNELS
-from selfcal.model.file import LEAST_NODES, NOT_HANDLED, Model
+from selfcal.model.file import NODES, NOT_HANDLED, Model
 from selfcal.model.forms import COLUMN_KINDS, HOST_FORMS
 from selfcal.model.laws import KIND_CODES, MOST_TERMS
 from selfcal.model.tables import AxisTable, PriorRow, Tables, gate_table
@@ -111,13 +111,13 @@ def check_forms(model: Model) -> None:
 def sizes(tables: Tables, target: str) -> dict[str, int]:
     """The library's sizes for these tables on a core, by their macros without SELFCAL_ (lib/selfcal.h)."""
     grids = [grid.nodes for h in tables.hypotheses for grid in (h.rho, h.alpha) if grid]
-    grid = max(grids, default=LEAST_NODES)
+    grid = max(grids, default=NODES[0])
     nodes = max(grid, *(h.nodes for h in tables.hypotheses))
     return {
         "AXES_MAX": len(tables.axes),
         "HYPOTHESES_MAX": len(tables.hypotheses),
         "GRID_MAX": grid,
-        "ALPHA_MAX": max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=LEAST_NODES),
+        "ALPHA_MAX": max((h.alpha.nodes for h in tables.hypotheses if h.alpha), default=NODES[0]),
         "HYPOTHESIS_NODES_MAX": nodes,
         "NODES_MAX": max(nodes, tables.nodes),
         "REGRESSORS_MAX": max(1, len(tables.regressors)),

@@ -34,8 +34,8 @@ QUANTILES = 64
 JUMPS_LEAST = 4
 #: Price of the search beside three degrees of freedom.
 LN_LOOKS = 2.0 + LN_SLOW
-#: Limits of a probability, and the largest exponent.
-LEAST, LN_MOST = 1e-9, 700.0
+#: Limits of a probability, and the largest exponent, of a double.
+LEAST, LN_MOST = float(np.finfo(float).eps), math.log(np.finfo(float).max)
 
 
 def switching(y: Array, theta: Array) -> tuple[Array, Array]:

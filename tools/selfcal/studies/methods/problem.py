@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from selfcal.adequacy.allan import LONGEST, STEP, Terms, overlapping, terms_of
+from selfcal.adequacy.allan import LONGEST, Terms, overlapping, terms_of
 from selfcal.bank.result import HALF_90
 from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Group, Prior
@@ -21,6 +21,8 @@ Floats = NDArray[np.float64]
 
 #: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
 REACH = 1e5
+#: Step in the ln of a parameter for a curvature: a smaller one shows the rounding of an Allan variance.
+STEP = 0.01
 #: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
 LEVEL_SD = 10.0
 
@@ -170,7 +172,7 @@ def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> P
 def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
     """Second derivatives by central differences."""
     d = theta.size
-    step = np.eye(d) * STEP * 10.0
+    step = np.eye(d) * STEP
     matrix = np.empty((d, d))
     for i in range(d):
         for j in range(i, d):
@@ -178,7 +180,7 @@ def hessian(objective: Callable[[Floats], float], theta: Floats) -> Floats:
                 objective(theta + a * step[i] + b * step[j])
                 for a, b in ((1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
             ]
-            matrix[i, j] = matrix[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * (STEP * 10.0) ** 2)
+            matrix[i, j] = matrix[j, i] = (values[0] - values[1] - values[2] + values[3]) / (4.0 * STEP**2)
     return matrix
 
 

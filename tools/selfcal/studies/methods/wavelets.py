@@ -12,7 +12,8 @@ from functools import partial
 
 import numpy as np
 
-from selfcal.adequacy.allan import STEP, Terms
+from selfcal.adequacy.allan import Terms
+from selfcal.base.grid import SLOPE_STEP
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, inverse, logarithmic, maximum
 
@@ -54,6 +55,7 @@ def gmwm(problem: Problem) -> Answer:
             by_law[law] = {name: Value(value.value) for name, value in first.values(law).items()}
             continue
         theta = maximum(partial(objective, weight), [first.at]).at
-        jacobian = np.array([(model(theta + s) - model(theta - s)) / (2.0 * STEP) for s in np.eye(theta.size) * STEP])
+        sides = [(model(theta + step), model(theta - step)) for step in np.eye(theta.size) * SLOPE_STEP]
+        jacobian = np.array([up - down for up, down in sides]) / (2.0 * SLOPE_STEP)
         by_law[law] = logarithmic(NAMED[law].parameters, theta, inverse(jacobian @ weight @ jacobian.T))
     return Answer(by_law)
