@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from selfcal.base.errors import few
@@ -336,13 +336,13 @@ def ratio(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
 
 
-def evidence(finding: Mapping[str, Any]) -> str:
+def evidence(finding: Mapping[str, Any], number: Callable[[float], str] = "{:.1f}".format) -> str:
     """What a finding gained when it was found, over the model with the findings of earlier rounds."""
     found = finding.get("found_in_round", 0)
     gain = finding["evidence_gain_nats"]
-    text = f"{math.inf if gain is None else gain:.1f} nats" + (f" in round {found}" if 1 <= found <= ROUNDS else "")
+    text = f"{number(math.inf if gain is None else gain)} nats" + (f" in round {found}" if 1 <= found <= ROUNDS else "")
     net = finding.get("net_nats")
-    return text if net is None or not math.isfinite(net) else f"{text}, {net:.1f} net of the search"
+    return text if net is None or not math.isfinite(net) else f"{text}, {number(net)} net of the search"
 
 
 def carried(finding: Mapping[str, Any]) -> list[str]:

@@ -590,7 +590,8 @@ def _with_nan(text: str, separator: str) -> str:
         while empty in text:
             text = text.replace(empty, f"{separator}nan{separator}")
     for blank in (" ", "\r"):
-        text = text.replace(f"{separator}{blank}\n", f"{separator}\n")
+        if f"{separator}{blank}\n" in text:
+            text = text.replace(f"{separator}{blank}\n", f"{separator}\n")
     text = text.replace(f"{separator}\n", f"{separator}nan\n").replace(f"\n{separator}", f"\nnan{separator}")
     return ("nan" if text.startswith(separator) else "") + text + ("nan" if text.endswith(separator) else "")
 
