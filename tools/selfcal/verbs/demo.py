@@ -14,6 +14,8 @@ from selfcal.verbs._shared import ModelFile
 REPORT_S, FASTEST = 10.0, 1000.0
 #: python-can's own group and port, so that its tools listen there without more.
 GROUP, PORT = "239.74.163.2", 43113
+#: Time that the firmware waits for a host, s: longer than anybody does.
+FOREVER_S = 999_999.0
 
 
 def demo(
@@ -41,7 +43,7 @@ def demo(
     from selfcal.model.file import Model
     from selfcal.wire.dbc_file import check_node
     from selfcal.wire.frames import SHIPPED
-    from selfcal.wire.replay import LONGEST_PERIOD_S, build, running, write_rows
+    from selfcal.wire.replay import build, running, write_rows
 
     if not 0.0 < speed <= FASTEST:
         raise UserError(f"--speed must be above 0 and at most {FASTEST:g}, not {speed:g}")
@@ -55,7 +57,7 @@ def demo(
     recording = recording.along(*names)
     with Console(stderr=True).status("building the firmware"):
         firmware = build(loaded, recording.rate_hz, names)
-    more = ["--realtime", f"{speed:g}", "--timeout", f"{LONGEST_PERIOD_S:g}", "--node", str(node)]
+    more = ["--realtime", f"{speed:g}", "--timeout", f"{FOREVER_S:g}", "--node", str(node)]
     if transport == "can":
         more += ["--can", channel or f"{GROUP}:{PORT}"]
         watch = (

@@ -51,8 +51,7 @@ MAGIC = b"SELFCAL2"
 #: Channels of every sample apart from the model's (port/port.h); not a number if the recording lacks them.
 SIDE = tuple(SIDE_CHANNELS.values())
 TIMEOUT_S = 60.0  # for the host firmware without a frame, and for any to end
-#: Longest period and longest wait of the firmware, s: the module compares times in ms as int32.
-LONGEST_PERIOD_S = np.iinfo(np.int32).max / 1000.0
+LONGEST_PERIOD_S = 4e6  # module time is uint32 in ms
 #: Sources of a firmware, and the environment variables that its `make` file reads.
 SOURCES = (".c", ".h", ".ld", ".mk")
 #: Debian packages of the programs that build and run it.
