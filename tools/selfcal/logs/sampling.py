@@ -65,9 +65,8 @@ CHANGE = 1e-3
 #: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
 #: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
 _ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
-#: A gap between steps of any length, in the step beyond which half of the time is, or in the usual one; errors about
-#: their line that are far off, in the median one; how far batches that overlap may stray from a steady count, in their
-#: length.
+#: A gap between steps of any length, in the step beyond which half of the time is; errors about their line that are
+#: far off, in the median one; how far batches that overlap may stray from a steady count, in their length.
 _GAP, _FAR, _STRAY = 12.0, 6.0, 5.0
 #: The share of the gaps that keep to a rhythm or a pattern, and gaps in a period of losses at most.
 _RHYTHM, _OF_PATTERN = 0.9, 4
@@ -322,17 +321,8 @@ def _counted(stamps: _Stamps, _: float) -> _Fit:
     dt = _slope(index, time, [cut for cut, seconds in zip(cuts, lost, strict=True) if seconds], trimmed=True)
     missing[cuts] = np.maximum(0, np.rint(np.array(lost) / dt)).astype(np.int64)
     kept = steps[~stamps.asleep]
-    nats = 3.0 * math.log(index.size) + min(stamps.ln_values(kept), _ln_batches(stamps, kept)) if kept.size else 0.0
+    nats = stamps.ln_values(kept) + 3.0 * math.log(index.size) if kept.size else 0.0
     return stamps.put_back(_Fit(dt, missing, nats))
-
-
-def _ln_batches(stamps: _Stamps, steps: Floats) -> float:
-    """Nats that write steps [m] within batches and those between them apart from each other."""
-    between = steps > _GAP * _usual(steps)  # those across lost samples are shorter, but for long losses
-    many = int(np.count_nonzero(between))
-    if not 0 < _AWAKE * many < steps.size:
-        return math.inf
-    return stamps.ln_values(steps[between]) + stamps.ln_values(steps[~between]) - float(betaln(many, steps.size))
 
 
 def _stepped(stamps: _Stamps, dt: float) -> _Fit | None:
