@@ -37,6 +37,8 @@ MOST_R_OBJECTS = 200_000
 STREAMS = ("/dev/stdin", "/dev/stdout", "/dev/stderr", "/dev/fd/", "/proc/")
 #: Metadata of a recording, and a model file.
 MOST_META_BYTES, MOST_MODEL_BYTES = 1 << 20, 1 << 18
+#: Values in a model file, each alias counted as if it were written out.
+MOST_MODEL_VALUES = 10_000
 #: Lowest and highest sampling rate, Hz.
 LEAST_RATE_HZ, MOST_RATE_HZ = 1e-6, 1e6
 #: Sampling rates in a recording.

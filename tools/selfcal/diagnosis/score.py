@@ -25,6 +25,8 @@ from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut, error_entry,
 from selfcal.likelihood.state import Look, Sequential, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
 
+#: Samples to score, and between the first and the last prediction, at least.
+LEAST = 30
 #: The bias is a mean over so long, s.
 BIAS_S = 60.0
 
@@ -104,7 +106,7 @@ def _cut(before: State, after: State, split: int) -> Cut | None:
     n = before.y.size
     there = [np.isfinite(state.y) for state in (before, after)]
     kept = split + np.flatnonzero((there[0] & there[1])[split:])
-    if kept.size < PIECES:
+    if kept.size < LEAST:
         return None
     pieces = np.array_split(kept, PIECES)
     edges = np.array([split, *(piece[0] for piece in pieces[1:]), n])
@@ -117,7 +119,7 @@ def _horizons(dt: float, n: int, split: int) -> dict[float, Rows]:
     """By horizon the samples from which the bias is predicted, where there are enough."""
     places = np.unique(np.linspace(split, n - 1, 300).astype(np.int64))
     found = {horizon: places[places <= n - _ahead(horizon, dt) - _window(dt)] for horizon in HORIZONS_S}
-    return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= PIECES}
+    return {horizon: each for horizon, each in found.items() if each.size and each[-1] - split >= LEAST}
 
 
 def _ahead(horizon: float, dt: float) -> int:

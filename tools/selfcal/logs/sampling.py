@@ -392,8 +392,8 @@ def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
         first = (phase - 0.1 * slack, phase + 0.1 * slack)
         fitted = _slope(sample, stamps.time)
         slopes = (fitted, _straightest(sample, stamps.time, fitted, stamps.lattice))
-        errors = min((stamps.time - sample * slope for slope in slopes), key=stamps.ln_values)
-        nats = stamps.fit(fitted, np.where(asleep, 0, missing), errors).nats
+        awake = np.where(asleep, 0, missing)
+        nats = min(stamps.fit(fitted, awake, stamps.time - sample * slope).nats for slope in slopes)
         if best is None or nats < best.nats:
             best = _Fit(fitted, missing, nats)
         elif again > 1:
@@ -526,9 +526,11 @@ def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), trimmed: bool 
         count = np.maximum(np.bincount(part[kept], minlength=parts), 1)
         x, y = (each - (np.bincount(part[kept], each[kept], parts) / count)[part] for each in (index, time))
         slope = float(x[kept] @ y[kept] / (x[kept] @ x[kept]))
+        if not trimmed:
+            return slope
         off = np.abs(y - slope * x)
         near = kept & (off <= _FAR * float(np.median(off[kept])) + 1e-9)
-        if not trimmed or (near == kept).all():
+        if (near == kept).all():
             return slope
         kept = near
 

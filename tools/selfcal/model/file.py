@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from selfcal import _library32
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
-from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_RATE_HZ, read_text, reading
+from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 from selfcal.base.units import SENSORS
 from selfcal.model.forms import FORMS, HOST_FORMS, INPUTS, NUMBER, POWER, Knots
 from selfcal.model.laws import (
@@ -362,8 +362,8 @@ class _Loader(yaml.SafeLoader):
         below = [node.value] if isinstance(node, yaml.ScalarNode) else node.value
         parts = [part for entry in below for part in (entry if isinstance(entry, tuple) else (entry,))]
         size = 1 + sum(1 if isinstance(part, str) else self._values[id(part)] for part in parts)
-        if size > MOST_MODEL_BYTES:  # a file without aliases has a byte a value at least
-            what = f"more than {MOST_MODEL_BYTES} values, aliases counted as often as they stand"
+        if size > MOST_MODEL_VALUES:
+            what = f"more than {MOST_MODEL_VALUES} values, aliases counted as often as they stand"
             raise yaml.constructor.ConstructorError(None, None, what, node.start_mark)
         self._values[id(node)] = size
         return node

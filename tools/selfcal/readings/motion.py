@@ -321,17 +321,15 @@ def _loud_windows(energy: Energy, known: Sequence[Stretch] = ()) -> list[Stretch
             which = which | more if of_others else more  # noqa: PLW2901
             apart.append(Stretch(a, b, which, nats, net))
             taken[a:b] = True
-    enough: list[Stretch] = []
+    least = {}
     for several in (True, False):
-        alike = [each for each in apart if each.several == several]
-        weak = [each for each in [*known, *alike] if each.several == several and each.net <= sure]
-        nets = sorted((each.net for each in weak), reverse=True)
+        weak = (each.net for each in [*known, *apart] if each.several == several and each.net <= sure)
+        nets = sorted(weak, reverse=True)
         # At rest exp(-net) stretches are beyond a net: the fewest that are together no chance. Those of one axis depend
         # on each other, as its noise is not normal: for them by Simes' bound.
         chances = (gammainc(k, math.exp(-net)) if several else math.exp(-net) / k for k, net in enumerate(nets, 1))
-        least = max((net for net, chance in zip(nets, chances, strict=True) if chance < SHARE), default=sure)
-        enough += [each for each in alike if each.net > sure or each.net >= least]
-    return enough
+        least[several] = max((net for net, chance in zip(nets, chances, strict=True) if chance < SHARE), default=sure)
+    return [each for each in apart if each.net >= least[each.several]]
 
 
 def _nats(energy: Energy, before: Sequence[Array], begin: Rows, length: int, wide: Array) -> tuple[Array, Mask, Array]:
