@@ -191,7 +191,7 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if beyond > BEYOND_MOST and near:
         values = sound = np.clip(values, -group.range, group.range)
     lattice = lattice_of(_known(sound), recording.rate_hz)
-    stuck, nats = _stuck(sound, lattice, group.stuck_limit)
+    stuck, nats, stretches = _repeated(sound, lattice, group.stuck_limit)
     new = np.where(stuck, np.nan, sound) if stuck.any() else sound  # held ones have more of the codes that were held
     uneven = explained = None
     if misread is None and (lattice is None or not lattice.carried):
@@ -207,10 +207,9 @@ def _readings_of(recording: Recording, axis: str, group: Group) -> Readings:
     if lost.any():
         sound = np.where(lost, np.nan, sound)
         lattice = lattice_of(_known(sound), recording.rate_hz)
-        stuck, nats = _stuck(sound, lattice, group.stuck_limit)
+        stuck, nats, stretches = _repeated(sound, lattice, group.stuck_limit)
     if stuck.any():
         sound = np.where(stuck, np.nan, sound)
-    stretches = tuple(slower(sound))
     repeats = repeats_of(stretches, values.size)
     left_out = lost | stuck | repeats
     values = np.where(left_out, np.nan, values) if left_out.any() else values
@@ -363,6 +362,17 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
 
 
 # ------------------------------------------------------------------------------------------------------- stuck readings
+
+
+def _repeated(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, float, tuple[Slower, ...]]:
+    """Stuck readings [n], their nats, and the stretches of a lower rate. Repeats belong to the likelier of the two."""
+    stuck, nats = _stuck(values, lattice, stated)
+    stretches = slower(values)
+    if sum(stretch.nats for stretch in stretches) > nats:
+        stuck, nats = _stuck(np.where(repeats_of(stretches, values.size), np.nan, values), lattice, stated)
+    elif stuck.any():
+        stretches = slower(np.where(stuck, np.nan, values))
+    return stuck, nats, tuple(stretches)
 
 
 def _many_runs(values: Array, starts: Rows, lengths: Rows) -> tuple[Mask, float]:
