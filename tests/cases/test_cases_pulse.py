@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from drifts import noise, recorded
+from scipy.signal import lfilter
 
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.likelihood import edges
@@ -68,3 +69,19 @@ def test_a_pulse_is_no_curve_of_a_temperature_that_rises() -> None:
         first = diagnose_record(record, ["gx"])["gx"].by_gain[0].look
         assert first.cause == "pulse"
         assert abs(first.estimate["time_s"]["median"] - start) < 3.0  # seconds: the readings are a second apart
+
+
+def test_a_pulse_beside_a_line_that_wanders_and_coloured_noise() -> None:
+    """Two noises high, over a minute to five: 20 nats net of its search and more, where 9.7 are asked for."""
+    n, decay = 5000, math.exp(-1.0 / 80.0)
+    t = np.arange(n)
+    for seed in range(case_records(1, 20)):
+        random = np.random.default_rng([436, seed])
+        white, turn = random.standard_normal(n + 1), 2.0 * math.pi * random.uniform(0.05, 0.3)
+        line = lfilter([1.0], [1.0, -2.0 * decay * math.cos(turn), decay**2], random.standard_normal(n))
+        length, start = random.uniform(60.0, 300.0), random.uniform(500.0, 4000.0)
+        y = white[1:] + 0.3 * white[:-1] + 0.6 * line / line.std() + 2.0 * ((t >= start) & (t < start + length))
+        _, record = recorded(0.04 * (y + 0.005 * np.cumsum(random.standard_normal(n))), 1.0)
+        found = {finding.look.cause: finding.look for finding in diagnose_record(record, ["gx"])["gx"].findings}
+        assert {"pulse", "periodic"} <= found.keys() and "step" not in found
+        assert abs(found["pulse"].estimate["time_s"]["median"] - start) < 8.0  # readings: the noise hides the edge

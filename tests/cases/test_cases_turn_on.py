@@ -65,6 +65,20 @@ def test_two_time_constants_are_never_two_huge_ones_that_cancel() -> None:
         assert all(abs(look.estimate[key]["median"]) < 3.0 * 0.5 for key in ("amplitude", "amplitude_2"))
 
 
+def test_no_time_constant_is_over_before_the_record_begins() -> None:
+    """A record from 30 s after power-on on, with a settling of 60 s and a first reading that is off. A time constant of
+    2 s would give that reading a million times its size at power-on."""
+    t = np.arange(3600.0) + 30.0
+    for seed in range(4):
+        y = 1.2 * np.exp(-t / 60.0) + noise(np.random.default_rng([427, seed]), "walk", t.size, 1.0)
+        y[:2] += (0.4, 0.15)
+        state, record = recorded(y, 1.0)
+        (look,) = turn_on.looks(state, replace(record, start_s=30.0))
+        estimate = look.measured(state).estimate
+        assert estimate["tau_s"]["median"] > 0.5 * turn_on.FASTEST  # samples of 1 s; the slower one moves by 2 at most
+        assert abs(estimate["amplitude"]["median"]) < 400.0  # exp(30 s / 5 s) readings of 0.4
+
+
 def test_both_time_constants_lie_in_their_intervals() -> None:
     """Of 6 records 4 and more have each number in its 90 % interval; 1 in 60 would fail by chance."""
     inside = {"tau_s": 0, "tau_2_s": 0, "amplitude": 0, "amplitude_2": 0}

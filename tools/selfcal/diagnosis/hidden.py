@@ -42,8 +42,6 @@ from selfcal.likelihood.statemodel import Array
 
 #: Name of the quantity in the document.
 ID = "hidden_input"
-#: Jumps that are named at most.
-JUMPS = 8
 
 
 @dataclass(frozen=True)
@@ -109,7 +107,7 @@ class Hidden:
         of it [k]."""
         found, course_of = list[dict[str, float]](), np.zeros(self.y.shape[1])
         t = np.arange(course_of.size)
-        for _ in range(JUMPS):
+        while True:  # each takes EVIDENT nats at least, so their number is bounded
             score, known = course(self.model, self.y - np.outer(self.model.loading, course_of), smooth=True).of_f.T
             gains = 0.5 * score**2 / np.maximum(known, 1e-300)
             gains[: max(3, gains.size // 200)] = 0.0

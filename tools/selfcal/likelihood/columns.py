@@ -316,9 +316,10 @@ def possible(state: State, shape: Shape) -> tuple[Array, Array]:
 def nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Array) -> tuple[Array, Array]:
     """Logarithms of numbers that the record leaves possible [points, m], on a lattice about the best with the steps
     [m, m], its columns. `scores` [d, points] of [points, m] at some drifts, the likeliest first."""
-    limits, middle, m = np.log(limits), np.log(start), len(limits)
+    limits, m = np.log(limits), len(limits)
     if not m:
         return np.empty((1, 0)), np.empty((0, 0))
+    middle = np.clip(np.log(start), *limits.T)  # the limits of one number may follow another
     best = scores(np.exp(middle)[None])[:, 0]
     reach, steps = np.full(m, REACH_FIRST), np.eye(m)
     for _ in range(REACHES):

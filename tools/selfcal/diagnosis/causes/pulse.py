@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import SMALLER
 from selfcal.likelihood.edges import EDGE, SHORTEST, Scan, edge, raised, scan
-from selfcal.likelihood.fit import Fit, run
+from selfcal.likelihood.fit import Fit, moved, run
 from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Array
 
@@ -34,7 +35,7 @@ UNEQUAL, UNEQUAL_SHARE = 5.0, 0.03
 def looks(state: State, record: Record) -> list[Look]:
     """The best pair of places, where its steps are of one size."""
     n = state.y.size
-    if n < 10 * SHORTEST or state.extras.color or state.extras.bands:
+    if n < 10 * SHORTEST:
         return []
     steps = scan(state.series, state.best)
     pairs = [edges.sharper(state, fit, two) for fit, two in (*_coarse(state), *_of_step(state, steps))]
@@ -43,14 +44,16 @@ def looks(state: State, record: Record) -> list[Look]:
     for look in found:
         column = look.changes["regressors"][-1].values
         ends = raised(n, int(np.flatnonzero(column)[-1]) + 1)
-        more = state.with_columns(np.array([column, ends]))[0]
-        if more > look.gain + max(UNEQUAL, UNEQUAL_SHARE * look.gain):
+        # At one drift: a drift that forgets and a step are as good as a walk, for any record.
+        alike, apart = state.scores([column, np.array([column, ends])], state.with_columns(column)[1])
+        if apart - alike > max(UNEQUAL, UNEQUAL_SHARE * look.gain):
             return []
     return found
 
 
 def _coarse(state: State) -> list[tuple[Fit, tuple[int, int]]]:
-    """The best pairs of places, some way apart, of block means, and the drift that shows each."""
+    """The best pairs of places, some way apart, of block means, and the drift that shows each. A pulse is slower than
+    wandering lines and the colour of the noise: the means are taken without."""
     series, block = state.means()
     m = series.y.size
     places = np.unique(np.linspace(0, m, PLACES + 2).astype(int)[1:-1])
@@ -58,7 +61,9 @@ def _coarse(state: State) -> list[tuple[Fit, tuple[int, int]]]:
     drifts = [(fit, less) for fit in state.fits if fit.terms in state.near() for less in (0.0, *SMALLER)]
     values = []
     for fit, less in drifts:
-        sums = run(more, fit.terms, fit.of_means(block, -less))[0][0].less(len(series.columns))
+        terms = replace(fit.terms, color="", bands=())
+        slow = replace(fit, terms=terms, theta=moved(fit, terms))
+        sums = run(more, terms, slow.of_means(block, -less))[0][0].less(len(series.columns))
         G, size = sums.G, np.diag(sums.G)[1:]
         information = size[:, None] + size[None, :] - 2.0 * G[1:, 1:]
         usable = np.triu(information > 1e-6 * size.max(), 1)

@@ -50,7 +50,8 @@ def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
     low, high = _range(record)
     numbers = [Number(f"tau{ends[-1]}_s", float(tau[-1]), "s", low, high)]
     if len(tau) == 2:
-        numbers.append(Number("tau_s", float(tau[0] / tau[1]), "s", low / high, 1.0 / APART, of="tau_2_s"))
+        fastest = min(low / float(tau[1]), 1.0 / APART)
+        numbers.append(Number("tau_s", float(tau[0] / tau[1]), "s", fastest, 1.0 / APART, of="tau_2_s"))
     return Shape(
         f"{len(tau)}",
         rows,
