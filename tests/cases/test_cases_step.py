@@ -118,10 +118,11 @@ def test_a_change_of_the_noise_beside_a_gap(place: str) -> None:
     for k in range(case_records(9, 180)):
         rate, gap = GRID[k % len(GRID)]
         t, y, begin, end, _ = drawn(random, rate, gap)
+        between = float(random.random())  # two readings: at one of them the truth would be the end of an interval
         time = {
             "in the gap": random.uniform(t[begin - 1], t[end]),
-            "before": t[begin] - 50.0 / rate,
-            "after": t[end] + 50.0 / rate,
+            "before": t[begin] - (50.0 + between) / rate,
+            "after": t[end] + (50.0 - between) / rate,
         }[place]
         ratio = float(random.choice([0.6, 0.75, 1.3, 1.7]))
         white = random.standard_normal(t.size) * np.where(t >= time, ratio, 1.0)

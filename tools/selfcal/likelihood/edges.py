@@ -193,19 +193,24 @@ def posterior(places: tuple[int, ...], state: State) -> dict[str, Any]:
     """Times and amplitude of a change over the places about its own, every near drift and the spread of its parameters.
 
     Two edges hardly know each other: each is taken with the other held. The amplitude's shift by both is summed."""
+    there = np.flatnonzero(np.isfinite(state.y))
     column = raised(state.y.size, *places)
     fit = state.with_columns(column)[1]
-    values, m, rows = np.array(places), len(places), []
+    # A gap is one place, the first reading after it, and as likely as it is long.
+    wide = np.zeros(state.y.size)
+    wide[there] = np.diff(there, prepend=there[0] - 1)
+    places = (*there[np.searchsorted(there, places).clip(max=there.size - 1)].tolist(),)
+    m, rows = len(places), []
     for drift, theta, ln_share in state.possible(column, rich=False):
         at = replace(drift, theta=theta, sigma=fit.sigma)
         scans = [edge(state, at, places, k) for k in range(m)]
         if not all(found.A[place] > 0.0 for found, place in zip(scans, places, strict=True)):
             continue  # this drift forgets too fast to know
-        likely = [_likely(found, place, m) for found, place in zip(scans, places, strict=True)]
+        likely = [_likely(found, place, wide, m) for found, place in zip(scans, places, strict=True)]
         each = [axis.ravel() for axis in np.meshgrid(*likely, indexing="ij")]
         gain, size, ln_information = np.zeros((3, each[0].size))
         for found, where in zip(scans, each, strict=True):
-            gain += found.gain[where]
+            gain += found.gain[where] + np.log(wide[where])
             size += found.B[where] / found.A[where]
             ln_information += np.log(found.A[where]) / m
         middle, place = scans[-1], places[-1]
@@ -213,20 +218,23 @@ def posterior(places: tuple[int, ...], state: State) -> dict[str, Any]:
         size -= (m - 1) * middle.B[place] / middle.A[place]
         ln_weight = ln_share + middle.none + gain - 0.5 * ln_information
         rows.append(np.vstack([ln_weight, size, -0.5 * ln_information, *each]))
-    all_of = np.hstack(rows) if rows else np.array([[0.0, fit.c[-1], math.log(fit.sd[-1]), *values]]).T
-    weight = np.exp(all_of[0] - all_of[0].max())
-    width = state.dt / math.sqrt(12.0)
-    estimate = {"time_s": mixture(weight, all_of[3] * state.dt - 0.5 * state.dt / state.block, width, "s")}
+    all_of = np.hstack(rows) if rows else np.array([[0.0, fit.c[-1], math.log(fit.sd[-1]), *places]]).T
+    weight, at_place = np.exp(all_of[0] - all_of[0].max()), all_of[3:].astype(np.int64)
+    width = wide[at_place]
+    times = (at_place - 0.5 * (width - 1.0 + 1.0 / state.block)) * state.dt
+    sds = width * state.dt / math.sqrt(12.0)
+    estimate = {"time_s": mixture(weight, times[0], sds[0], "s")}
     if m > 1:
-        estimate["duration_s"] = mixture(weight, (all_of[4] - all_of[3]) * state.dt, math.sqrt(2.0) * width, "s")
+        estimate["duration_s"] = mixture(weight, times[1] - times[0], np.hypot(*sds), "s")
     return {**estimate, "amplitude": mixture(weight, all_of[1], np.exp(all_of[2]), state.unit)}
 
 
-def _likely(found: Scan, place: int, edges: int) -> Array:
-    """The likeliest places about `place`, itself among them. Those behind a valley are another step's."""
+def _likely(found: Scan, place: int, wide: Array, edges: int) -> Array:
+    """The likeliest places about `place`, itself among them, of those that are `wide` [n]. Those behind a valley are
+    another step's."""
     gain = np.where(found.A > 0.0, found.gain, -math.inf)
     deep = np.flatnonzero(gain < gain[place] - (VALLEY if edges == 1 else math.inf))
     low, high = (deep[deep < place][-1:] + 1).max(initial=0), deep[deep > place][:1].min(initial=gain.size)
-    held = low + np.flatnonzero(gain[low:high] > gain[low:high].max() + math.log(WEIGHT_LEAST))
+    held = low + np.flatnonzero((gain[low:high] > gain[low:high].max() + math.log(WEIGHT_LEAST)) & (wide[low:high] > 0))
     best = held[np.argsort(-gain[held])[: round(MOST_PLACES ** (1.0 / edges))]]
     return np.union1d(best, [place])
