@@ -107,16 +107,17 @@ class Hidden:
         of it [k]."""
         found, course_of = list[dict[str, float]](), np.zeros(self.y.shape[1])
         t = np.arange(course_of.size)
-        while True:  # each takes EVIDENT nats at least, so their number is bounded
+        free = t >= max(3, t.size // 200)
+        while True:  # a place jumps once
             score, known = course(self.model, self.y - np.outer(self.model.loading, course_of), smooth=True).of_f.T
-            gains = 0.5 * score**2 / np.maximum(known, 1e-300)
-            gains[: max(3, gains.size // 200)] = 0.0
+            gains = np.where(free, 0.5 * score**2 / np.maximum(known, 1e-300), 0.0)
             at = int(np.argmax(gains))
             if net(float(gains[at]), 1, math.log(gains.size)) < EVIDENT:
                 break
             size = float(score[at] / known[at])
             found.append({"time_s": at * self.dt, "size": size / self.step, "evidence_nats": float(gains[at])})
             course_of += np.where(t >= at, size * np.exp(-self.model.rate * (t - at)), 0.0)
+            free[at] = False
         return sorted(found, key=lambda jump: jump["time_s"]), course_of
 
     @property
