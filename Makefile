@@ -15,7 +15,7 @@
 #   make tolerances             all that must agree, as one table; fails where a tolerance is not kept
 #   make calibration            ranks of the truth in the bank's posterior over thousands of records, every law
 #   make emulate                20 minutes of six axes through the emulated firmware
-#   make cases                  logs that went wrong, each kind on hundreds of records; half an hour
+#   make cases                  logs that went wrong, each kind on hundreds of records; two hours on two cores
 #   make campaigns              every fault campaign on the firmware images at length, an hour and more
 #   make format                 lay out C, C++ and Python
 #   make check                  warnings, clang-tidy, ruff, mypy and house rules alone

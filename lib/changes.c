@@ -3,7 +3,7 @@
  * STEP A step of the bias by d at some onset adds d w_k / sigma_v to z_k, where w is the innovation of a step of 1 over
  * sqrt(S). For SELFCAL_ONSETS onsets, SPACING bank samples apart, the likelihood ratio of a step there is
  *     exp(T^2 / 2),   T = sum z w / sqrt(sum w^2),   d = sigma_v sum z w / sum w^2.
- * It is told where |T| has been beyond STEP_LIMIT for HOLD bank samples and the last of them bear it out. |z| is held
+ * It is told where |T| has been beyond STEP_LIMIT for HOLD bank samples and the last samples confirm it. |z| is held
  * at HELD there. So neither an outlier nor a burst of up to ten bank samples is a step: after it z is as before, or of
  * the other sign. Where the noise is louder than it was, T is measured by it. Steps of several axes at once are motion.
  * With the drift's gain g, T ends at d / (sigma_v sqrt(2 g)): a walk hides a step of less than some 10 sd of its own

@@ -7,6 +7,8 @@ part alone (`--part`) leaves no line. `make test` shows the lines at its end.
 from __future__ import annotations
 
 import argparse
+import os
+import platform
 import subprocess
 import sys
 import time
@@ -37,6 +39,11 @@ def git(*arguments: str) -> str | None:
     except OSError:
         return None
     return done.stdout.strip() if done.returncode == 0 else None
+
+
+def machine() -> str:
+    """Its cores and their kind. The seeds of a run are in its tests."""
+    return f"{os.cpu_count()} cores, {platform.machine()}"
 
 
 def commit() -> str:
@@ -86,7 +93,7 @@ def main() -> int:
         minutes = (time.monotonic() - start) / 60.0
         outcome = "passed" if code == 0 else f"FAILED with exit code {code}"
         when = datetime.now(UTC).strftime("%Y-%m-%dT%H:%MZ")
-        write(read() | {arguments.name: Run(when, at, f"{outcome} after {minutes:.0f} min")})
+        write(read() | {arguments.name: Run(when, at, f"{outcome} after {minutes:.0f} min on {machine()}")})
         print(f"written to tests/{RECORD.name}: commit it")
     return code
 

@@ -1,4 +1,4 @@
-"""Laws that are sums (SUMS of model/file.py): model models/sums.yaml.
+"""Laws that are sums (SUMS of model/laws.py): model models/sums.yaml.
 
 Judges: the textbook bank of host_sim, which shares no code with lib/ and has the terms as states of its filter, and the
 same report on dense nodes (agreement.py). Tolerances are those of the design.

@@ -163,7 +163,7 @@ def test_reports_over_time_are_those_of_the_whole_record() -> None:
 def test_the_stretches_of_the_real_recordings() -> None:
     if not (SHARED_DATA / "adis16405_run1.npz").exists():
         pytest.skip(f"REAL DATA ABSENT: {SHARED_DATA} (see README, 'Real recordings')")
-    found = section4.real(SHARED_DATA, Model.load())
+    found = section4.real(SHARED_DATA)
     assert all(y.size == section4.DURATION and np.isfinite(y).all() for y in found.values())
     places = section4.STRETCHES
     assert len(set(places)) == len(places) >= 4

@@ -325,6 +325,16 @@ def test_stated_rate_is_taken_where_it_agrees(tmp_path: Path) -> None:
             stamped(tmp_path, time, rate=wrong)
 
 
+@pytest.mark.parametrize("sign", [",", ";"])
+def test_a_separator_between_quotes_separates_nothing(sign: str, tmp_path: Path) -> None:
+    """RFC 4180: a quoted cell may hold separators, and two quotes for one. Truth: the numbers that are written."""
+    path, values = tmp_path / "quoted.csv", np.random.default_rng(3).normal(size=40).round(6)
+    head = sign.join(["t[s]", f'"note{sign} ""one"" [x]"', '"gx[deg/s]"', "b"])
+    rows = [sign.join([str(k), f'"a{sign}{sign} ""{k}"""', f"{value:.6f}", "3"]) for k, value in enumerate(values)]
+    path.write_text("\n".join([head, *rows]) + "\n")
+    np.testing.assert_array_equal(load(path).columns["gx"].values, values)
+
+
 # ----------------------------------------------------------------------------------------------------------- bad ones
 
 BAD_CSV = {

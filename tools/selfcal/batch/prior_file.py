@@ -35,7 +35,7 @@ def write_model(path: Path | str, model: Model, batch: Batch) -> dict[str, dict[
     for population in batch.populations:
         axis, _, parameter = population.measured.name.rpartition(".")
         if population.measured.logarithm:
-            priors.setdefault(axis, {})[parameter] = _prior(population, batch)
+            priors.setdefault(axis, {})[parameter] = _prior(population)
     if not priors:
         raise UserError("--write-model: no parameter has a population: it takes five units that identify it")
     for group in model.groups:
@@ -69,7 +69,7 @@ def _rounded(value: float) -> float:
     return float(f"{value:.4g}")
 
 
-def _prior(population: Population, batch: Batch) -> Prior:
+def _prior(population: Population) -> Prior:
     """The log-normal prior of a new unit's parameter, in the unit of the axis's group."""
     fit = population.fit
     mean = float(fit.weight @ fit.mean)

@@ -142,7 +142,7 @@ def by_identify(found: Mapping[str, Diagnosed], recording: Recording, model: Mod
         others = {axis: column for axis, column in recording.columns.items() if axis not in follow}
         beside = replace(recording, columns=others)
         with suppress(UserError):  # no report, no checks
-            look = of_checks(diagnosed, identify_axis(beside, name, model, "library", None).judged.checks)
+            look = of_checks(identify_axis(beside, name, model, "library", None).judged.checks)
             if look is not None:
                 diagnosed.findings.append(Finding(look, ROUNDS + 1, diagnosed.state, diagnosed.state))
 

@@ -38,7 +38,7 @@ def to_document(
     out: Sequence[Finding] = (),
 ) -> dict[str, Any]:
     """The document, in the units of the recording's columns. `errors`: why an axis has no result. `model`: the extended
-    model file's tree. `first`: what a look at means has found, of which causes that `found` has not stay beside it.
+    model file's tree. `first`: findings of the look at means; causes that `found` lacks stay in `only_in_means`.
     `out`: findings that a bank has no room for."""
     axes = {name: _axis(axis, recording.columns[name].unit, first.get(name), out) for name, axis in found.items()}
     return {

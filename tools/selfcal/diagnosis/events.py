@@ -440,8 +440,8 @@ def _before_and_after(
 
 
 def parted(findings: Sequence[Mapping[str, Any]]) -> tuple[list[Mapping[str, Any]], list[Mapping[str, Any]]]:
-    """Those of a document that are told, and the small ones: these change no number by as much as matters, and are
-    named. Told in any case: what moves several axes and was not recorded, and the time that is left out."""
+    """The findings of a document to print in full, and the small ones: these change no number by as much as matters. A
+    hidden quantity and time that is left out are printed in any case."""
     told: list[Mapping[str, Any]] = []
     small: list[Mapping[str, Any]] = []
     for finding in findings:

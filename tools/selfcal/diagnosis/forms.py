@@ -49,7 +49,7 @@ RATE_WINDOWS_S = (20.0, 40.0, 60.0, 90.0, 150.0, 400.0)
 PLAYS = (0.05, 0.1, 0.2, 0.35, 0.55, 0.8)
 #: A lag is looked at up to this share of the record: a longer one is a ramp as well.
 LONGEST_LAG = 1.0 / 3.0
-#: A lag or a play that changes the column by less than this share of it is none.
+#: Share of a column below which the change by a lag or a play is ignored.
 ALIKE_COLUMN = 0.1
 #: ln of the number of independent looks that each form beside the static one costs, over all channels' forms.
 LN_FORMS = {

@@ -162,7 +162,7 @@ class Hidden:
         return whole, whole.refit(regressors=(*whole.regressors, Regressor(ID, ID, column, "1", {})))
 
     def beside(self, states: Mapping[str, State]) -> Hidden | None:
-        """The quantity beside what the models of its axes have by now; None: there is none."""
+        """The quantity given the current models of its axes, or None."""
         y = np.array([half_means(steady(state), max(1, round(self.dt / state.dt)))[0] for state in states.values()])
         n = min(y.shape[1], self.y.shape[1])
         y = np.where(np.isfinite(self.y[:, :n]), y[:, :n] / self.scale[:, None], np.nan)

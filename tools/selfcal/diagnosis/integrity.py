@@ -17,7 +17,7 @@ from selfcal.likelihood.statemodel import Mask
 from selfcal.readings.budget import SHARES
 from selfcal.readings.held import equal_by_chance
 
-#: An unstated lattice is told of from this many white noise sd on.
+#: Report an unstated lattice from this many white noise sd.
 LATTICE_LEAST = 0.5
 #: Readings at most of which a log's means show by their lattice.
 AVERAGED_MOST = 20

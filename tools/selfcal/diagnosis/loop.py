@@ -228,7 +228,8 @@ def _louder(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[s
 
 
 def _together(record: Record, found: Mapping[str, Diagnosed], advance: Callable[[str], None]) -> Record:
-    """What acts on several axes goes into the model of each. One that predicts held-out time worse on all is none."""
+    """What acts on several axes goes into the model of each. A cause that predicts held-out time worse on every axis is
+    dropped."""
     advance("all axes together")
     record = _curves(record, found)
     states = dict(record.axes)

@@ -48,7 +48,7 @@ from selfcal.likelihood.joint import (
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, SLOW_S, State
 from selfcal.likelihood.statemodel import Array, Mask
 
-#: Chance makes an evidence of T nats and more on this times e^-T of modules on which nothing acts (`make module-null`).
+#: False-alarm rate of the joint search at T nats, over e^-T: modules on which nothing acts (`make module-null`).
 NULL = 0.05
 #: Evidence of a candidate that is named, nats.
 NAMED = math.log(NULL) + EVIDENT

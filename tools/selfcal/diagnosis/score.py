@@ -87,9 +87,7 @@ def gain(
         first = split + min(int(np.argmax(column[split:] != 0.0)) for column in added)
         piece = int(np.searchsorted(cut.edges, first, "right")) - 1
         later[piece] -= max(0.0, look.gain - look.net) / cut.sizes[piece]
-    return _held_out(
-        cut, scores, later, spread(later - scores), before.unit, _errors(after, old, new, cut.marks, horizons)
-    )
+    return _held_out(cut, scores, later, spread(later - scores), before.unit, _errors(after, old, new, horizons))
 
 
 def _held_out(
@@ -193,7 +191,7 @@ def _sequential(state: State, marks: Rows, horizons: Mapping[float, Rows]) -> Se
 
 
 def _errors(
-    state: State, old: Sequential, new: Sequential, marks: Rows, horizons: Mapping[float, Rows]
+    state: State, old: Sequential, new: Sequential, horizons: Mapping[float, Rows]
 ) -> dict[str, dict[str, float]]:
     """Root mean square of predicted minus read bias at each horizon; the reading is a mean of one second about it."""
     window = _window(state.dt)

@@ -53,7 +53,7 @@ def look_of(statistic: Statistic, p: float) -> Look:
     return Look("unexplained", nats, nats, estimate, {}, shown_by=statistic.name)
 
 
-def of_checks(axis: Diagnosed, checks: Mapping[str, Mapping[str, Any]]) -> Look | None:
+def of_checks(checks: Mapping[str, Mapping[str, Any]]) -> Look | None:
     """What the checks of `identify` hold against an axis in which no cause was found."""
     for name, deviations in against(checks).items():
         told = float(checks[name]["value"])

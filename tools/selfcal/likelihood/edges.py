@@ -15,8 +15,8 @@ from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
 from selfcal.likelihood.state import Regressor, State, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array
 
-#: A place is looked at where the level before it leaves this share of a step's information, at least; and until what is
-#: left of the record knows a step by this share of the information of one in its middle.
+#: Least share of its information that a step keeps beside the level before it; and the least share of a mid-record
+#: step's information at the last place that is looked at.
 INFORMATION_LEAST = 0.05
 #: A drift that forgets more often than this in the record gives way to a step: its size is fitted anew beside it, and
 #: noise alone gains as two coefficients do. Of 683 clean records at 1 Hz 17 instead of 4.6 showed 5 nats with one.

@@ -17,7 +17,7 @@ HORIZONS_S = (1.0, 10.0, 60.0, 300.0)
 PIECES = 24
 #: Least change of a number that matters, over the number.
 MATTERS = 0.05
-#: A finding whose gain lies so many standard deviations below 0 is none.
+#: Standard deviations below 0 of a gain from which a finding is dropped.
 HARM_SD = 2.0
 
 

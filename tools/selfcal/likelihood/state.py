@@ -369,10 +369,14 @@ def ln_looks(bend: Array, gain: float) -> float:
 
 @dataclass(frozen=True)
 class Look:
-    """One candidate: what it gains (nats of ln likelihood), `net` of the price of its search, the `estimate` (each an
-    interval with unit), `when` (s, s), the state that has it (`changes`), and what else it might be. `measure`: sizes
-    beside a model that lacks the look's columns alone. `shape`: of its columns, `rivals`: other forms of it that are as
-    likely."""
+    """One candidate.
+
+    gain      nats of ln likelihood; `net`: less the price of its search.
+    estimate  intervals with their units; `measure` makes them beside a model that lacks the look's columns alone.
+    changes   the fields of the state that has it.
+    when      begin and end, s.
+    others    what else it might be.
+    shape     of its columns; `rivals`: other forms that are as likely."""
 
     cause: str
     gain: float

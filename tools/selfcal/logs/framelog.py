@@ -333,9 +333,9 @@ def _message(stamp: str, identifier: str, extended: bool, length: int, data: lis
 
 
 def _check_blf(path: Path) -> Damaged:
-    """What python-can's reader would pass by: it takes what a container that is cut off, or of which zlib finds the
-    checksum not to fit, holds up to there, and does not look for the end that the header states. Raises UserError for a
-    BLF file on which it would take all memory, or go round for ever.
+    """Damage that python-can's reader passes over: it reads a truncated or damaged container up to the fault, and does
+    not look for the end that the header states. Raises UserError for a BLF file on which the reader would take all
+    memory, or never end.
 
     A file is a header and objects; an object's header has its size, and a container holds objects, packed by zlib.
     """

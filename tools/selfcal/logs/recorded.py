@@ -146,7 +146,7 @@ class Recording:
         )
 
     def later(self, since_power_on_s: float) -> Recording:
-        """The recording with its distance from power-on, s. Raises UserError for one that is none."""
+        """The recording with its distance from power-on, s. Raises UserError for an invalid time."""
         if not 0.0 <= since_power_on_s <= LONGEST_S:
             raise UserError(
                 f"--since-power-on {since_power_on_s:g}: takes the seconds from power-on to the recording's beginning, "

@@ -34,19 +34,19 @@ _HEAD, _NEAR_FIRST = 4000, 512
 _PARTS = 5
 #: Lattice over mean step from which stamps are coarse, and the smallest cell of errors over the mean step.
 _COARSE, _FINEST = 0.25, 1e-3
-#: Nats of another interval than a lattice that is no tick of a clock, and of one that is not the stated one at most;
-#: the relative sd of that one. Ticks of clocks are 10^-k s, 2^-k s, and this, s.
+#: Evidence, nats, against a lattice that is no tick of a clock; most evidence against the stated interval; relative sd
+#: of the stated interval. Ticks of clocks are 10^-k s, 2^-k s, and the last number, s.
 _COINCIDENCE, _STATED, _STATED_SD, _JIFFY = 400.0, 20.0, 0.005, 0.004
-#: Nats of a line or a rhythm that random times show by chance, and of a line in a row at most: rows of batches make
-#: lines as well.
+#: Evidence, nats, of a line or a rhythm beyond chance; most evidence of a line, nats a row: rows of batches make lines
+#: as well.
 _NO_CHANCE, _LINE_MOST = 25.0, 0.1
-#: Another dt that costs so few nats more is as good; and may cost less by the whole record.
+#: Nats within which another dt is as good, and within which the whole record may prefer it.
 _AS_GOOD, _CLOSE = 10.0, 25.0
 #: Change of rate within a record that the decoder follows; rows over which a grid's phase is followed, and at which
 #: a row or several between late ones are early.
 _WANDER, _PIECE_OF_GRID, _EARLY = 3e-5, 100, 3
-#: Grids proposed, harmonics of their lines, the band of a line in rates of the stamps, and the least ln of its power
-#: over that around it.
+#: Number of grids proposed; harmonics of a grid's line; band of a line, in rates of the stamps; least ln of the line's
+#: power over the power around it.
 _LINES, _HARMONICS, _BAND, _LINE = 8, 6, (0.9, 4.0), 3.0
 #: Steps of one interval on a grid at least, of all; and steps of less than half of one where each strays, at most.
 _ONES, _TOO_SHORT = 0.05, 0.01
@@ -62,11 +62,11 @@ ONE_INSTANT = 0.01
 _LONGEST = 2.0 / float(np.finfo(np.float64).eps)
 #: Share from which on the intervals show a change of rate; a crystal keeps 1e-4.
 CHANGE = 1e-3
-#: Steps between stretches of samples, in usual steps, and in the longest of all others; samples of a stretch at least;
-#: where stretches are short, their share of the time and the share of the steps about the usual one, at least.
+#: Shortest pause between bursts, in usual steps, and in the longest step of a burst; fewest samples of a burst; where
+#: bursts are short, their least share of the time, and the least share of steps near the usual one.
 _ASLEEP, _ALONE, _AWAKE, _AWAKE_SHARE, _EVEN = 30.0, 3.0, 20, 0.05, 0.6
-#: A gap between steps of any length, in the step beyond which half of the time is; errors about their line that are
-#: far off, in the median one; how far batches that overlap may stray from a steady count, in their length.
+#: Shortest gap between steps of any length, in their time-weighted median; errors about their line that count as far
+#: off, in the median error; most that overlapping batches stray from a steady count, in their length.
 _GAP, _FAR, _STRAY = 12.0, 6.0, 5.0
 #: The share of the gaps that keep to a rhythm or a pattern, and gaps in a period of losses at most.
 _RHYTHM, _OF_PATTERN = 0.9, 4

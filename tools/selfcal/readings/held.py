@@ -29,8 +29,7 @@ ONE_EACH = 0.75
 SMEARED, LEFT = 0.25, 0.35
 #: Share of readings that are equal by chance from which on a row may be; rows that repeat at no beat, at most.
 CHANCE, RUN_MOST = 0.01, 5
-#: Rows to a reading in a stretch at most, and stretches at most. The chance that a row
-#: of it does not repeat, and equal readings that are supposed among those of a stretch.
+#: Most rows to a reading in a stretch; most stretches; chance of a missing repeat; pseudo-count of equal readings.
 RATIO_MOST, STRETCHES, MISSED, SUPPOSED = 5, 8, 0.02, 2.0
 #: Changes of a channel that is read anew each period, at least: a chamber may step a few times, as evenly.
 CHANGES_LEAST = 8

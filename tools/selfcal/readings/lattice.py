@@ -58,7 +58,7 @@ class Lattice:
 
     @property
     def too_coarse(self) -> bool:
-        """Rounding is no white noise: what is told of the noise is the lattice's."""
+        """Rounding is no white noise: the noise cannot be told from the lattice."""
         return self.coarseness > self.most
 
     @property

@@ -71,8 +71,8 @@ def recurring_of(values: Array, explained: Misread | None) -> Recurring | None:
 
 
 def _alone(y: Array, sigma: float, spacing: float) -> tuple[float, float]:
-    """The value that comes most often beside the others within the noise `sigma` of it, which readings [n] have about
-    once each, and its evidence in nats. `spacing` of the values."""
+    """The most frequent value of readings [n] whose neighbours within the noise `sigma` occur about once each, and its
+    evidence in nats. `spacing` of the values."""
     value, counts = np.unique(y, return_counts=True)
     total, reach = np.concatenate([[0], np.cumsum(counts)]), max(sigma, 2.5 * spacing)
     first, last = np.searchsorted(value, value - reach), np.searchsorted(value, value + reach, "right")

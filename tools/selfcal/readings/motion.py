@@ -40,12 +40,12 @@ LEVEL, SQUARES = 9, 1.29
 WINDOW_S, SIDE, SIDE_SQUARES = 32.0, 8, 120
 #: Probability, a record, that axes at rest move together, and that one moves alone.
 SHARE = SHARES["motion"]
-#: Share of its windows by which an axis' own loudness counts: of an axis alone at most the rest may be loud.
+#: Share of an axis' windows that are its usual loudness. The rest is the most that may be loud on one axis alone.
 OWN = 0.9
 #: Quantiles of the means of windows that show their spread without the loud ones: the median, and one sd below it.
 QUIETER = (0.1587, 0.5)
-#: Nats by which the search over windows costs all axes together less than as many windows apart: of 124 clean records
-#: of 600 and 1500 s at 1 and 10 Hz the largest of one is 1.5 to 1.9 less in the median, and 2.0 to 2.7 in a tenth.
+#: Discount, nats, of the joint search over windows against independent windows: of 124 clean records of 600 and 1500 s
+#: at 1 and 10 Hz the largest evidence is 1.5 to 1.9 less in the median, and 2.0 to 2.7 in a tenth.
 FEWER = 2.0
 #: Smallest probability that a float holds.
 TINY = np.finfo(np.float64).tiny

@@ -38,7 +38,7 @@ LN_STUCK = -nats_of("stuck")
 #: Nats of the runs that are counted; times that there are as many as chance makes, at least. Beyond so many steps in
 #: the noise chance is not well known.
 HELD_NATS, HELD_TIMES, HELD_COARSEST = 64, 1.5, 0.8
-#: A reading that bears less than this share of an unclipped one's information bears none.
+#: Share of an unclipped reading's information below which a clipped one is ignored.
 INFORMATION_LEAST = 0.05
 #: Share of the variance of an axis' steps that its copy of another leaves at most: that of a float's digits; and that
 #: of rounding to a lattice, over the variance of as many even steps.
@@ -572,7 +572,7 @@ def _quiet_window(y: Array) -> int:
 
 
 def copied(recording: Recording, name: str, others: Sequence[str]) -> str:
-    """What to say of a column that is a copy of one of the `others`: no noise of its own. Empty where it is none."""
+    """A line for a column that is a copy of one of the `others`, without noise of its own; else empty."""
     own = np.diff(recording.columns[name].values)
     for other in others:
         theirs = np.diff(recording.columns[other].values)

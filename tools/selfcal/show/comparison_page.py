@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -25,8 +26,9 @@ def page(document: Mapping[str, Any], curves: Curves) -> str:
     names = names_of(document)
     axes = [_axis(name, entry, document, curves.get(name, {}), names) for name, entry in document["axes"].items()]
     title = f"Comparison of {' and '.join(names.values())}"
+    one_in = round(1.0 / math.erfc(document["limit_sd"] / math.sqrt(2.0)))
     values = {"document": document, "title": title, "names": names, "axes": axes, "changes": told_of(document)}
-    return str(render("comparison.html", **values))
+    return str(render("comparison.html", **values, one_in=one_in))
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ def paper(
         simulated = section4.simulated(seed)
         figures += section4.figures_5_and_6(default, simulated, False, seed)
         progress.advance(task)
-        real = section4.real(folder, default)
+        real = section4.real(folder)
         progress.advance(task)
         if len(real) == len(section4.STRETCHES):
             figures += with_reason(section4.figures_5_and_6(default, real, True, seed), folder / EXPLAINED, diagnose)

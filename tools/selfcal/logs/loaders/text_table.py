@@ -138,7 +138,7 @@ class TextReader:
         #: The column that numbers the sensors, and the cell of the one that is read.
         self._only: tuple[int, str] | None = None
         self.where = f"line {number}: "
-        headings = self._stated(_words(header) if self._separator == " " else header.split(self._separator))
+        headings = self._stated(_words(header) if self._separator == " " else _split(header, self._separator))
         if len(headings) == len(self._cells(self._batch[0])) + 1 and headings[-1].strip().lower() == _COMMENT_OF_ROWS:
             del headings[-1]  # of LabVIEW, which writes the comment of a row only where there is one
         cells = self._cells(self._batch[0])
@@ -310,7 +310,7 @@ class TextReader:
     def _cells(self, line: str) -> list[str]:
         if self._separator == "," and _THOUSANDS.search(line):
             line = _THOUSANDS.sub(lambda cell: cell[0].replace(",", ""), line)
-        return line.split() if self._separator == " " else line.split(self._separator)
+        return line.split() if self._separator == " " else _split(line, self._separator)
 
     def _stated(self, headings: list[str]) -> list[str]:
         """The headings with the units that the cells of the first row have after their numbers: `0.02 sec`."""
@@ -527,6 +527,15 @@ def _words(line: str) -> list[str]:
     return [" ".join(words) for words in headings]
 
 
+def _split(line: str, sign: str) -> list[str]:
+    """The cells of a line. A sign between quotes separates none, where each quote has a partner (RFC 4180)."""
+    parts = line.split('"')
+    if len(parts) % 2 == 0 or not any(sign in quoted for quoted in parts[1::2]):
+        return line.split(sign)
+    parts[1::2] = [quoted.replace(sign, "\0") for quoted in parts[1::2]]
+    return [cell.replace("\0", sign) for cell in '"'.join(parts).split(sign)]
+
+
 def _with_signs(text: str) -> str:
     """A text with the signs of units, in the lines before the first row, that some alphabets have as one byte."""
     end = 0
@@ -551,12 +560,12 @@ def _is_header(line: str, after: Sequence[str], knows: Callable[[Sequence[str]],
     for sign in (*_SEPARATORS, " "):
         if sign != " " and line.count(sign) > MOST_COLUMNS:
             continue
-        cells = [cell.strip(_QUOTED) for cell in (_words(line) if sign == " " else line.split(sign))]
+        cells = [cell.strip(_QUOTED) for cell in (_words(line) if sign == " " else _split(line, sign))]
         if len(cells) > MOST_COLUMNS or max(map(len, cells), default=0) > LONGEST_HEADING:
             continue
         if any(_NUMBER.fullmatch(cell) for cell in cells) or not knows(cells):
             continue
-        row = [cell for line in after for cell in (line.split() if sign == " " else line.split(sign))]
+        row = [cell for line in after for cell in (line.split() if sign == " " else _split(line, sign))]
         same = len(row) == len(cells) or (len(row) == len(cells) - 1 and cells[-1].lower() == _COMMENT_OF_ROWS)
         if not after or (same and any(_ROW.fullmatch(cell.strip(_QUOTED)) for cell in row)):
             return True
@@ -597,10 +606,11 @@ def _with_nan(text: str, separator: str) -> str:
 
 
 def _unquoted(cell: str) -> str | None:
-    """A cell without the spaces and the pair of quotes around it; None if one quote has no partner."""
+    """A cell without the spaces and the pair of quotes around it, in which two are one; None if one has no partner."""
     text = cell.strip()
-    inner = text[1:-1] if len(text) > 1 and text[0] == text[-1] == '"' else text
-    return None if '"' in inner else inner
+    if len(text) > 1 and text[0] == text[-1] == '"':
+        return None if '"' in text[1:-1].replace('""', "") else text[1:-1].replace('""', '"')
+    return None if '"' in text else text
 
 
 def _opened(path: Path, files: ExitStack) -> tuple[BinaryIO, int]:

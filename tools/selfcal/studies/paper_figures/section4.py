@@ -153,7 +153,7 @@ def _within(value: float, prior: Prior) -> float:
     return float(np.clip(value, prior.min, prior.max))
 
 
-def real(folder: Path, model: Model) -> dict[str, Array]:
+def real(folder: Path) -> dict[str, Array]:
     """1 s means of the stretches; those whose file is absent are left out."""
     records, loaded = {}, {}
     for name, start in STRETCHES:
