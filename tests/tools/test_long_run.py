@@ -16,6 +16,7 @@ from conftest import COLLECTED, ROOT, long_tests
 def record(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     monkeypatch.setattr(long_run, "RECORD", tmp_path / "long_runs.txt")
     monkeypatch.setattr(long_run, "commit", lambda: "HEAD~0")
+    monkeypatch.setattr(long_run, "machine", lambda: "3 cores, m68k")
     return tmp_path / "long_runs.txt"
 
 
@@ -27,10 +28,11 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 def test_a_whole_run_is_written_down(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "make soak        no run is recorded" in long_run.say()
     assert run(monkeypatch, "soak", "false", "--part") == 1  # --part is the command's here
-    assert "make soak        FAILED with exit code 1 after 0 min" in long_run.say()
+    assert "make soak        FAILED with exit code 1 after 0 min on 3 cores, m68k" in long_run.say()
     assert run(monkeypatch, "campaigns", "true") == 0
     assert run(monkeypatch, "soak", "true") == 0
-    assert [long_run.read()[name].outcome for name in ("campaigns", "soak")] == ["passed after 0 min"] * 2
+    written = [long_run.read()[name].outcome for name in ("campaigns", "soak")]
+    assert written == ["passed after 0 min on 3 cores, m68k"] * 2
     if subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, check=False).returncode == 0:
         assert long_run.say().count("0 commits ago") == 2
 
