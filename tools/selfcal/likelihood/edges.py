@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Rows
 from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
 from selfcal.likelihood.state import Regressor, State, interval, ln_looks, mixture, net
-from selfcal.likelihood.statemodel import Array
+from selfcal.likelihood.statemodel import Array, Mask
 
 #: Least share of its information that a step keeps beside the level before it; and the least share of a mid-record
 #: step's information at the last place that is looked at.
@@ -142,10 +143,7 @@ def edge(state: State, fit: Fit, places: tuple[int, ...], k: int) -> Scan:
 
 def shape(state: State, cause: str, places: tuple[int, ...], steps: Scan) -> Shape:
     """A change of the level at some places, in a gap in its middle. `steps`: the scan that has a search's price."""
-    there = np.flatnonzero(np.isfinite(state.y))
-    at, after = np.array(places), np.searchsorted(there, places)
-    first = np.where(after > 0, there[np.maximum(after - 1, 0)] + 1, at)
-    last = np.where(after < there.size, there[np.minimum(after, there.size - 1)], at)
+    first, last = between_readings(state.y, np.array(places))
     at = (first + last) // 2  # any place of a gap may be the one
     times = (at * state.dt).tolist()
     stated = known(state, at, last - first + 1)
@@ -165,7 +163,15 @@ def shape(state: State, cause: str, places: tuple[int, ...], steps: Scan) -> Sha
     )
 
 
-def known(state: State, places: Sequence[int] | Array, samples: Sequence[int] | Array) -> dict[str, Any]:
+def between_readings(y: Array, places: Rows) -> tuple[Rows, Rows]:
+    """First and last place of an edge between the same two readings of y [n] as each place."""
+    there = np.flatnonzero(np.isfinite(y))
+    after = np.searchsorted(there, places)
+    first = np.where(after > 0, there[np.maximum(after - 1, 0)] + 1, places)
+    return first, np.where(after < there.size, there[np.minimum(after, there.size - 1)], places)
+
+
+def known(state: State, places: Sequence[int] | Rows, samples: Sequence[int] | Rows | Array) -> dict[str, Any]:
     """When a change is: each edge lies between the last reading before it and the first one after it, so many samples
     apart. Means begin with their first reading."""
     width = np.asarray(samples) * state.dt / math.sqrt(12.0)
@@ -193,20 +199,19 @@ def posterior(places: tuple[int, ...], state: State) -> dict[str, Any]:
     """Times and amplitude of a change over the places about its own, every near drift and the spread of its parameters.
 
     Two edges hardly know each other: each is taken with the other held. The amplitude's shift by both is summed."""
-    there = np.flatnonzero(np.isfinite(state.y))
     column = raised(state.y.size, *places)
     fit = state.with_columns(column)[1]
     # A gap is one place, the first reading after it, and as likely as it is long.
-    wide = np.zeros(state.y.size)
-    wide[there] = np.diff(there, prepend=there[0] - 1)
-    places = (*there[np.searchsorted(there, places).clip(max=there.size - 1)].tolist(),)
+    first, last = between_readings(state.y, np.arange(state.y.size))
+    wide, there = last - first + 1.0, np.isfinite(state.y)
+    places = (*last[[*places]].tolist(),)
     m, rows = len(places), []
     for drift, theta, ln_share in state.possible(column, rich=False):
         at = replace(drift, theta=theta, sigma=fit.sigma)
         scans = [edge(state, at, places, k) for k in range(m)]
         if not all(found.A[place] > 0.0 for found, place in zip(scans, places, strict=True)):
             continue  # this drift forgets too fast to know
-        likely = [_likely(found, place, wide, m) for found, place in zip(scans, places, strict=True)]
+        likely = [_likely(found, place, there, m) for found, place in zip(scans, places, strict=True)]
         each = [axis.ravel() for axis in np.meshgrid(*likely, indexing="ij")]
         gain, size, ln_information = np.zeros((3, each[0].size))
         for found, where in zip(scans, each, strict=True):
@@ -229,12 +234,12 @@ def posterior(places: tuple[int, ...], state: State) -> dict[str, Any]:
     return {**estimate, "amplitude": mixture(weight, all_of[1], np.exp(all_of[2]), state.unit)}
 
 
-def _likely(found: Scan, place: int, wide: Array, edges: int) -> Array:
-    """The likeliest places about `place`, itself among them, of those that are `wide` [n]. Those behind a valley are
+def _likely(found: Scan, place: int, there: Mask, edges: int) -> Array:
+    """The likeliest places about `place`, itself among them, of those that are `there` [n]. Those behind a valley are
     another step's."""
     gain = np.where(found.A > 0.0, found.gain, -math.inf)
     deep = np.flatnonzero(gain < gain[place] - (VALLEY if edges == 1 else math.inf))
     low, high = (deep[deep < place][-1:] + 1).max(initial=0), deep[deep > place][:1].min(initial=gain.size)
-    held = low + np.flatnonzero((gain[low:high] > gain[low:high].max() + math.log(WEIGHT_LEAST)) & (wide[low:high] > 0))
+    held = low + np.flatnonzero((gain[low:high] > gain[low:high].max() + math.log(WEIGHT_LEAST)) & there[low:high])
     best = held[np.argsort(-gain[held])[: round(MOST_PLACES ** (1.0 / edges))]]
     return np.union1d(best, [place])

@@ -49,8 +49,8 @@ _NUMBER = re.compile(r"\s*[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?\s*", re.ASCII)
 #: A number and its unit, in one cell.
 _WITH_UNIT = re.compile(r"\s*[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)? ([^\W\d_][\w/^]{0,20})\s*", re.ASCII)
 _QUOTED = ' "'
-#: A number in quotes whose thousands commas separate: without a point one comma may be the decimal sign.
-_THOUSANDS = re.compile(r'"[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:,\d{3}){2,})"', re.ASCII)
+#: A number whose thousands commas separate: without a point one comma may be the decimal sign.
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:(?:,\d{3})+\.\d*|(?:,\d{3}){2,})", re.ASCII)
 _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 #: A cell that holds no sample.
 _MISSING = re.compile(r"(nan?|#?n/a|#nv|null|none|-+|\?)?", re.ASCII | re.IGNORECASE)
@@ -308,8 +308,6 @@ class TextReader:
         return present[0] if present else ","
 
     def _cells(self, line: str) -> list[str]:
-        if self._separator == "," and _THOUSANDS.search(line):
-            line = _THOUSANDS.sub(lambda cell: cell[0].replace(",", ""), line)
         return line.split() if self._separator == " " else _split(line, self._separator)
 
     def _stated(self, headings: list[str]) -> list[str]:
@@ -434,6 +432,8 @@ class TextReader:
                 raise _Bad(k, f"'{short(cell)}' is no date like the first") from None
         if _MISSING.fullmatch(cell):
             return math.nan
+        if self._separator == "," and _THOUSANDS.fullmatch(cell):
+            cell = cell.replace(",", "")
         for sign in ",.":
             if self._separator != "," and sign in cell:
                 if self._decimal not in (None, sign) or (sign == "," and "." in cell):
