@@ -1,7 +1,8 @@
 """Run what `make test` leaves out, and write down when, on which commit and with what outcome it last ran.
 
-`long_run.py NAME COMMAND...` runs the command and puts a line into tests/long_runs.txt, which is committed. A run of a
-part alone (`--part`) leaves no line. `make test` shows the lines at its end.
+`long_run.py NAME COMMAND...` runs the command and puts a line into tests/long_runs.txt, which is committed. The line
+ends with the last line that the command printed. A run of a part alone (`--part`) leaves no line. `make test` shows the
+lines at its end.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ ROOT = Path(__file__).resolve().parent.parent
 RECORD = ROOT / "tests" / "long_runs.txt"
 HEAD = "# The last whole runs of what `make test` leaves out, by tests/long_run.py: name, UTC, commit, outcome.\n"
 #: Targets of the Makefile that run through here.
-NAMES = ("campaigns", "cases", "tolerances", "soak", "emulate", "calibration")
+ROOMS = ("agree", "cases", "hidden", "lib", "tools")
+NAMES = ("campaigns", *(f"cases-{room}" for room in ROOMS), "tolerances", "soak", "emulate", "calibration")
 
 
 @dataclass(frozen=True)
@@ -62,7 +64,7 @@ def read() -> dict[str, Run]:
 
 def write(runs: dict[str, Run]) -> None:
     """The whole record."""
-    rows = (f"{name:11} {run.when} {run.commit} {run.outcome}\n" for name, run in sorted(runs.items()))
+    rows = (f"{name:12} {run.when} {run.commit} {run.outcome}\n" for name, run in sorted(runs.items()))
     RECORD.write_text(HEAD + "".join(rows), encoding="utf-8")
 
 
@@ -71,13 +73,26 @@ def say() -> str:
     runs, lines = read(), []
     for name in NAMES:
         if name not in runs:
-            lines.append(f"make {name:11} no run is recorded")
+            lines.append(f"make {name:12} no run is recorded")
             continue
         run = runs[name]
         since = git("rev-list", "--count", f"{run.commit.removesuffix('-dirty')}..HEAD")
         ago = "" if since is None else f", {since} commits ago"
-        lines.append(f"make {name:11} {run.outcome}; {run.when}, commit {run.commit}{ago}")
+        lines.append(f"make {name:12} {run.outcome}; {run.when}, commit {run.commit}{ago}")
     return "not part of `make test`:\n" + "\n".join(f"  {line}" for line in lines)
+
+
+def passed_on(command: list[str]) -> tuple[int, str]:
+    """Run it and show what it prints as it comes. Its exit code, and its last line."""
+    tail = b""
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        while piece := os.read(process.stdout.fileno(), 65536):
+            sys.stdout.buffer.write(piece)
+            sys.stdout.buffer.flush()
+            tail = (tail + piece)[-4096:]
+    lines = tail.decode(errors="replace").split("\n")
+    return process.returncode, next((line.strip("= ") for line in reversed(lines) if line.strip("= ")), "")
 
 
 def main() -> int:
@@ -88,12 +103,13 @@ def main() -> int:
     parser.add_argument("command", nargs=argparse.REMAINDER)
     arguments = parser.parse_args()
     at, start = commit(), time.monotonic()
-    code = subprocess.run(arguments.command, cwd=ROOT, check=False).returncode
+    code, last = passed_on(arguments.command)
     if not arguments.part:
         minutes = (time.monotonic() - start) / 60.0
         outcome = "passed" if code == 0 else f"FAILED with exit code {code}"
         when = datetime.now(UTC).strftime("%Y-%m-%dT%H:%MZ")
-        write(read() | {arguments.name: Run(when, at, f"{outcome} after {minutes:.0f} min on {machine()}")})
+        outcome = f"{outcome} after {minutes:.0f} min on {machine()}{': ' if last else ''}{last}"
+        write(read() | {arguments.name: Run(when, at, outcome)})
         print(f"written to tests/{RECORD.name}: commit it")
     return code
 

@@ -26,15 +26,17 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
 
 
 def test_a_whole_run_is_written_down(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "make soak        no run is recorded" in long_run.say()
+    assert "make soak         no run is recorded" in long_run.say()
     assert run(monkeypatch, "soak", "false", "--part") == 1  # --part is the command's here
-    assert "make soak        FAILED with exit code 1 after 0 min on 3 cores, m68k" in long_run.say()
+    assert "make soak         FAILED with exit code 1 after 0 min on 3 cores, m68k" in long_run.say()
     assert run(monkeypatch, "campaigns", "true") == 0
+    assert run(monkeypatch, "cases-lib", sys.executable, "-c", "print('..')\nprint('== 3 passed in 2 s ==')") == 0
+    assert long_run.read()["cases-lib"].outcome.endswith("m68k: 3 passed in 2 s")
     assert run(monkeypatch, "soak", "true") == 0
     written = [long_run.read()[name].outcome for name in ("campaigns", "soak")]
     assert written == ["passed after 0 min on 3 cores, m68k"] * 2
     if subprocess.run(["git", "rev-parse", "HEAD"], cwd=ROOT, capture_output=True, check=False).returncode == 0:
-        assert long_run.say().count("0 commits ago") == 2
+        assert long_run.say().count("0 commits ago") == 3
 
 
 def test_a_part_is_not(monkeypatch: pytest.MonkeyPatch, record: Path) -> None:
