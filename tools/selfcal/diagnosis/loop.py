@@ -339,7 +339,7 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
             return state
         kept = [finding for finding in in_means.findings if CAUSES[finding.look.cause].of_means]
         known = in_means.state.extras
-        extras = replace(state.extras, flicker=known.flicker, oscillation=known.oscillation)
+        extras = replace(state.extras, **known.slow)
         left_out = np.isfinite(in_means.first.y) & ~np.isfinite(in_means.state.y)
         state = _between(state, runs(left_out), 1.0 / in_means.record.rate_hz)
         columns = [

@@ -203,9 +203,7 @@ def _column(column: Regressor, values: Mapping[str, Array], t: Array, dt: float)
 def _drift(at: Fit, dt: float) -> tuple[Terms, Array, float]:
     """The drift of a fit at samples of `dt` s: its terms, their parameters, and the white noise of a sample."""
     terms = replace(at.terms, color="", bands=())
-    longer = math.log(dt / at.dt)
-    grows = {"ln_rho": longer} | dict.fromkeys(("ln_markov", "ln_flicker", "ln_swing"), 0.5 * longer)
-    theta = np.array([at.value(name) + grows.get(name, 0.0) for name in terms.names])
+    theta = np.array([at.value(name) for name in terms.names]) + math.log(dt / at.dt) * terms.growth
     return terms, theta, (at.N_of_color if at.terms.color else at.N) / math.sqrt(dt)
 
 

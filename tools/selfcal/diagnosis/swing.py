@@ -72,7 +72,7 @@ def found(state: State, *, slow: bool) -> Swing | None:
     if start is None or net(start[2] + FIT_ADDS, 3, price) < NEARLY:
         return None
     gain, fits = state.with_terms(start[0], start[1], oscillation=True, bands=held(state))
-    if slow and not state.extras.flicker:  # a poor drift model makes some nats of any slow term
+    if slow and not state.extras.all_scales:  # a poor drift model makes some nats of any slow term
         gain -= max(0.0, state.rich.ln_likelihood - state.best.ln_likelihood)
     swing = Swing(fits, gain, net(gain, 3, price))
     period, damping, _ = swing.numbers

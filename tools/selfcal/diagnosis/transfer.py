@@ -24,7 +24,7 @@ from selfcal.diagnosis.forms import LONGEST_LAG, agreement
 from selfcal.likelihood.columns import LN_SLOW, nodes, top
 from selfcal.likelihood.fit import Fit, Sums, left, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
-from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
+from selfcal.likelihood.statemodel import Array
 from selfcal.model.forms import POWER, played, slope
 
 Complex = NDArray[np.complex128]
@@ -319,7 +319,7 @@ def beside_two_terms(state: State, found: Sequence[Tried]) -> list[Tried]:
     """The structures with scores beside a drift of two terms, and the fit with that drift where it is clearly better.
 
     A drift of one term that follows quick errors of a structure leaves slow columns some nats of their own."""
-    if state.extras.flicker:
+    if state.extras.all_scales:
         return list(found)
     best = max(found, key=lambda trial: trial.score)
     base = max(state.rich.ln_likelihood, state.best.ln_likelihood)
@@ -384,8 +384,7 @@ def posterior(state: State, drive: Drive, trial: Tried) -> Posterior:
 def _flat(fit: Fit, theta: Array) -> float:
     """ln of a prior flat in the sizes of the drift over Jeffreys' for a weak walk, about a fit: a drift that quick
     errors of a structure make smaller would leave slow coefficients too narrow an interval."""
-    sizes = [name in DRIFT_SIZES for name in fit.terms.names]
-    return 0.5 * float((theta - fit.theta)[sizes].sum())
+    return 0.5 * float((theta - fit.theta)[fit.terms.sizes].sum())
 
 
 def _ln_weight(sums: Sums) -> float:

@@ -17,7 +17,7 @@ from scipy.special import logsumexp
 from selfcal import _likelihood
 from selfcal.base.grid import SLOPE_STEP
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Mask, Terms, matrices
+from selfcal.likelihood.statemodel import LN_SIZE, PARAMETERS, Array, Mask, Terms, matrices
 
 #: Columns that the compiled filter takes in one pass beside the record.
 COLUMNS_MOST = _likelihood.COLUMNS_MAX - 1
@@ -48,9 +48,7 @@ LARGER = (
     (("ln_markov", "ln_alpha"), -5.0, ((-5.0, -7.0), (-5.0, -5.0), (-5.0, -3.0), (-5.0, -1.7))),
 )
 #: Logarithm of a drift over the white noise at which this is nothing.
-DROWNED = math.log(SIZE_LIMITS[1]) - 0.01
-#: Parameters that are logarithms of sizes.
-SIZES = (*DRIFT_SIZES, "ln_swing")
+DROWNED = LN_SIZE[1] - 0.01
 
 
 @dataclass(frozen=True)
@@ -158,17 +156,15 @@ class Fit:
 
     def shrunk(self, by: float) -> Fit:
         """The same model with a drift smaller by exp(-by), within its limits. Only its parameters are of that drift."""
-        less = np.array([by * (name in DRIFT_SIZES) for name in self.terms.names])
         low = np.array(self.terms.limits(self.dt)).reshape(-1, 2)[:, 0]
-        return replace(self, theta=np.maximum(self.theta - less, low))
+        return replace(self, theta=np.maximum(self.theta - by * self.terms.sizes, low))
 
     def of_means(self, block: int, less: float) -> Array:
         """Its parameters for means of so many samples, sizes of the drift times e to `less`: they are relative to the
         white noise."""
-        by = {name: 0.5 * math.log(block) for name in DRIFT_SIZES} | {"ln_rho": math.log(block)}
-        low = math.log(SIZE_LIMITS[0])
-        each = zip(self.terms.names, self.theta, strict=True)
-        return np.array([max(value + by[name] + less, low) if name in by else value for name, value in each])
+        terms = self.terms
+        theta = self.theta + math.log(block) * terms.growth + less * terms.sizes
+        return np.where(terms.growth > 0.0, np.maximum(theta, LN_SIZE[0]), theta)
 
     @property
     def N(self) -> float:
@@ -178,7 +174,7 @@ class Fit:
     @property
     def drowned(self) -> bool:
         """Whether a drift leaves no white noise: a climb from there may not begin."""
-        return any(self.value(name) > DROWNED for name in self.terms.names if name in DRIFT_SIZES)
+        return bool(np.any(self.theta[self.terms.sizes] > DROWNED))
 
     @property
     def quantized(self) -> bool:
@@ -390,7 +386,7 @@ def _climbed(series: Series, here: Fit) -> Fit:
     if not terms.names:
         return here
     low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
-    size = np.array([name in SIZES for name in terms.names])
+    size = terms.growth > 0.0
     reach = FARTHEST
     for _ in range(STEPS):
         slope, information = slopes(series, here)
@@ -489,8 +485,7 @@ def nodes(series: Series, found: Fit) -> list[tuple[Array, float]]:
     places = [found.theta + spread @ np.array(z) for z in product(*steps)]
     inside = [theta for theta in places if np.all((theta >= limits[:, 0]) & (theta <= limits[:, 1]))]
     inside = inside or [found.theta]
-    sizes = [name in DRIFT_SIZES for name in found.terms.names]
-    ln_prior = 0.5 * np.array([theta[sizes].sum() for theta in inside])
+    ln_prior = 0.5 * np.array([theta[found.terms.sizes].sum() for theta in inside])
     ln_prior -= logsumexp(ln_prior) - math.log(len(inside))
     return list(zip(inside, (volume + ln_prior).tolist(), strict=True))
 
@@ -527,18 +522,11 @@ def finish(series: Series, terms: Terms, theta: Array) -> Fit:
     return Fit(terms, theta, sigma, c, sd, ln_likelihood(sums), sums.n, series.dt, series.duration_s)
 
 
-_GUESSES: dict[str, tuple[float, ...]] = {
-    "ln_rho": (-4.0, -8.0),
-    "ln_markov": (-1.5,),
-    "ln_alpha": (-6.0, -4.0, -2.0),
-    "ln_flicker": (-2.0, -6.0),
-    "color": (0.2, -0.2),
-}
-
-
 def _starts(terms: Terms, limits: Array) -> list[Array]:
     """All combinations of a few guesses a parameter; further ones at the middle of their limits."""
-    grids = [_GUESSES.get(name, (0.5 * (low + high),)) for name, (low, high) in zip(terms.names, limits, strict=True)]
+    grids = [
+        PARAMETERS[name].starts or (0.5 * (low + high),) for name, (low, high) in zip(terms.names, limits, strict=True)
+    ]
     if len(grids) > 3:
         grids = [guess[: 2 if k < 2 else 1] for k, guess in enumerate(grids)]
     mesh = np.meshgrid(*grids, indexing="ij")
@@ -553,5 +541,4 @@ def best(fits: Sequence[Fit]) -> Fit:
 def moved(fit_: Fit, terms: Terms, own: Mapping[str, float] = MappingProxyType({})) -> Array:
     """A start for `terms` from another model's fit: shared parameters are kept, new ones begin small, or as `own`."""
     known = {**dict(zip(fit_.terms.names, fit_.theta, strict=True)), **own}
-    fresh = {"ln_rho": -6.0, "ln_markov": -2.5, "ln_alpha": -4.0, "ln_flicker": -3.0, "color": 0.2}
-    return np.array([known.get(name, fresh.get(name, 0.0)) for name in terms.names])
+    return np.array([known.get(name, PARAMETERS[name].fresh) for name in terms.names])

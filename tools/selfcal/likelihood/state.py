@@ -15,7 +15,7 @@ from selfcal.bank.result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
-from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Mask, Terms
+from selfcal.likelihood.statemodel import PARAMETERS, PERIOD_LIMITS, Array, Mask, Terms
 from selfcal.readings.budget import OF_MODULES, P_LOOK
 from selfcal.readings.lattice import OFF
 
@@ -160,7 +160,7 @@ class State:
 
     def stiffer(self, by: float) -> list[Fit]:
         """The best fit with a drift smaller by exp(-by), if it has one."""
-        return [self.best.shrunk(by)] if any(name in DRIFT_SIZES for name in self.best.terms.names) else []
+        return [self.best.shrunk(by)] if self.best.terms.sizes.any() else []
 
     def with_columns(self, more: Array) -> tuple[float, Fit]:
         """Gain of ln likelihood by further columns [k, n], the drift refitted with them, and that fit."""
@@ -195,7 +195,7 @@ class State:
         parameters that the record leaves possible, and ln of the share of those that they stand for."""
         series = self.series.beside(more)
         fits = [self.fitted_with(terms, more) for terms in self.near()]
-        if rich and not self.extras.flicker:
+        if rich and not self.extras.all_scales:
             fits.append(refit(series, self.rich))
         for drift in fits:
             for theta, ln_share in nodes(series, drift):
@@ -230,7 +230,7 @@ class State:
             replace(regressor, values=mean) for regressor, mean in zip(self.regressors, series.columns[1:], strict=True)
         ]
         bands = [  # sizes are relative to the white noise; faster ones average out
-            (period, damping, ln_size + 0.5 * math.log(block))
+            (period, damping, ln_size + PARAMETERS["ln_swing"].grows * math.log(block))
             for period, damping, ln_size in self.extras.bands
             if period >= PERIOD_LIMITS[0]
         ]

@@ -7,9 +7,10 @@ are a vector of unbounded numbers: logarithms of sizes and rates, atanh of corre
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from typing import Literal
+from functools import cached_property, lru_cache
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +27,37 @@ ALPHA_LIMITS = ABOUT_N["alpha"][:2]
 SIZE_LIMITS = (1e-5, 1e2)
 #: A drift that oscillates keeps within these periods, s: faster ones are a band.
 PERIOD_LIMITS = (20.0, 3000.0)
-#: Parameters that size a term of the drift.
-DRIFT_SIZES = ("ln_rho", "ln_markov", "ln_flicker")
+#: Limits of ln of a size.
+LN_SIZE = (math.log(SIZE_LIMITS[0]), math.log(SIZE_LIMITS[1]))
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a term: the field of `Terms` that it belongs to, its limits, where a fit starts (without: at the
+    middle), and where one starts that takes over another model's numbers.
+
+    `grows`: a size over the white noise of a mean goes as this power of its samples; 0 for what is no size. `drift`: a
+    size of the drift, so that a smaller drift has less of it."""
+
+    term: str
+    limits: tuple[float, float]
+    starts: tuple[float, ...] = ()
+    fresh: float = 0.0
+    grows: float = 0.0
+    drift: bool = False
+
+
+#: In the vector's order.
+PARAMETERS = {
+    "ln_rho": Parameter("walk", LN_SIZE, (-4.0, -8.0), -6.0, grows=1.0, drift=True),
+    "ln_markov": Parameter("markov", LN_SIZE, (-1.5,), -2.5, grows=0.5, drift=True),
+    "ln_alpha": Parameter("markov", (math.log(ALPHA_LIMITS[0]), math.log(ALPHA_LIMITS[1])), (-6.0, -4.0, -2.0), -4.0),
+    "ln_flicker": Parameter("flicker", LN_SIZE, (-2.0, -6.0), -3.0, grows=0.5, drift=True),
+    "ln_swing": Parameter("oscillation", LN_SIZE, grows=0.5),
+    "ln_period": Parameter("oscillation", (-math.inf, math.log(PERIOD_LIMITS[1]))),  # see `limits`
+    "ln_damping": Parameter("oscillation", (math.log(1e-5), math.log(DAMPING_LIMITS[1]))),
+    "color": Parameter("color", (-2.6, 2.6), (0.2, -0.2), 0.2),
+}
 
 
 @dataclass(frozen=True)
@@ -45,33 +75,35 @@ class Terms:
     color: Literal["", "ma", "ar"] = ""
     bands: tuple[tuple[float, float, float], ...] = ()
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters, in the vector's order."""
-        names: list[str] = []
-        names += ["ln_rho"] if self.walk else []
-        names += ["ln_markov", "ln_alpha"] if self.markov else []
-        names += ["ln_flicker"] if self.flicker else []
-        names += ["ln_swing", "ln_period", "ln_damping"] if self.oscillation else []
-        names += ["color"] if self.color else []
-        return tuple(names)
+        return tuple(name for name, parameter in PARAMETERS.items() if getattr(self, parameter.term))
+
+    @cached_property
+    def sizes(self) -> Mask:
+        """Of the parameters those that are ln of sizes of the drift."""
+        return np.array([PARAMETERS[name].drift for name in self.names], bool)
+
+    @cached_property
+    def growth(self) -> Array:
+        """Powers by which the parameters' sizes grow in means, see `Parameter`."""
+        return np.array([PARAMETERS[name].grows for name in self.names])
+
+    @property
+    def all_scales(self) -> bool:
+        """Whether a term has all time scales: a drift of two terms then adds nothing."""
+        return self.flicker
+
+    @property
+    def slow(self) -> dict[str, Any]:
+        """The fields of terms that means show as well: those with a size that grows in them."""
+        return {each.term: getattr(self, each.term) for each in PARAMETERS.values() if each.grows}
 
     def limits(self, dt: float) -> list[tuple[float, float]]:
         """Low and high of each parameter; dt: sampling interval, s."""
-        size = (math.log(SIZE_LIMITS[0]), math.log(SIZE_LIMITS[1]))
-        found: list[tuple[float, float]] = []
-        for name in self.names:
-            if name == "ln_alpha":
-                found.append((math.log(ALPHA_LIMITS[0]), math.log(ALPHA_LIMITS[1])))
-            elif name == "ln_period":
-                found.append((math.log(2.1 * dt), math.log(max(PERIOD_LIMITS[1], 20.0 * dt))))
-            elif name == "ln_damping":
-                found.append((math.log(1e-5), math.log(DAMPING_LIMITS[1])))
-            elif name == "color":
-                found.append((-2.6, 2.6))
-            else:
-                found.append(size)
-        return found
+        period = (math.log(2.1 * dt), max(PARAMETERS["ln_period"].limits[1], math.log(20.0 * dt)))
+        return [period if name == "ln_period" else PARAMETERS[name].limits for name in self.names]
 
 
 @dataclass(frozen=True)
@@ -100,59 +132,66 @@ def flicker_rates(duration_s: float, dt: float) -> tuple[float, ...]:
     return tuple(float(rate) for rate in np.logspace(low, high, count))
 
 
+class _Part(NamedTuple):
+    """States of one term [m], as in `Matrices`; a number stands for a matrix of one state."""
+
+    states: int
+    F: Array | float
+    Q: Array | float
+    P0: Array | float
+    h: Array | float = 1.0
+    lost: float = 0.0
+    driver: bool = False
+
+
+def _parts(terms: Terms, value: Mapping[str, float], dt: float, duration_s: float, block: int) -> Iterator[_Part]:
+    """The terms' states, one term after the other. A kind of noise is a branch here and its rows of PARAMETERS."""
+
+    def markov(variance: float, rate: float) -> _Part:
+        lost = variance * lost_of(rate * dt, block)
+        return _Part(1, math.exp(-rate * dt), -variance * math.expm1(-2.0 * rate * dt), variance, lost=lost)
+
+    if terms.walk:
+        step = math.exp(2.0 * value["ln_rho"])
+        yield _Part(1, 1.0, step, 0.0, lost=step * lost_of(0.0, block))
+    if terms.markov:
+        yield markov(math.exp(2.0 * value["ln_markov"]), math.exp(value["ln_alpha"]))
+    if terms.flicker:
+        rates = flicker_rates(duration_s, dt)
+        apart = math.log(rates[1] / rates[0])
+        for rate in rates:
+            yield markov(math.exp(2.0 * value["ln_flicker"]) * apart / math.pi, rate)
+    if terms.color == "ar":  # the white noise itself is a first-order process
+        f = math.tanh(value["color"])
+        yield _Part(1, f, 1.0 - f * f, 1.0, driver=True)
+    if terms.color == "ma":  # e_i + theta e_(i-1)
+        m = math.tanh(value["color"])
+        unit = 1.0 / (1.0 + m * m)
+        yield _Part(2, np.eye(2, k=-1), np.diag([unit, 0.0]), unit * np.eye(2), np.array([1.0, m]), driver=True)
+    swings = list(terms.bands)
+    if terms.oscillation:
+        swings.append((math.exp(value["ln_period"]), math.exp(value["ln_damping"]), value["ln_swing"]))
+    for period, damping, ln_size in swings:
+        turn_of, variance = swing(period, damping, dt), math.exp(2.0 * ln_size)
+        first = variance * np.eye(2)
+        yield _Part(2, turn_of, variance * (np.eye(2) - turn_of @ turn_of.T), first, np.array([1.0, 0.0]))
+
+
 def matrices(terms: Terms, theta: Array, dt: float, duration_s: float, block: int = 1) -> Matrices:
     """The state model of `terms` at the parameters `theta`, for means of `block` readings.
 
     Flicker noise of coefficient B has the two-sided spectrum B^2 / (2 pi f), as in `simulate` and in IEEE 952. Terms of
     variance v whose rates are a factor g apart make v / (2 ln g f), so v = B^2 ln g / pi.
     """
-    value = dict(zip(terms.names, map(float, theta), strict=True))
-    swings = list(terms.bands)
-    if terms.oscillation:
-        swings.append((math.exp(value["ln_period"]), math.exp(value["ln_damping"]), value["ln_swing"]))
-    rates = flicker_rates(duration_s, dt) if terms.flicker else ()
-    pairs = len(swings) + (terms.color == "ma")
-    single = terms.walk + terms.markov + len(rates) + (terms.color == "ar")
-    size = max(1, single + 2 * pairs)
+    parts = list(_parts(terms, dict(zip(terms.names, map(float, theta), strict=True)), dt, duration_s, block))
+    size = max(1, sum(part.states for part in parts))
     F, Q, P0, h = np.zeros((size, size)), np.zeros((size, size)), np.zeros((size, size)), np.zeros(size)
-    R, driver, k, lost = 1.0, -1, 0, 0.0
-
-    def markov(variance: float, rate: float) -> None:
-        nonlocal k, lost
-        F[k, k] = math.exp(-rate * dt)
-        Q[k, k] = -variance * math.expm1(-2.0 * rate * dt)
-        P0[k, k] = variance
-        h[k] = 1.0
-        lost += variance * lost_of(rate * dt, block)
-        k += 1
-
-    if terms.walk:
-        F[k, k] = h[k] = 1.0
-        Q[k, k] = math.exp(2.0 * value["ln_rho"])
-        lost += Q[k, k] * lost_of(0.0, block)
-        k += 1
-    if terms.markov:
-        markov(math.exp(2.0 * value["ln_markov"]), math.exp(value["ln_alpha"]))
-    if terms.flicker:
-        apart = math.log(rates[1] / rates[0])
-        for rate in rates:
-            markov(math.exp(2.0 * value["ln_flicker"]) * apart / math.pi, rate)
-    if terms.color == "ar":  # the white noise itself is a first-order process
-        f = math.tanh(value["color"])
-        F[k, k], Q[k, k], P0[k, k], h[k] = f, 1.0 - f * f, 1.0, 1.0
-        R, driver, k = 1e-9, k, k + 1
-    if terms.color == "ma":  # e_i + theta e_(i-1)
-        m = math.tanh(value["color"])
-        unit = 1.0 / (1.0 + m * m)
-        F[k + 1, k] = 1.0
-        Q[k, k] = P0[k, k] = P0[k + 1, k + 1] = unit
-        h[k], h[k + 1] = 1.0, m
-        R, driver, k = 1e-9, k, k + 2
-    for period, damping, ln_size in swings:
-        turn_of, variance = swing(period, damping, dt), math.exp(2.0 * ln_size)
-        F[k : k + 2, k : k + 2] = turn_of
-        Q[k : k + 2, k : k + 2] = variance * (np.eye(2) - turn_of @ turn_of.T)
-        P0[k, k] = P0[k + 1, k + 1] = variance
-        h[k] = 1.0
-        k += 2
+    R, driver, lost, end = 1.0, -1, 0.0, 0
+    for part in parts:
+        start, end = end, end + part.states
+        own = slice(start, end)
+        F[own, own], Q[own, own], P0[own, own], h[own] = part.F, part.Q, part.P0, part.h
+        lost += part.lost
+        if part.driver:
+            R, driver = 1e-9, start
     return Matrices(F, Q, h, P0, R, driver, lost)
