@@ -52,6 +52,23 @@ def test_a_line_of_constant_phase_stays_periodic(law: str) -> None:
     assert binom.cdf(right, total, 0.9) > 1e-3
 
 
+def test_swings_of_two_axes_are_no_line_of_both() -> None:
+    """Two gyros, each with a swing of its own of one period. Without a common source no axis has a line: 9 of 10."""
+    random, right, total = np.random.default_rng(466), 0, 0
+    for _ in range(case_records(3, 30)):
+        period, damping = math.exp(random.uniform(math.log(50.0), math.log(160.0))), random.uniform(0.05, 0.14)
+        drawn = {
+            name: recorded(noise(random, law, 1500, 1.0) + Swing(period, damping, 0.07).drawn(random, 1500, 1.0), 1.0)
+            for name, law in zip(("gx", "gy"), LAWS, strict=True)
+        }
+        axes = {name: replace(state, axis=name) for name, (state, _) in drawn.items()}
+        found = diagnose_record(replace(drawn["gx"][1], axes=axes), list(axes))
+        total += 1
+        right += all("periodic" not in [f.look.cause for f in axis.findings] for axis in found.values())
+    print(f"two swings: {right} of {total}")
+    assert binom.cdf(right, total, 0.9) > 1e-3
+
+
 def test_the_effect_has_the_covariance_of_its_keys() -> None:
     """By the solution of the equation: r(t) = sd^2 exp(-d w t) (cos v t + d/s sin v t), v = s w, s = sqrt(1 - d^2).
     400 independent records: each mean of products within 4.5 of its standard deviations."""

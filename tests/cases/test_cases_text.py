@@ -343,6 +343,21 @@ def test_a_regular_pattern_of_empty_cells_is_a_slower_axis(tmp_path: Path, every
     assert_noise(log, "gy", 0.3 / math.sqrt(rate))
 
 
+@pytest.mark.parametrize("heading", ["board [degC]", "NTC (°C)", "case[K]"])
+def test_the_only_column_in_degrees_is_the_temperature(heading: str, tmp_path: Path) -> None:
+    """By any name, where no column is named a temperature."""
+    n = 500
+    columns = (np.arange(n) / 50.0, white(n, 0.1, 1), 290.0 + 0.01 * np.arange(n))
+    for headings, read in ((heading, True), (f"{heading},{heading.replace('[', 'B[').replace('(', 'B(')}", False)):
+        values = (*columns[:2], *[columns[2]] * (1 + headings.count(",")))
+        log = text_of(tmp_path / "log.csv", f"t[s],gx[deg/s],{headings}", values, ",".join(["%.5f"] * len(values)))
+        recording = load(log)
+        assert ("temp" in recording.columns) == read
+        if read:
+            offset = 273.15 if "K" in heading else 0.0
+            assert recording.in_unit("temp", "degC") == pytest.approx(columns[2] - offset, abs=1e-4)
+
+
 def test_a_slow_temperature_is_bridged(tmp_path: Path) -> None:
     """A column that explains is drawn by straight lines between its samples: a ramp is a ramp again."""
     n = 2000

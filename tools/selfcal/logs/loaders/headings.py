@@ -311,12 +311,14 @@ def _in_two(keys: Sequence[str], source: str) -> dict[str, Meaning]:
 
 
 def _temperature(form: _Form, keys: Sequence[str], source: str) -> dict[str, Meaning]:
-    """The temperature of a source, else the only one that there is."""
+    """The temperature of a source, else the only one that there is: by its name, else by its unit."""
     matches = [
         ((match.groupdict().get("source") or "").strip("/. "), key, stated)
         for key, match, stated in _matching(form.temperature, keys)
     ]
-    of = [entry for entry in matches if entry[0] == source] or (matches if len(matches) == 1 else [])
+    of = [entry for entry in matches if entry[0] == source]
+    others = matches or [("", key, unit) for key in keys if (unit := split(key)[1]) and _kind(unit, (("K", "K"),))]
+    of = of or (others if len(others) == 1 else [])
     return {key: Meaning("temp", stated or (None if form is FORMS[-1] else "degC")) for _, key, stated in of[:1]}
 
 
