@@ -96,6 +96,8 @@ def test_a_drift_that_one_record_cannot_tell_is_below_its_limit() -> None:
     (row,) = changes({"K": unknown}, {"K": known})
     assert (row["what"], row["before_below"]) == ("changed", 1e-3) and "after_below" not in row
     assert changes({"K": unknown}, {"K": {**unknown, "median": 5e-3, "q05": 4.9e-3, "q95": 5.1e-3}}) == []
+    bare = {"median": 2.0, "unit": "1"}  # how much louder motion is: no interval
+    assert changes({"motion.ratio": bare}, {"motion.ratio": {**bare, "median": 40.0}}) == []
     document = {"recordings": ["a", "b"], "axes": {"gx": [{"from": "a", "to": "b", **row}]}}
     ((line,),) = told_of(document).values()
     assert (line.side("before", "-"), line.side("after", "-")) == ("< 0.001", "0.01")

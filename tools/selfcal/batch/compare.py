@@ -96,7 +96,7 @@ def quantities(identified: Mapping[str, Any], diagnosed: Mapping[str, Any]) -> d
         counted[cause] = counted.get(cause, 0) + 1
         label = cause if counted[cause] == 1 else f"{cause} {counted[cause]}"
         own_sizes = {
-            key: finding["estimate"][key] for key in SIZES if isinstance(finding["estimate"].get(key), Mapping)
+            key: size for key in SIZES if isinstance(size := finding["estimate"].get(key), Mapping)
         }
         first: Mapping[str, Any] = next(iter(own_sizes.values()), {})
         size = {part: first[part] for part in ("median", "unit") if part in first}
@@ -118,7 +118,8 @@ def changes(before: Mapping[str, Mapping[str, Any]], after: Mapping[str, Mapping
                 size = {side: only["median"], "unit": only["unit"]} if "median" in only else {}
                 rows.append({"quantity": key, "what": "appeared" if a is None else "gone", **size})
             continue
-        if "present" in a or not (a.get("identified", True) or b.get("identified", True)):
+        known = all("present" not in size and "q95" in size for size in (a, b))  # some sizes have no interval
+        if not (known and (a.get("identified", True) or b.get("identified", True))):
             continue
         sd = math.hypot(sd_of(a), sd_of(b))
         distance = (b["median"] - a["median"]) / sd if sd > 0.0 else 0.0
