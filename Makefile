@@ -3,7 +3,7 @@
 #   make run [RECORDING=path]   the firmware over a recording: live view, table, plot
 #   make quick                  the checks, the C tests and a thin way through everything, in less than a minute
 #   make test                   everything that is checked; ends with `N passed, N failed`
-#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [SAVE=dir] [RIVALS=1]
+#   make hidden [CLASSES="step clean"] [RECORDS=n] [SEED=n] [RATE=hz] [OUT=dir] [SAVE=dir] [RIVALS=1] [TSOUTLIERS=1]
 #                               effects hidden in recordings: are they named?
 #   make hidden-physics [KINDS="turn_on tilt"] [SIZES=plain] [RECORDS=n] [SEED=n] [RATE=hz] [SECONDS=s] [OUT=dir]
 #                               effects from physics, by a generator that knows nothing of the detector

@@ -28,21 +28,14 @@ soak tolerances emulate campaigns calibration cases $(CASES): export OPENBLAS_NU
 LONG = $(BIN)/python tests/long_run.py $(if $(QUICK)$(ONLY)$(TIMES),--part) $@
 PYTEST := $(BIN)/python -m pytest -q --config-file=tools/pyproject.toml --rootdir=.
 
-# Seeds from the date unless SEED is given.
-hidden: setup-dev
-	nice $(BIN)/python tests/hidden/$(if $(RIVALS),rivals,judge).py --records $(or $(RECORDS),20) --classes $(CLASSES) \
-	    $(SEED:%=--seed %) $(RATE:%=--rate %) $(SAVE:%=--save %) $(if $(TSOUTLIERS),--tsoutliers)
-
-# Goes on where an earlier run of this commit ended.
-hidden-physics: setup-dev
-	nice $(BIN)/python tests/hidden/physics_judge.py --records $(or $(RECORDS),10) $(if $(KINDS),--kinds $(KINDS)) \
-	    $(if $(SIZES),--sizes $(SIZES)) $(SEED:%=--seed %) $(if $(RATE),--rate $(RATE)) $(SECONDS:%=--seconds %) \
-	    $(if $(OUT),--out $(OUT))
-
-# The same.
-hidden-several: setup-dev
-	nice $(BIN)/python tests/hidden/several_judge.py --records $(or $(RECORDS),10) $(if $(KINDS),--kinds $(KINDS)) \
-	    $(SEED:%=--seed %) $(if $(OUT),--out $(OUT))
+# A run goes on where an earlier one of this commit ended. Seeds of `hidden` are from the date unless SEED is given.
+hidden: SUITE = $(if $(TSOUTLIERS),tsoutliers,$(if $(RIVALS),rivals,recordings))
+hidden-physics: SUITE = physics
+hidden-several: SUITE = several
+hidden hidden-physics hidden-several: setup-dev
+	nice $(BIN)/python tests/hidden/judge.py --suite $(SUITE) --kinds $(CLASSES) $(KINDS) $(RECORDS:%=--records %) \
+	    $(SEED:%=--seed %) $(if $(SIZES),--sizes $(SIZES)) $(if $(RATE),--rate $(RATE)) $(SECONDS:%=--seconds %) \
+	    $(OUT:%=--out %) $(SAVE:%=--save %)
 
 false-alarms: setup-dev
 	nice $(BIN)/python tests/hidden/false_alarms.py $(RECORDS:%=--records %) $(SEED:%=--seed %) $(RATE:%=--rate %)

@@ -35,8 +35,8 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-AXES = ("gx", "gy", "gz", "ax", "ay", "az")
-UNITS = {"g": "deg/s", "a": "m/s^2"}
+from generator import AXES, UNITS
+
 #: White noise density N by kind of axis.
 N = {"g": 0.04, "a": 0.005}
 FORMS = ("float", "lattice", "digits", "means")

@@ -45,7 +45,7 @@ def axis(random: np.random.Generator, n: int) -> Array:
     elif law == "markov":
         drift = markov(random, n, np.exp(random.uniform(np.log(10.0), np.log(2000.0))))
     else:
-        drift = sum(markov(random, n, tau) for tau in 2.0 ** np.arange(1, 15))
+        drift = np.asarray(sum(markov(random, n, tau) for tau in 2.0 ** np.arange(1, 15)))
     return np.asarray(random.normal(size=n) + size * drift)
 
 
@@ -56,7 +56,7 @@ def best(seed: int) -> dict[str, float]:
     y, kept_out, _ = in_means(np.array([axis(random, n) for _ in range(6)]))
     side = {name: markov(random, n, 600.0) for name in ("temperature", "supply")}
     known = Search(1.0, side, kept_out, 0.0, fitted(bins_of(y), 1.0, False), y).known
-    return {name: max((one.evidence for one in each), default=-np.inf) for name, each in known.items()}
+    return {name: max((column.evidence for column in columns), default=-np.inf) for name, columns in known.items()}
 
 
 def main() -> int:
@@ -66,10 +66,10 @@ def main() -> int:
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     with ProcessPoolExecutor(options.processes) as pool:
-        found = list(pool.map(best, range(options.seed, options.seed + options.records)))
-    every = np.array([list(each.values()) for each in found])
+        answers = list(pool.map(best, range(options.seed, options.seed + options.records)))
+    every = np.array([list(each.values()) for each in answers])
     print("search      median   0.9    0.99   most   of")
-    for name, values in [*zip(found[0], every.T, strict=True), ("any", every.max(axis=1))]:
+    for name, values in [*zip(answers[0], every.T, strict=True), ("any", every.max(axis=1))]:
         cells = [f"{value:7.2f}" for value in (*np.quantile(np.maximum(values, -99.0), (0.5, 0.9, 0.99)), values.max())]
         print(f"{name:10}", *cells, f"  seed {options.seed + int(np.argmax(values))}")
     tail = [float(np.mean(every.max(axis=1) > t) * np.exp(t)) for t in (-3.0, -2.0, -1.0, 0.0, 1.0)]

@@ -9,22 +9,21 @@ first 3000 block means at 1 Hz or less. None of them names a cause: alarms are c
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
-import sys
+import tempfile
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 import numpy as np
 from statsmodels.stats.diagnostic import acorr_ljungbox, het_arch
 from statsmodels.stats.stattools import jarque_bera
 
 from generator import Array, Record, draw, innovations
-from judge import OUT, Answer, Task, chosen, command_line, run
+from judge import Answer, Suite, Task, markdown
+from recordings_suite import RECORDINGS
 
 #: Exit code of tsoutliers.R where the package is absent.
 ABSENT = 77
@@ -37,9 +36,14 @@ def block_means(record: Record, rate: float) -> tuple[Array, float]:
     return y[: y.size // block * block].reshape(-1, block).mean(axis=1), block / record.rate_hz
 
 
-def textbook(task: Task) -> Answer:
+def drawn(task: Task) -> Record:
+    """The record of a task of the suite `recordings`."""
+    return draw(task.kind, task.seed, task.size, task.rate, task.law, task.pair)
+
+
+def textbook(task: Task, _folder: Path | None = None) -> Answer:
     """p values of the tests for one record."""
-    record = draw(task.kind, task.seed, task.size, task.rate, task.law, task.pair)
+    record = drawn(task)
     seen = innovations(*block_means(record, 10.0))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FutureWarning)  # het_arch of statsmodels 0.15 warns of its own inner call
@@ -49,74 +53,65 @@ def textbook(task: Task) -> Answer:
         "Jarque-Bera": float(jarque_bera(seen)[1]),
         "ARCH": float(arch[1]),
     }
-    return {"truth": {**record.truth(), "group": task.group}, "p": p}
+    return {"truth": record.truth(), "p": p}
 
 
-def table(answers: Sequence[Answer], level: float = 0.01) -> str:
+def means(task: Task, _folder: Path) -> Answer:
+    """The block means that `tsoutliers` gets of one record."""
+    return {"y": block_means(drawn(task), 1.0)[0][:3000]}
+
+
+def alarms(answers: Sequence[Answer], level: float = 0.01) -> str:
     """Share of alarms by kind; any: at a third of the level each."""
     tests = ("Ljung-Box", "Jarque-Bera", "ARCH")
-    lines = [
-        f"alarms at {100 * level:g} %, in % of the records",
-        "| drawn | records | " + " | ".join(tests) + " | any |",
-    ]
-    lines.append("|---" * 6 + "|")
-    rows: dict[str, list[dict[str, float]]] = {}
+    of: dict[str, list[dict[str, float]]] = {}
     for each in answers:
-        truth = each["truth"]
-        rows.setdefault(f"{truth['kind']}, {truth['size']}", []).append(each["p"])
-        if truth["group"] == "clean":
-            rows.setdefault("clean, all", []).append(each["p"])
-    for name, p in rows.items():
+        task = each["task"]
+        of.setdefault(f"{task['kind']}, {task['size']}", []).append(each["p"])
+        if task["kind"].startswith("clean:"):
+            of.setdefault("clean, all", []).append(each["p"])
+    rows = []
+    for name, p in of.items():
         shares = [100.0 * sum(each[test] < level for each in p) / len(p) for test in tests]
         shares.append(100.0 * sum(min(each.values()) < level / 3.0 for each in p) / len(p))
-        lines.append(f"| {name} | {len(p)} | " + " | ".join(f"{share:.0f}" for share in shares) + " |")
-    return "\n".join(lines)
+        rows.append([name, len(p), *(f"{share:.0f}" for share in shares)])
+    title = f"alarms at {100 * level:g} %, in % of the records\n"
+    return title + markdown(["drawn", "records", *tests, "any"], rows)
 
 
-def tsoutliers(work: Sequence[Task]) -> str:
-    """What tsoutliers finds by kind: records with an additive outlier, a level shift, a temporary change."""
+def tsoutliers(answers: Sequence[Answer]) -> str:
+    """Records by kind in which tsoutliers finds an additive outlier, a level shift, a temporary change."""
     if shutil.which("Rscript") is None:
         return "SKIPPED: tsoutliers: there is no Rscript (Debian: r-base-core, then install.packages('tsoutliers'))"
-    folder = OUT / "tsoutliers"
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    for i, task in enumerate(work):
-        y, _ = block_means(draw(task.kind, task.seed, task.size, task.rate, task.law, task.pair), 1.0)
-        np.savetxt(folder / f"{i:05d}.csv", y[:3000], fmt="%.9g", header="y", comments="")
     script = Path(__file__).with_name("tsoutliers.R")
-    done = subprocess.run(["Rscript", str(script), str(folder)], stdout=subprocess.PIPE, text=True, check=False)
+    with tempfile.TemporaryDirectory() as folder:
+        for i, each in enumerate(answers):
+            np.savetxt(Path(folder) / f"{i:05d}.csv", each["y"], fmt="%.9g", header="y", comments="")
+        done = subprocess.run(["Rscript", str(script), folder], stdout=subprocess.PIPE, text=True, check=False)
     if done.returncode == ABSENT:
         return "SKIPPED: tsoutliers: R has no package tsoutliers (install.packages('tsoutliers'))"
     if done.returncode != 0:
         return f"FAILED: {script.name} ended with {done.returncode}"
-    rows: dict[str, list[list[int]]] = {}
+    of: dict[str, list[list[int]]] = {}
     for line in done.stdout.splitlines():
         name, *counts = line.split(",")
-        task = work[int(name.removesuffix(".csv"))]
-        rows.setdefault(f"{task.kind}, {task.size}", []).append([int(count) for count in counts])
-    lines = ["records in which tsoutliers finds a", "| drawn | records | AO | LS | TC | any |", "|---" * 6 + "|"]
-    for name, found in rows.items():
-        hits = (np.array(found) > 0).sum(axis=0)
-        any_hit = (np.array(found).sum(axis=1) > 0).sum()
-        lines.append(f"| {name} | {len(found)} | " + " | ".join(str(hit) for hit in (*hits, any_hit)) + " |")
-    return "\n".join(lines)
+        task = answers[int(name.removesuffix(".csv"))]["task"]
+        of.setdefault(f"{task['kind']}, {task['size']}", []).append([int(count) for count in counts])
+    rows = []
+    for name, outliers in of.items():
+        hits = (np.array(outliers) > 0).sum(axis=0)
+        any_hit = (np.array(outliers).sum(axis=1) > 0).sum()
+        rows.append([name, len(outliers), *map(str, hits), str(any_hit)])
+    return "records in which tsoutliers finds a\n" + markdown(["drawn", "records", "AO", "LS", "TC", "any"], rows)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Command line."""
-    parser = command_line(__doc__.partition("\n")[0])
-    parser.add_argument("--tsoutliers", action="store_true", help="R's tsoutliers instead; up to 2 s a record")
-    options = parser.parse_args(arguments)
-    work = chosen(parser, options)
-    if options.tsoutliers:
-        print(tsoutliers(work))
-        return 0
-    answers = run(work, textbook, processes=options.processes)
-    OUT.mkdir(parents=True, exist_ok=True)
-    (OUT / "rivals.json").write_text(json.dumps(answers, default=float) + "\n")
-    print(table(answers))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+RIVALS = Suite(
+    about=__doc__.partition("\n")[0],
+    kinds=RECORDINGS.kinds,
+    records=RECORDINGS.records,
+    tasks=RECORDINGS.tasks,
+    ask=textbook,
+    table=alarms,
+    options=RECORDINGS.options,
+)
+TSOUTLIERS = replace(RIVALS, ask=means, table=tsoutliers)

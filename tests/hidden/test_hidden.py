@@ -6,8 +6,11 @@ with the drawn effect and the dense covariance of what was drawn.
 
 from __future__ import annotations
 
+import ast
 import json
+import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,7 @@ from scipy.linalg import cholesky, solve_triangular
 
 import generator
 import judge
+import recordings_suite
 import rivals
 from generator import AXES, CAUSES, CLEAN, GRID, OUTSIDE, PAIRS, Law, Scene, draw, exact, least
 
@@ -51,6 +55,15 @@ def fitted(y: np.ndarray, dt: float = 1.0) -> float:
         return exact(y[None] - y[0], dt, law, theta).cost(np.ones(1))
 
     return least(cost, {law: [cost(law, theta) for theta in points] for law, points in GRID.items()})[0]
+
+
+@pytest.mark.parametrize("name", ["generator", "physics", "several", "evidence"])
+def test_a_generator_imports_nothing_of_selfcal(name: str) -> None:
+    tree = ast.parse(Path(__file__).with_name(f"{name}.py").read_text(encoding="utf-8"))
+    modules = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
+    modules |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    roots = {module.partition(".")[0] for module in modules}
+    assert roots <= {"numpy", "scipy", "evidence", "physics", *sys.stdlib_module_names}
 
 
 @pytest.mark.parametrize("dt", [0.1, 1.0])
@@ -242,27 +255,36 @@ def broken(path: Path, axes: list[str]) -> dict[str, Any]:
     raise ValueError("no")
 
 
+def answer(task: judge.Task, detector: Any, out: Path) -> dict[str, Any]:
+    made = judge.answer(task, partial(recordings_suite.ask, detector=detector), out)
+    return made | recordings_suite.verdict(made)
+
+
 def judged(detector: Any, tmp_path: Path) -> list[dict[str, Any]]:
     """One answer a group and kind, without those whose drawing takes long."""
     classes = ["step", "quantization", "missing_samples", "pair", "outside:echo", "clean:nothing", "clean:ms_stamps"]
-    work = [task for task in judge.tasks(classes, 1, 1, 1.0) if "flicker" not in (task.pair or ())]
-    first = {(task.group, task.kind): task for task in reversed(work)}
-    return [judge.answer(task, f"{__name__}:{detector.__name__}", tmp_path) for task in first.values()]
+    work = [task for task in recordings_suite.tasks(classes, 1, 1, 1.0) if "flicker" not in (task.pair or ())]
+    first = {(task.size, task.kind): task for task in reversed(work)}
+    return [answer(task, detector, tmp_path) for task in first.values()]
 
 
 def test_the_judge_finds_nothing_wrong_with_the_truth(tmp_path: Path) -> None:
     answers = judged(oracle, tmp_path)
-    lines = judge.requirements(answers)
+    lines = recordings_suite.requirements(answers)
     assert all(line.met for line in lines), "\n".join(map(str, lines))
-    assert {each["truth"]["group"] for each in answers} == set(judge.GROUPS)
+    assert {each["group"] for each in answers} == set(recordings_suite.GROUPS)
     assert all(line.hits == line.of for line in lines if "adequate" in line.what or "first" in line.what)
-    assert [gain.cause for gain in judge.held_out(answers)] == ["step", "quantization", "missing_samples"]
+    assert [gain.cause for gain in recordings_suite.held_out(answers) if gain.of] == [
+        "step",
+        "quantization",
+        "missing_samples",
+    ]
     assert all(ok for each in answers for ok in each["sizes"].values())
     assert {"step.amplitude", "quantization.lsb", "missing_samples.missing"} <= {k for e in answers for k in e["sizes"]}
 
 
 def test_the_judge_fails_a_detector_that_sees_nothing(tmp_path: Path) -> None:
-    lines = judge.requirements(judged(content, tmp_path))
+    lines = recordings_suite.requirements(judged(content, tmp_path))
     for what in ("  step", "two causes: both named", "outside the table: not adequate"):
         line = next(line for line in lines if line.what == what)
         assert line.hits == 0 < line.of
@@ -271,13 +293,38 @@ def test_the_judge_fails_a_detector_that_sees_nothing(tmp_path: Path) -> None:
 
 
 def test_a_fault_of_the_detector_is_an_answer(tmp_path: Path) -> None:
-    found = judge.answer(judge.Task("plain", "quantization", 1, rate=1.0), f"{__name__}:broken", None)
-    assert (found["first"], found["error"]) == ("refused", "ValueError: no")
-    assert "| quantization, plain | 1 |" in judge.confusion([found])
+    refused = answer(judge.Task("quantization", 1, rate=1.0), broken, tmp_path)
+    assert (refused["first"], refused["error"]) == ("refused", "ValueError: no")
+    assert "| quantization, plain | 1 |" in recordings_suite.confusion([refused])
+
+
+def test_an_answer_is_asked_once(tmp_path: Path) -> None:
+    """A run goes on where it ended, but leaves recordings in a folder whenever that is asked for."""
+    task, saved = judge.Task("quantization", 1, rate=1.0), tmp_path / "saved"
+    saved.mkdir()
+    first = answer(task, broken, tmp_path)
+    assert answer(task, content, tmp_path) == first
+    ask = partial(recordings_suite.ask, detector=content)
+    again = judge.answer(task, ask, tmp_path, saved)
+    assert recordings_suite.verdict(again)["first"] == "adequate"
+    assert judge.answer(task, ask, tmp_path) == again
+    suffixes = (".answer.json", ".npz", ".truth.json")
+    assert sorted(path.name for path in saved.iterdir()) == [f"{task.name}{suffix}" for suffix in suffixes]
+
+
+@pytest.mark.parametrize("name", judge.SUITES)
+def test_every_record_of_a_suite_has_a_file_of_its_own(name: str) -> None:
+    suite, options, work = judge.command_line(["--suite", name, "--records", "2", "--seed", "3"])
+    assert len({task.name for task in work}) == len(work) > 0
+    assert {task.kind for task in work} <= set(suite.kinds) and options.suite == name
+    kind = work[-1].kind
+    assert {task.kind for task in judge.command_line(["--suite", name, "--kinds", kind])[2]} == {kind}
+    with pytest.raises(SystemExit):
+        judge.command_line(["--suite", name, "--kinds", "nothing_of_the_kind"])
 
 
 def test_textbook_tests_keep_their_level_on_white_noise_and_see_outliers() -> None:
-    tasks = judge.tasks(["clean:constant"], 2, 3, 1.0) + judge.tasks(["outliers"], 3, 3, 1.0)
+    tasks = recordings_suite.tasks(["clean:constant"], 2, 3, 1.0) + recordings_suite.tasks(["outliers"], 3, 3, 1.0)
     answers = [rivals.textbook(task) for task in tasks]
     kinds = [each["truth"]["kind"] for each in answers]
     alarms = [min(each["p"].values()) < 0.003 for each in answers]
@@ -288,7 +335,7 @@ def test_textbook_tests_keep_their_level_on_white_noise_and_see_outliers() -> No
 @pytest.mark.parametrize(("hits", "of", "met"), [(84, 100, False), (90, 100, True), (96, 100, False), (0, 0, True)])
 def test_coverage_may_miss_on_both_sides(hits: int, of: int, met: bool) -> None:
     answers = [{"sizes": {"step.amplitude": i < hits}} for i in range(of)]
-    assert judge._size_lines("plain", answers)[0].met == met
+    assert recordings_suite._size_lines("plain", answers)[0].met == met
 
 
 def test_innovations_of_a_slow_walk_are_white_from_the_start() -> None:

@@ -5,34 +5,22 @@ Nothing of the detector runs here.
 
 from __future__ import annotations
 
-import ast
-import sys
 from typing import Any
 
 import numpy as np
 import pytest
 
 import several
-import several_judge
-from conftest import ROOT
+import several_suite
 from evidence import Array, dense_log_likelihood
 from physics import AXES, UNITS, Axis
 from several import ALL, COLUMNS, EACH, KINDS, TOGETHER, draw
-from several_judge import Event, events, verdict
+from several_suite import Event, events, verdict
 
-HIDDEN = ROOT / "tests" / "hidden"
 #: Kinds whose effect is a column on single axes.
 SINGLE = [*COLUMNS, "tilt"]
 #: s: a dense covariance is small.
 SHORT = 420
-
-
-def test_imports_nothing_of_selfcal() -> None:
-    tree = ast.parse((HIDDEN / "several.py").read_text(encoding="utf-8"))
-    modules = {a.name for node in ast.walk(tree) if isinstance(node, ast.Import) for a in node.names}
-    modules |= {str(node.module) for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
-    roots = {module.partition(".")[0] for module in modules}
-    assert roots <= {"numpy", "scipy", "evidence", "physics", *sys.stdlib_module_names}
 
 
 def covariance(axis: Axis, n: int) -> Array:
@@ -275,7 +263,7 @@ def test_verdicts() -> None:
 
 
 def test_shapes_that_agree() -> None:
-    close = several_judge.close
+    close = several_suite.close
     assert close("frequency_hz", 0.2, 0.2 + 0.9 / 10_800.0, 10_800.0)
     assert not close("frequency_hz", 0.2, 0.2 + 1.1 / 10_800.0, 10_800.0)
     for key in ("lag_s", "tau_s", "duration_s"):

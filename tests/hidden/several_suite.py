@@ -1,10 +1,5 @@
 """Does `selfcal diagnose` name, once and on the right axes, what acts on several axes (several.py)?
-
-    make hidden-several                                        12 kinds, 10 records each, and those beside them
-    make hidden-several KINDS="step f_jumps" RECORDS=3 SEED=1  some of it
-
-Each record's answer is a JSON file in build/hidden/several/COMMIT (`OUT=DIR`: there). A run that was interrupted goes
-on where it ended; `summary.json` there has the table. Exit code 1: a goal is missed, or not all was run.
+(`make hidden-several`)
 
 The answer is a list of events. An entry of the document's `findings` is one. Findings of axes are one if they have one
 cause, `shared_with` names the other axis, and their shapes agree. Shapes agree within 10 s in time, 1/T in frequency,
@@ -16,27 +11,16 @@ axes), or `missed`. A record is as good as its worst cause.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import sys
-import tempfile
-import time
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # one core a record
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-sys.path.insert(0, str(Path(__file__).parent))
-
 import numpy as np
 
-from judge import Line, print_cost, run, summed_up
-from physics_judge import ROOT, _commit
-from several import ALL, BESIDE, CALM, CLEAN, KINDS, SECONDS, draw
+from judge import Answer, Line, Suite, Task, diagnosed, ended, markdown, save_columns, share, where
+from several import ALL, CALM, CLEAN, KINDS, SECONDS, draw
 
 OUTCOMES = ("named", "wrong axes", "wrong shape", "wrong cause", "missed", "refused")
 JACCARD = 0.7
@@ -51,15 +35,11 @@ SHORT, CLEAN_MOST, BESIDE_F = 0.9, 0.04, 1.0 / 50.0
 #: Records of a kind: those that are judged by a small share are more.
 TIMES = {CLEAN: 10, CALM: 5}
 
-Answer = dict[str, Any]
 
-
-@dataclass(frozen=True)
-class Task:
-    """One record to draw."""
-
-    kind: str
-    seed: int
+def tasks(kinds: Sequence[str], records: int, seed: int) -> list[Task]:
+    """`records` a kind, and `TIMES` as many of the kinds there unless kinds are asked for."""
+    counts = {kind: records * (1 if kind in kinds else TIMES.get(kind, 1)) for kind in kinds or ALL}
+    return [Task(kind, seed + i, size="") for kind, count in counts.items() for i in range(count)]
 
 
 @dataclass
@@ -102,22 +82,22 @@ def shape_of(finding: dict[str, Any], axis: str = "") -> dict[str, Any]:
     return shape
 
 
-def close(key: str, one: Any, other: Any, seconds: float) -> bool:
+def close(key: str, value: Any, other: Any, seconds: float) -> bool:
     """Whether two values of a shape's key agree."""
     if key == "jumps":
-        return all(any(abs(a - b) <= TIME for b in other) for a in one)
-    if not isinstance(one, float | int) or not isinstance(other, float | int):
-        return bool(one == other)
+        return all(any(abs(a - b) <= TIME for b in other) for a in value)
+    if not isinstance(value, float | int) or not isinstance(other, float | int):
+        return bool(value == other)
     if key == "time_s":
-        return abs(one - other) <= TIME
+        return abs(value - other) <= TIME
     if key == "frequency_hz":
-        return abs(one - other) <= 1.0 / seconds
-    return one > 0.0 < other and max(one / other, other / one) <= FACTOR
+        return abs(value - other) <= 1.0 / seconds
+    return value > 0.0 < other and max(value / other, other / value) <= FACTOR
 
 
-def agree(one: dict[str, Any], other: dict[str, Any], seconds: float) -> bool:
+def agree(shape: dict[str, Any], other: dict[str, Any], seconds: float) -> bool:
     """Whether two shapes agree in every key that both have."""
-    return all(close(key, one[key], other[key], seconds) for key in one.keys() & other.keys())
+    return all(close(key, shape[key], other[key], seconds) for key in shape.keys() & other.keys())
 
 
 def events(document: dict[str, Any], seconds: float) -> list[Event]:
@@ -137,14 +117,13 @@ def events(document: dict[str, Any], seconds: float) -> list[Event]:
         shared, grown = _with(finding), True
         while grown:
             grown = False
-            for other in list(left):
-                at, also = other
-                named = at in shared or event.axes & _with(also)
-                if also["cause"] == event.cause and named and agree(event.shape, shape_of(also, at), seconds):
-                    event.axes.add(at)
-                    event.nats += _nats(also)
-                    shared |= _with(also)
-                    left.remove(other)
+            for axis, other in list(left):
+                named = axis in shared or event.axes & _with(other)
+                if other["cause"] == event.cause and named and agree(event.shape, shape_of(other, axis), seconds):
+                    event.axes.add(axis)
+                    event.nats += _nats(other)
+                    shared |= _with(other)
+                    left.remove((axis, other))
                     grown = True
         made.append(event)
     return sorted(made, key=lambda event: -event.nats)
@@ -176,10 +155,10 @@ def _nats(finding: dict[str, Any]) -> float:
 def jaccard(piece: dict[str, Any], axes: set[str]) -> float:
     """Of the axes of an event and of the truth, without weak ones. With weak ones alone one of them is enough."""
     weak = {name for name, nats in piece["nats"].items() if nats < WEAK}
-    right, found = set(piece["nats"]) - weak, axes - weak
-    if not right | found:
+    right, strong = set(piece["nats"]) - weak, axes - weak
+    if not right | strong:
         return float(bool(axes & weak))
-    return len(right & found) / len(right | found)
+    return len(right & strong) / len(right | strong)
 
 
 def shape_right(piece: dict[str, Any], event: Event, beside: Sequence[Event], seconds: float) -> bool:
@@ -194,9 +173,9 @@ def shape_right(piece: dict[str, Any], event: Event, beside: Sequence[Event], se
     return all(key in shape and close(key, value, shape[key], seconds) for key, value in theta.items())
 
 
-def verdict(pieces: Sequence[dict[str, Any]], found: Sequence[Event], seconds: float) -> Answer:
+def verdict(pieces: Sequence[dict[str, Any]], listed: Sequence[Event], seconds: float) -> Answer:
     """Outcome of each cause of the truth, and how much longer the list is than the truth."""
-    left, results, words = list(found), [], []
+    left, results, words = list(listed), [], []
     wanted = [piece for piece in pieces if not piece["optional"]]
     for piece in wanted:
         graded = []
@@ -229,105 +208,69 @@ def verdict(pieces: Sequence[dict[str, Any]], found: Sequence[Event], seconds: f
         "outcome": max(results, key=OUTCOMES.index) if results else "",
         "outcomes": results,
         "words": words,
-        "longer": len(found) - len(wanted) - allowed,
+        "longer": len(listed) - len(wanted) - allowed,
         "beside": [str(event) for event in left],
-        "said": [str(event) for event in found],
+        "said": [str(event) for event in listed],
     }
 
 
-def answer(task: Task, out: Path) -> Answer:
-    """Draws a record, has it diagnosed, and judges the answer."""
-    path = out / f"{task.kind}_{task.seed}.json"
-    if not path.exists():
-        partial = path.with_suffix(f".{os.getpid()}")
-        partial.write_text(json.dumps(_run(task), default=float) + "\n")
-        partial.replace(path)
-    made: Answer = json.loads(path.read_text())
-    document = made["document"]
-    errors = [entry["error"] for entry in document["axes"].values() if "error" in entry]
-    found = events(document, SECONDS)
-    made |= verdict(made["truth"]["pieces"], found, SECONDS)
-    made["inadequate"] = [name for name, e in document["axes"].items() if e.get("verdict", "adequate") != "adequate"]
-    if errors:
-        made |= {"outcome": "refused", "error": errors[0]}
-    return made
-
-
-def _run(task: Task) -> Answer:
-    """What `diagnose` says of a record, and its CPU seconds without imports of the first record."""
-    import selfcal
-
+def ask(task: Task, folder: Path) -> Answer:
+    """Draws a record and has it diagnosed."""
     record = draw(task.kind, task.seed)
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{task.kind}.npz"
-        np.savez(path, allow_pickle=False, **{"t[s]": record.t, **record.columns})
-        start = time.process_time()
-        try:
-            document: Answer = selfcal.diagnose(path)
-        except Exception as error:  # a fault of the detector is an answer too
-            document = {"axes": {"all": {"error": f"{type(error).__name__}: {error}"}}}
-        seconds = time.process_time() - start
-    axes = {
-        name: {key: entry[key] for key in ("error", "verdict", "findings") if key in entry}
-        for name, entry in document["axes"].items()
-    }
-    kept = {"findings": document.get("findings") or [], "axes": axes}
-    return {"task": vars(task), "truth": record.truth, "document": kept, "seconds": seconds}
+    path = folder / f"{task.name}.npz"
+    save_columns(path, record.t, record.columns)
+    return diagnosed(path, record.truth)
+
+
+def judged(made: Answer) -> Answer:
+    """The verdict on a record, or the fault of the detector."""
+    document = made["document"]
+    result = verdict(made["truth"]["pieces"], events(document, SECONDS), SECONDS)
+    errors = [entry["error"] for entry in document["axes"].values() if "error" in entry]
+    return result | ({"outcome": "refused", "error": errors[0]} if errors else {})
 
 
 # ------------------------------------------------------------------------------------------------------------- summary
 
 
 def goals(answers: Sequence[Answer]) -> list[Line]:
-    """The issue's, for what was run."""
-    of = {kind: [each for each in answers if each["task"]["kind"] == kind] for kind in ALL}
-    lines = []
-    main = [each for kind in KINDS for each in of[kind]]
-    if main:
-        lines.append(Line("twelve kinds: named", _count(main, "named"), len(main), NAMED))
-        shares = [_count(of[kind], "named") / len(of[kind]) for kind in KINDS if of[kind]]
-        lines.append(Line("  kinds named in six of ten", sum(share >= EVERY for share in shares), len(shares), 1.0))
-        word = [each["words"] for each in of["tilt"] if each["outcome"] == "named"]
-        lines.append(Line("  tilt by the word tilt, of those named", sum("tilt" in each for each in word), len(word)))
-    truths = [each for kind in (*KINDS, "leak", "leak_beside_f", "two") for each in of[kind]]
-    if truths:
-        short = [each["longer"] <= 1 for each in truths]
-        lines.append(Line("lists at most one longer than the truth", sum(short), len(short), SHORT))
-        same = [each["longer"] <= 0 for each in truths]
-        lines.append(Line("  lists no longer", sum(same), len(same)))
-    for kind in ("leak", "leak_beside_f", "two"):
-        if of[kind]:
-            lines.append(Line(f"{kind}: named", _count(of[kind], "named"), len(of[kind])))
-    if of[CALM]:
-        lines.append(Line("f without jumps: named", _count(of[CALM], "named"), len(of[CALM])))
-        further = sum(len(each["beside"]) for each in of[CALM])
-        lines.append(Line("f without jumps: further events a module", further, len(of[CALM]), 0.0, BESIDE_F))
-    if of[CLEAN]:
-        any_event = sum(bool(each["said"]) for each in of[CLEAN])
-        lines.append(Line("clean modules with an event", any_event, len(of[CLEAN]), 0.0, CLEAN_MOST))
-    return lines
-
-
-def _count(answers: Sequence[Answer], name: str) -> int:
-    return sum(each["outcome"] == name for each in answers)
+    """The goals, for the kinds that were run."""
+    of = {kind: where(answers, kind=kind) for kind in ALL}
+    further = ("leak", "leak_beside_f", "two")
+    by_kind = [ended(of[kind], "named", kind, EVERY) for kind in KINDS if of[kind]]
+    words = ("tilt" in each["words"] for each in of["tilt"] if each["outcome"] == "named")
+    longer = [each["longer"] for kind in (*KINDS, *further) for each in of[kind]]
+    beside = sum(len(each["beside"]) for each in of[CALM])
+    return [
+        ended([each for kind in KINDS for each in of[kind]], "named", "twelve kinds: named", NAMED),
+        share("  kinds named in six of ten", (line.met for line in by_kind), 1.0),
+        share("  tilt by the word tilt, of those named", words),
+        share("lists at most one longer than the truth", (count <= 1 for count in longer), SHORT),
+        share("  lists no longer", (count <= 0 for count in longer)),
+        *(ended(of[kind], "named", f"{kind}: named") for kind in further),
+        ended(of[CALM], "named", "f without jumps: named"),
+        Line("f without jumps: further events a module", beside, len(of[CALM]), 0.0, BESIDE_F),
+        share("clean modules with an event", (bool(each["said"]) for each in of[CLEAN]), 0.0, CLEAN_MOST),
+    ]
 
 
 def table(answers: Sequence[Answer]) -> str:
     """By kind: outcomes, how much longer the list is than the truth, expected nats and CPU."""
-    head = ["kind", "records", *OUTCOMES, "list: as long", "+1", "more", "nats", "CPU, s"]
-    lines = ["| " + " | ".join(head) + " |", "|---" * len(head) + "|"]
+    rows = []
     for kind in ALL:
-        own = [each for each in answers if each["task"]["kind"] == kind]
+        own = where(answers, kind=kind)
         if not own:
             continue
         counts = Counter(each["outcome"] for each in own)
         lengths = Counter(min(max(each["longer"], 0), 2) for each in own)
         nats = [sum(p["together"] for p in each["truth"]["pieces"] if not p["optional"]) for each in own]
-        cells = [kind, str(len(own)), *(str(counts[name] or "") for name in OUTCOMES)]
-        cells += [str(lengths[k] or "") for k in range(3)]
-        cells += [f"{np.median(nats):.0f}", f"{np.median([each['seconds'] for each in own]):.1f}"]
-        lines.append("| " + " | ".join(cells) + " |")
-    return "\n".join(lines)
+        cpu = np.median([each["seconds"] for each in own])
+        outcomes = [counts[name] for name in OUTCOMES]
+        rows.append(
+            [kind, len(own), *outcomes, *(lengths[k] for k in range(3)), f"{np.median(nats):.0f}", f"{cpu:.1f}"]
+        )
+    head = ["kind", "records", *OUTCOMES, "list: as long", "+1", "more", "nats", "CPU, s"]
+    return markdown(head, rows)
 
 
 def failures(answers: Sequence[Answer]) -> list[str]:
@@ -346,34 +289,15 @@ def failures(answers: Sequence[Answer]) -> list[str]:
     return lines
 
 
-# ---------------------------------------------------------------------------------------------------------------- main
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description="One cause on several axes: does `selfcal diagnose` name it once?")
-    parser.add_argument("--kinds", nargs="*", default=[], help=f"of {', '.join(ALL)}; all if none")
-    parser.add_argument("--records", type=int, default=10, help=f"a kind; {CLEAN} ten times, {CALM} five times as many")
-    parser.add_argument("--seed", type=int, default=1, help="of the first record")
-    parser.add_argument("--processes", type=int, default=2)
-    parser.add_argument("--out", type=Path, help="folder of the answers")
-    options = parser.parse_args(arguments)
-    if unknown := [kind for kind in options.kinds if kind not in ALL]:
-        parser.error(f"unknown kind {unknown[0]}; there are {', '.join([*KINDS, *BESIDE])}")
-    out = options.out or ROOT / "build" / "hidden" / "several" / _commit()
-    out.mkdir(parents=True, exist_ok=True)
-    work = [
-        Task(kind, options.seed + i)
-        for kind in (options.kinds or ALL)
-        for i in range(options.records * (1 if kind in options.kinds else TIMES.get(kind, 1)))
-    ]
-    print(f"{len(work)} records, answers in {out}", flush=True)
-    answers = run(work, answer, out, processes=options.processes)
-    lines = goals(answers)
-    print(table(answers), "", *lines, "", *failures(answers), sep="\n")
-    print_cost(answers)
-    kept = [{key: each[key] for key in each if key != "document"} for each in answers]
-    return summed_up(kept, work, lines, out, "records")
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+SEVERAL = Suite(
+    about="One cause on several axes: does `selfcal diagnose` name it once?",
+    kinds=tuple(ALL),
+    records=10,
+    seed=1,
+    tasks=tasks,
+    ask=ask,
+    verdict=judged,
+    goals=goals,
+    table=table,
+    details=failures,
+)
