@@ -29,8 +29,8 @@ from scipy.special import ndtri
 
 from selfcal.bank.library import Bank
 from selfcal.base import units
+from selfcal.batch.batch_files import Source
 from selfcal.batch.batch_summary import OTHER_LAW, Batch, summed_up
-from selfcal.batch.files import Source
 from selfcal.batch.population import FALSE_NAME, fit
 from selfcal.batch.unit_table import Unit
 from selfcal.model.file import DEFAULT, Model, read_yaml

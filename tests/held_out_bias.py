@@ -27,8 +27,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
 from selfcal.logs.recording import as_float, load
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.regressors import columns_of, mask_of, offered

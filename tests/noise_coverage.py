@@ -37,8 +37,8 @@ from scipy.signal import lfilter
 
 from selfcal.adequacy.one_over_f import SURE, Rerun, weigh, with_white
 from selfcal.adequacy.summary import summarize
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.base.units import FLICKER_FLOOR
 from selfcal.logs.recording import as_float
 from selfcal.model.file import DEFAULT, Group, Model, Prior

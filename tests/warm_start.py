@@ -28,8 +28,8 @@ import yaml
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
 from selfcal.diagnosis.warm import RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, load, warmed
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.tables import Tables, make_tables

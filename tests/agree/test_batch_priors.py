@@ -20,9 +20,9 @@ from scipy import integrate, stats
 from test_docs import assert_alike
 
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
 from selfcal.bank.reference import identify_axis
-from selfcal.bank.result import HALF_90
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
 from selfcal.model.file import DEFAULT, Model, Prior

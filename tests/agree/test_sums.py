@@ -18,9 +18,9 @@ import pytest
 
 from selfcal import _library32
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.bank.axis_result import in_unit
 from selfcal.bank.library import Bank
 from selfcal.bank.reference import identify_axis
-from selfcal.bank.result import in_unit
 from selfcal.base.errors import UserError
 from selfcal.model.file import Model
 from selfcal.model.laws import PLACES, SUMS

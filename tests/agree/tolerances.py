@@ -29,8 +29,8 @@ from rich.table import Table
 
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
 from selfcal.bank import reference
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.logs.recording import load
 from selfcal.model.laws import NAMED, PLAIN, SUMS
 from selfcal.model.tables import make_tables

@@ -25,10 +25,10 @@ from selfcal.diagnosis.record import of_recording
 from selfcal.logs.recording import Column, Recording, load, save
 from selfcal.logs.sampling import rate_changes, sampling
 from selfcal.model.file import Model
+from selfcal.readings.changed_words import misread_of
 from selfcal.readings.held import held as held_rows
 from selfcal.readings.lattice import lattice_of
 from selfcal.readings.lost_words import recurring_of
-from selfcal.readings.misread import misread_of
 from selfcal.readings.readings import evened, look
 from selfcal.verbs.diagnose import diagnose
 

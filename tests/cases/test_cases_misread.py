@@ -22,10 +22,10 @@ from selfcal.diagnosis.record import of_recording
 from selfcal.logs.recording import Column, Recording
 from selfcal.model.file import Model
 from selfcal.readings.budget import SHARES
-from selfcal.readings.misread import spans_of
-from selfcal.readings.motion import moves_of
+from selfcal.readings.changed_words import spans_of
+from selfcal.readings.faults import FAULTS
+from selfcal.readings.moves import moves_of
 from selfcal.readings.readings import look
-from selfcal.readings.tests import TESTS
 
 from conftest import case_records
 
@@ -283,8 +283,8 @@ def test_sound_readings_are_called_so() -> None:
         recording = sound(np.random.default_rng([95, k]), k)
         for axis in recording.columns:
             seen = look(recording, axis, MODEL.group_of(axis))
-            for test in TESTS:
-                named[test.name] += test.statistic(seen) > 0.0
+            for fault in FAULTS:
+                named[fault.name] += fault.statistic(seen) > 0.0
     print(named)
     assert sum(named.values()) <= binom.isf(1e-3, 3 * count, 2e-3)
     for name, share in SHARES.items():

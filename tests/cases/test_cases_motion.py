@@ -26,8 +26,8 @@ from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Column, Recording, save
 from selfcal.model.file import Model
-from selfcal.readings.misread import spans_of
-from selfcal.readings.motion import Moved, moves_of
+from selfcal.readings.changed_words import spans_of
+from selfcal.readings.moves import Moved, moves_of
 from selfcal.readings.readings import look
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

@@ -32,7 +32,7 @@ from selfcal.model.file import Model
 from selfcal.model.regressors import columns_of
 from selfcal.readings import gate
 from selfcal.readings.rest import rest_of
-from selfcal.show.findings import show
+from selfcal.show.diagnosis_lines import show
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

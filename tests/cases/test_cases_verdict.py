@@ -15,11 +15,11 @@ from scipy.stats import binom, kurtosistest, norm
 
 from selfcal.adequacy.checks import against, kurtosis_at
 from selfcal.base.errors import UserError
+from selfcal.diagnosis.axis_verdict import coherence, joined, look_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import LEAST, Record
 from selfcal.diagnosis.statistics import Statistic, judged
-from selfcal.diagnosis.verdict import coherence, joined, look_of
 from selfcal.likelihood.state import NET_LEAST, Look, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import LARGEST, SMALLEST, Model

@@ -18,8 +18,8 @@ from scipy.optimize import minimize_scalar
 
 from selfcal import _library32, _reference
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.model.file import DEFAULT, Model, Regressor
 from selfcal.model.laws import NAMED, PLACES, SUMS
 from selfcal.model.tables import Tables, make_grid, make_tables

@@ -21,7 +21,7 @@ from tumbled import G0, POSITIONS, draw_part, matrices
 from selfcal.calibration import accelerometer
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import Noise, Term, drift
-from selfcal.calibration.rests import ACCEL, GYRO, PIECES, Rest, Tumble
+from selfcal.calibration.tumble_rests import ACCEL, GYRO, PIECES, Rest, Tumble
 
 from conftest import ROOT
 

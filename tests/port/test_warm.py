@@ -20,8 +20,8 @@ import yaml
 from scipy import stats
 from warm_start import LAW, PART, both, campaign, diagnosed, law_known
 
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.warm import REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load, warmed
 from selfcal.logs.recording import load as load_recording

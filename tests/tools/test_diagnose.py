@@ -42,7 +42,7 @@ from selfcal.likelihood.state import Look, State
 from selfcal.likelihood.statemodel import Terms, matrices
 from selfcal.logs.recording import load, save
 from selfcal.model.file import DEFAULT, Model
-from selfcal.readings.motion import moves_of
+from selfcal.readings.moves import moves_of
 from selfcal.verbs.compare import compare
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

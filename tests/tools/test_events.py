@@ -11,16 +11,16 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from selfcal.adequacy.document import Identified
+from selfcal.adequacy.identify_document import Identified
 from selfcal.adequacy.summary import Number, noisier
-from selfcal.bank.result import Estimate
+from selfcal.bank.axis_result import Estimate
 from selfcal.batch.fail_on import outcome
 from selfcal.diagnosis import events, words
 from selfcal.diagnosis.alias import of_readings
 from selfcal.diagnosis.causes import CAUSES
+from selfcal.diagnosis.channel_looks import FORMS, side_at
 from selfcal.diagnosis.events import Member, grouped
 from selfcal.diagnosis.finding import Finding
-from selfcal.diagnosis.forms import FORMS, side_at
 from selfcal.diagnosis.record import Record, of_recording
 from selfcal.diagnosis.suspicion import suspicions
 from selfcal.likelihood.state import Look, State, interval, log_normal
@@ -28,7 +28,7 @@ from selfcal.logs.recording import load, save
 from selfcal.model.file import Model
 from selfcal.model.forms import formed
 from selfcal.show import identification
-from selfcal.show.findings import show
+from selfcal.show.diagnosis_lines import show
 from selfcal.verbs import identify as identify_verb
 from selfcal.verbs.diagnose import diagnose
 from selfcal.verbs.identify import identify

@@ -24,8 +24,8 @@ import pytest
 
 from selfcal.base.errors import UserError
 from selfcal.base.units import factor
+from selfcal.batch.batch_files import Source
 from selfcal.batch.batch_summary import document_of, lines_of, summed_up
-from selfcal.batch.files import Source
 from selfcal.batch.fleet import document_with, judged_units
 from selfcal.batch.fleet_page import page
 from selfcal.batch.spread import DEATHS, Row, spread

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from selfcal.diagnosis import module
 from selfcal.diagnosis.causes import tilt
-from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.diagnose_document import to_document
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.loop import _give, diagnose_record
 from selfcal.diagnosis.record import Record, of_recording

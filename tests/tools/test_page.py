@@ -26,10 +26,10 @@ from selfcal.base.output import write_text
 from selfcal.diagnosis import integrity
 from selfcal.diagnosis.causes import colored_noise, periodic, ramp, step, variance_change
 from selfcal.diagnosis.causes import outliers as outliers_cause
-from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.channel_looks import side_looks
+from selfcal.diagnosis.diagnose_document import to_document
 from selfcal.diagnosis.events import add_findings
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Missing, Record, of_recording
 from selfcal.diagnosis.words import named

@@ -17,7 +17,7 @@ from scipy import signal
 
 from selfcal.adequacy.allan import overlapping
 from selfcal.adequacy.drawn import simulate_bank_samples
-from selfcal.bank.result import Estimate
+from selfcal.bank.axis_result import Estimate
 from selfcal.base.errors import UserError
 from selfcal.logs.recording import save
 from selfcal.model.file import Model

@@ -20,8 +20,8 @@ from fleet_power import model_of, study
 from numpy.typing import NDArray
 
 from selfcal.adequacy.drawn import simulate_bank_samples
+from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
-from selfcal.bank.result import HALF_90
 from selfcal.base.units import factor
 from selfcal.batch.batch_summary import apart_words, seen_from_words
 from selfcal.batch.drift import Series, drifts_of

@@ -17,8 +17,8 @@ from rich.console import Console
 
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.adequacy.summary import Number, halved_after, summarize
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult, Estimate
 from selfcal.logs.recording import save
 from selfcal.model.file import Model
 from selfcal.model.laws import PLAIN

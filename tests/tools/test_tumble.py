@@ -30,9 +30,9 @@ from selfcal.calibration.accelerometer import Accelerometer
 from selfcal.calibration.earth import gravity_at, place
 from selfcal.calibration.gyroscope import Gyroscope
 from selfcal.calibration.noise import Noise, Term, drift
-from selfcal.calibration.rests import tumble_of
 from selfcal.calibration.tumble_export import FORMS
 from selfcal.calibration.tumble_plan import plan_of
+from selfcal.calibration.tumble_rests import tumble_of
 from selfcal.calibration.tumble_show import show
 from selfcal.logs.recording import Recording
 from selfcal.model.file import DEFAULT, Model

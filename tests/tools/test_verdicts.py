@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from selfcal.adequacy.drawn import simulate_bank_samples
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.library import Bank
-from selfcal.bank.result import AxisResult
 from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.base.units import duration_words

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import gammaincinv, ndtri
 
+from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.blocks import Blocks
-from selfcal.bank.result import HALF_90, AxisResult, Estimate
 from selfcal.base.grid import SLOPE_STEP, bisected
 from selfcal.model.file import Group
 from selfcal.model.laws import FORGOTTEN, KINDS, Law, named

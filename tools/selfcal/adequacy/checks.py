@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from selfcal.adequacy.allan import LEFT_LEAST, Curve, curve_of, ratio_at, terms_of
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.blocks import FEWEST, MOST_DENSE, Blocks
 from selfcal.bank.priors import rounded
-from selfcal.bank.result import AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.logs.recording import Recording
@@ -22,8 +22,8 @@ from selfcal.logs.sampling import CHANGE
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
 from selfcal.readings.budget import CHECK_LIMIT, FALSE_ALARM
+from selfcal.readings.faults import FAULTS
 from selfcal.readings.readings import Readings
-from selfcal.readings.tests import TESTS
 
 #: Largest distance of a part from its batch that passes, sd: the two parameters of a law share FALSE_ALARM.
 BATCH_LIMIT = -float(ndtri(0.25 * FALSE_ALARM))
@@ -158,7 +158,7 @@ def with_readings(
     `lattice`, if they lie on one: is their noise above it, or carried on to the next reading? `value`: steps in the
     noise of a reading; `step` in the recording's unit; `distinct` readings; of a counter that fails `counter_hz`: the
     rate of means whose remainders are white.
-    The tests of the readings (readings/tests.py), if they name something: the share of readings that it is about.
+    Faults of the readings (readings/faults.py), if there are any: the share of readings that each is about.
     `misread` has its `kind`, whether it is `undone`, and kinds that are `also_possible`, `saturation` the `at` of the
     limit, `outliers` the value `at` which they recur, `stuck` and `motion` their `intervals` in s. `motion` passes
     where the noise of averages is the same with it, within its own scatter.
@@ -183,10 +183,10 @@ def with_readings(
             "intervals": [[a + start_s, b + start_s] for a, b in readings.moved.intervals] if readings.moved else [],
         },
     }
-    for test in TESTS:
-        if test.statistic(readings) > 0.0:
-            outcome = {"value": float(np.mean(test.mask(readings))), "limit": 0.0, "passed": False}
-            checks[test.name] = {**outcome, **more.get(test.name, dict)()}
+    for fault in FAULTS:
+        if fault.statistic(readings) > 0.0:
+            outcome = {"value": float(np.mean(fault.mask(readings))), "limit": 0.0, "passed": False}
+            checks[fault.name] = {**outcome, **more.get(fault.name, dict)()}
     if as_fed:
         if readings.changes:
             ratio = max((change.after_hz / change.before_hz - 1.0 for change in readings.changes), key=abs)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 
 from selfcal.adequacy.one_over_f import Beside, Rerun, weigh_law
-from selfcal.bank.result import AxisResult
+from selfcal.bank.axis_result import AxisResult
 from selfcal.model.file import Prior
 from selfcal.model.laws import RATIO_LIMITS
 from selfcal.readings.lattice import Lattice

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
+from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.blocks import Blocks
-from selfcal.bank.result import AxisResult
 from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood import columns, edges

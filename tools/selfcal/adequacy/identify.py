@@ -13,11 +13,11 @@ from selfcal import _library32
 from selfcal.adequacy.allan import Sampled, sample_lengths, sampled
 from selfcal.adequacy.checks import against, coefficients_of, judge, with_rate, with_readings
 from selfcal.adequacy.counted import weigh_counted
-from selfcal.adequacy.document import Identified
+from selfcal.adequacy.identify_document import Identified
 from selfcal.adequacy.one_over_f import Rerun, weigh, with_white
 from selfcal.adequacy.summary import halved_after, summarize
+from selfcal.bank.axis_result import AxisResult, in_unit
 from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
-from selfcal.bank.result import AxisResult, in_unit
 from selfcal.bank.subsets import Scored, combine
 from selfcal.base.errors import OutsidePriors, UserError
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, check_column

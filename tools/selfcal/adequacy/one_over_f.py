@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import LONGEST, fit_of, posterior_draws, terms_of
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.priors import MOST_INTERVALS, NARROW
-from selfcal.bank.result import AxisResult, Estimate
 from selfcal.base.errors import UserError
 from selfcal.model.file import ABOUT_N, MOST_HYPOTHESES, Group, Prior
 from selfcal.model.laws import NAMED

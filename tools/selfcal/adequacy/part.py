@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.adequacy.summary import NOISIER
+from selfcal.bank.axis_result import in_unit
 from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, NARROW, Seen, about, laid, prior_tree, rounded, seen_of
-from selfcal.bank.result import in_unit
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError, note, remark, short
 from selfcal.base.units import SENSORS, factor, parameter_unit

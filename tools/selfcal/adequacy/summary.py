@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import DRAWS, LONGEST, PER_OCTAVE, Terms, fit_of, posterior_draws
 from selfcal.adequacy.one_over_f import FLICKER, SURE, Beside, white_of
-from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.base.grid import bisected, weighted_quantiles

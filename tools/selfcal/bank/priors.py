@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.bank.result import FAINT, AxisResult
+from selfcal.bank.axis_result import FAINT, AxisResult
 from selfcal.base.errors import UserError
 from selfcal.base.grid import MEDIAN_SD
 from selfcal.logs.recording import Recording, as_float

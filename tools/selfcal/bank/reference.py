@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import generate_binary_structure, maximum_filter
 
 from selfcal import _reference
-from selfcal.bank.result import AxisResult, Estimate
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.base.errors import UserError
 from selfcal.model.file import Group, Prior
 from selfcal.model.laws import KINDS, Law

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal import _library32
-from selfcal.bank.result import HALF_90, AxisResult, of_mixture
+from selfcal.bank.axis_result import HALF_90, AxisResult, of_mixture
 from selfcal.model.regressors import Choice, coefficient_unit, ln_prior
 
 #: Least probability of a law that may be true. The widest of these laws of a subset states the coefficient. If a record

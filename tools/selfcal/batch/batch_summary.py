@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.summary import MOST_TIMES
-from selfcal.bank.result import HALF_90, bias_of, likeliest, sd_of
+from selfcal.bank.axis_result import HALF_90, bias_of, likeliest, sd_of
 from selfcal.base import units as unit_module
 from selfcal.base.errors import MOST_NAMED, UserError, few
 from selfcal.batch.drift import Drift, Series, drifts_of

@@ -11,7 +11,7 @@ from typing import Any
 
 from rich.markup import escape
 
-from selfcal.bank.result import bias_of, likeliest, sd_of
+from selfcal.bank.axis_result import bias_of, likeliest, sd_of
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.population import sd_off

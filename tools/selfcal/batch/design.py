@@ -18,7 +18,7 @@ import numpy as np
 from scipy.signal import max_len_seq
 
 from selfcal.adequacy.drawn import simulate_bank_samples
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
 from selfcal.base.output import print_lines

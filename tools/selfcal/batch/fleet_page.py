@@ -15,7 +15,7 @@ from selfcal.base.grid import Array
 from selfcal.batch.batch_summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
 from selfcal.batch.population import Population
 from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, draw
-from selfcal.show.template import render
+from selfcal.show.page_template import render
 
 #: Most of what the page shows: lines of a list, those not folded, units of the matrix, pictures.
 MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES = 150, 15, 100, 48

@@ -26,7 +26,7 @@ import numpy as np
 from selfcal.adequacy.allan import information_of, terms_of
 from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.adequacy.summary import MOST_TIMES
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, short
 from selfcal.base.grid import Array, bisected

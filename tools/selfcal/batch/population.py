@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtri, log_ndtr, logsumexp, ndtri
 
-from selfcal.bank.result import HALF_90, of_mixture
+from selfcal.bank.axis_result import HALF_90, of_mixture
 from selfcal.base.grid import Array, weighted_quantiles
 from selfcal.readings.budget import FALSE_ALARM
 

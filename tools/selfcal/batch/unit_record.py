@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 from selfcal.base.errors import MOST_NAMED, UserError, first_line
 from selfcal.batch.spread import Job, Kept, Row, spread
 from selfcal.batch.unit_table import Unit
-from selfcal.readings.tests import TESTS
+from selfcal.readings.faults import FAULTS
 
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
 IDENTIFIED = ("hypotheses", "log_evidence", "parameters", "regressors", "bias_now", "adequate", "error")
 DIAGNOSED = ("verdict", "causes", "material", "not_judged", "unfinished", "error")
 #: Checks of the readings, and of the innovations.
-READINGS = tuple(test.name for test in TESTS)
+READINGS = tuple(fault.name for fault in FAULTS)
 INNOVATIONS = ("innovation_lag1", "innovation_excess_kurtosis", "innovation_ln_variance_ratio_of_halves")
 #: Characters that the name of a device's page lacks.
 _UNSAFE = re.compile(r"[^A-Za-z0-9._-]")

@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from selfcal.bank.result import bias_of, likeliest
+from selfcal.bank.axis_result import bias_of, likeliest
 from selfcal.base.errors import UserError, cell, install
 from selfcal.base.output import whole
-from selfcal.batch.files import Source, moment, stem
+from selfcal.batch.batch_files import Source, moment, stem
 
 COLUMNS = (
     *("device", "recording", "recorded_at", "station", "lot", "sha256", "version", "axis", "parameter"),

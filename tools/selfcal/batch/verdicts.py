@@ -20,7 +20,7 @@ from statistics import NormalDist
 from typing import Any
 
 from selfcal.adequacy.summary import MOST_TIMES
-from selfcal.bank.result import HALF_90, bias_of, likeliest
+from selfcal.bank.axis_result import HALF_90, bias_of, likeliest
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, shown
@@ -318,7 +318,7 @@ def check_options(limits: Path | str | None, junit: Path | str | None, verdicts:
 def write(judged: Sequence[Judged], junit: Path | str | None, verdicts: Path | str | None) -> None:
     """Write the files that are asked for: JUnit, and a CSV of a row for each limit of each recording. A recording
     without a device has its file's name."""
-    from selfcal.batch.files import stem
+    from selfcal.batch.batch_files import stem
     from selfcal.batch.unit_table import write_csv
 
     named = [(device or stem(recording), recording, of_unit) for device, recording, of_unit in judged]

@@ -16,8 +16,8 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask, slices
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import drift
-from selfcal.calibration.rests import ACCEL, REST_S, Tumble
 from selfcal.calibration.tumble_fit import Fit, Problem, fit
+from selfcal.calibration.tumble_rests import ACCEL, REST_S, Tumble
 from selfcal.readings.budget import FALSE_ALARM
 
 #: Stated priors, sd, of lib/tumble.h: bias, m/s^2 (100 mg); scale; angle, rad; square of the scale, s^2/m.

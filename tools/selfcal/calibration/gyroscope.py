@@ -25,8 +25,8 @@ from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import ANGLE_SD, NONE, SCALE_SD, Accelerometer, forces, means_covariance, shaped
 from selfcal.calibration.noise import drift
-from selfcal.calibration.rests import GYRO, Tumble, Turn
 from selfcal.calibration.tumble_fit import Fit, Problem
+from selfcal.calibration.tumble_rests import GYRO, Tumble, Turn
 
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); temperature coefficient,
 #: rad/s/degC (0.05 deg/s/degC). Scale and angles have the accelerometers'.

@@ -8,15 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.adequacy.document import recording_entry
-from selfcal.bank.result import HALF_90
+from selfcal.adequacy.identify_document import recording_entry
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base.grid import Array
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
 from selfcal.calibration.gyroscope import Gyroscope
-from selfcal.calibration.rests import ACCEL, GYRO, Tumble
 from selfcal.calibration.tumble_fit import IDENTIFIED, Fit
 from selfcal.calibration.tumble_plan import EDGES, FLATS, OPPOSITE
+from selfcal.calibration.tumble_rests import ACCEL, GYRO, Tumble
 from selfcal.logs.recording import Recording
 from selfcal.readings.budget import FALSE_ALARM
 

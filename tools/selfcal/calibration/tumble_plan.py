@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
@@ -24,7 +24,7 @@ from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import Noise, of_model
-from selfcal.calibration.rests import ACCEL, CUT_S, GYRO, PIECES, REST_S, UNITS, Rest, Tumble
+from selfcal.calibration.tumble_rests import ACCEL, CUT_S, GYRO, PIECES, REST_S, UNITS, Rest, Tumble
 from selfcal.model.file import Model
 
 SCHEMA = "selfcal.plan_tumble/1"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base.errors import printable
 from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
 from selfcal.base.units import STANDARD_GRAVITY

@@ -13,18 +13,18 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.adequacy.document import Identified, parameters_entry, recording_entry, regressors_entry
 from selfcal.adequacy.identify import identify_axis
+from selfcal.adequacy.identify_document import Identified, parameters_entry, recording_entry, regressors_entry
 from selfcal.base.ending import Held, Stopped, abandon
 from selfcal.base.errors import UserError, note
 from selfcal.base.progress import Doing
 from selfcal.diagnosis import hidden, module
+from selfcal.diagnosis.axis_verdict import of_checks
 from selfcal.diagnosis.causes import CAUSES
-from selfcal.diagnosis.document import to_document
+from selfcal.diagnosis.diagnose_document import to_document
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, carried
-from selfcal.diagnosis.verdict import of_checks
 from selfcal.likelihood import work
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording

@@ -17,7 +17,7 @@ from scipy.linalg import lstsq, qr, svd
 from scipy.optimize import least_squares
 from scipy.signal import fftconvolve, lfilter
 
-from selfcal.diagnosis.forms import LONGEST_LAG
+from selfcal.diagnosis.channel_looks import LONGEST_LAG
 from selfcal.likelihood.fit import Fit, left
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array

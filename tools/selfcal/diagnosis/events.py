@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from scipy.special import chdtrc, expit
 
-from selfcal.adequacy.document import Identified
-from selfcal.bank.result import HALF_90
+from selfcal.adequacy.identify_document import Identified
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
 from selfcal.diagnosis import hidden, words
 from selfcal.diagnosis.alias import of_readings
@@ -31,7 +31,7 @@ from selfcal.likelihood.heldout import HARM_SD, MATTERS, in_sd
 from selfcal.likelihood.state import State, interval, log_normal, mixture
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
-from selfcal.readings.motion import joined
+from selfcal.readings.moves import joined
 
 #: The numbers, and their names in a summary.
 SUMMARY = {"N": "arw", "K": "rrw", "B": "bias_instability"}

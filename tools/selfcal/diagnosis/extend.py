@@ -20,8 +20,8 @@ from selfcal.base.output import write_text
 from selfcal.diagnosis.cause import Cause, Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.causes.vibration import WIDTHS_S
+from selfcal.diagnosis.channel_looks import form_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.forms import form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import finish

@@ -15,18 +15,18 @@ import numpy as np
 from selfcal.base.ending import Stopped
 from selfcal.base.grid import regridded, runs
 from selfcal.diagnosis import hidden, integrity, module, score
+from selfcal.diagnosis.axis_verdict import unexplained
 from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.causes import CAUSES, motion, tilt, variance_change
+from selfcal.diagnosis.channel_looks import side_looks
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding, rarer
-from selfcal.diagnosis.forms import side_looks
 from selfcal.diagnosis.record import TIMES, Record, carried
 from selfcal.diagnosis.statistics import judged
-from selfcal.diagnosis.verdict import unexplained
 from selfcal.likelihood import edges, work
 from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
 from selfcal.likelihood.state import ALIKE, NET_LEAST, SLOW_S, Look, Regressor, State
-from selfcal.readings.motion import Moved
+from selfcal.readings.moves import Moved
 
 #: Looks that one round tries on an axis.
 LOOKS: tuple[Looks, ...] = tuple(cause.looks for cause in CAUSES.values() if cause.looks)

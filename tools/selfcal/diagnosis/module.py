@@ -24,7 +24,7 @@ from selfcal.diagnosis.alias import WANDERS
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
 from selfcal.diagnosis.causes.variance_change import ln_changes, stretches
-from selfcal.diagnosis.forms import FORMS, LN_FORMS, shape_of, side_of, variants_of
+from selfcal.diagnosis.channel_looks import FORMS, LN_FORMS, shape_of, side_of, variants_of
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
 from selfcal.likelihood.columns import FITTED, LN_EITHER, LN_SLOW

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from selfcal.adequacy.document import to_document
 from selfcal.adequacy.identify import identify_axis
+from selfcal.adequacy.identify_document import to_document
 from selfcal.bank.blocks import FEWEST
 from selfcal.bank.priors import MOST_INTERVALS, add_sources, for_record
 from selfcal.base.errors import UserError

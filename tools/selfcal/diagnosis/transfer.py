@@ -20,7 +20,7 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
-from selfcal.diagnosis.forms import LONGEST_LAG, agreement
+from selfcal.diagnosis.channel_looks import LONGEST_LAG, agreement
 from selfcal.likelihood.columns import LN_SLOW, nodes, top
 from selfcal.likelihood.fit import Fit, Sums, left, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net

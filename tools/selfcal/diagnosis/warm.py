@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.bank.result import FAINT, HALF_90
+from selfcal.bank.axis_result import FAINT, HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, shown
 from selfcal.base.limits import read_text, reading
@@ -113,7 +113,7 @@ class _Reader:
         return UserError(f"{self.path}: {where}: {what}" if where else f"{self.path}: {what}")
 
     def tree(self) -> dict[str, Any]:
-        from selfcal.diagnosis.document import SCHEMA  # takes long to import
+        from selfcal.diagnosis.diagnose_document import SCHEMA  # takes long to import
 
         try:
             text = read_text(self.path, 1 << 25, "not a diagnosis")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import chdtrc, logsumexp, ndtr, softmax
 
-from selfcal.bank.result import HALF_90, of_mixture
+from selfcal.bank.axis_result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run

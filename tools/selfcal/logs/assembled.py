@@ -17,7 +17,7 @@ from selfcal.base.errors import UserError, short, shown
 from selfcal.base.grid import runs
 from selfcal.base.limits import FEWEST_ROWS, LONGEST_S, MOST_CLOCKS
 from selfcal.logs import written
-from selfcal.logs.headers import Header, number_in
+from selfcal.logs.chosen_columns import Header, number_in
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import PART, split
 from selfcal.logs.loaders.table import Rows

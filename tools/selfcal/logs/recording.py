@@ -24,7 +24,7 @@ from selfcal.base.options import Scale
 from selfcal.base.units import SENSORS
 from selfcal.logs import arrays, written
 from selfcal.logs.assembled import assembled
-from selfcal.logs.headers import NAME_YOURS, Asked, Header
+from selfcal.logs.chosen_columns import NAME_YOURS, Asked, Header
 from selfcal.logs.loaders import check_library, format_of, texts
 from selfcal.logs.loaders.child import tables_of
 from selfcal.logs.loaders.damage import SOUND, bytes_of

@@ -21,12 +21,12 @@ from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import Change, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
+from selfcal.readings.changed_words import misread_of, spans_of
 from selfcal.readings.codes import CHANGED_LEAST, ELSEWHERE, PIECE, PIECES, UNEVEN, Cells, Misread
 from selfcal.readings.held import Held, Slower, held, repeats_of, slower
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import MOST, Recurring, is_limit, recurring_of
-from selfcal.readings.misread import misread_of, spans_of
-from selfcal.readings.motion import Moved, moves_of
+from selfcal.readings.moves import Moved, moves_of
 from selfcal.readings.rest import FEWEST
 
 #: Rows of a recording whose readings are kept once they were looked at, at most.

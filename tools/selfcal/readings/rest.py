@@ -17,7 +17,7 @@ from selfcal.model.file import Model
 from selfcal.model.tables import bank_block
 from selfcal.readings.budget import CHECK_LIMIT
 from selfcal.readings.lattice import step_of
-from selfcal.readings.motion import PUSH
+from selfcal.readings.moves import PUSH
 
 #: Length of a piece, s, and its samples at least.
 PIECE_S, PIECE_LEAST = 1.0, 4

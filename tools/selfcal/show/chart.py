@@ -15,7 +15,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from selfcal.base.grid import Array, Mask, runs
-from selfcal.show.template import number, render
+from selfcal.show.page_template import number, render
 
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
 WIDTH, HEIGHT = 340, 220

@@ -15,7 +15,7 @@ from markupsafe import Markup
 from selfcal.base.errors import short
 from selfcal.base.units import typeset
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw
-from selfcal.show.template import render
+from selfcal.show.page_template import render
 
 #: Allan deviations by axis and recording: the key `allan` of `selfcal.identify/1`.
 Curves = Mapping[str, Mapping[str, Mapping[str, Any]]]

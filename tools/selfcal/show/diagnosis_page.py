@@ -27,8 +27,8 @@ from selfcal.diagnosis.response import RECORDS
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.show import chart, pictures
 from selfcal.show.chart import Band, Curve, Figure, Panel, draw, envelope, outside_of, strips
-from selfcal.show.findings import before_after, notes
-from selfcal.show.template import number, render
+from selfcal.show.diagnosis_lines import before_after, notes
+from selfcal.show.page_template import number, render
 
 #: The line in place of a picture.
 LEFT_OUT = Markup(

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.overbound import overbound, upper_limit
-from selfcal.bank.result import likeliest
+from selfcal.bank.axis_result import likeliest
 from selfcal.base import units
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import write_text
-from selfcal.base.templates import of_code
 
 #: Names of the formats on the command line, and their templates.
 FORMS = {

@@ -11,17 +11,17 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from selfcal.adequacy.document import as_typed
+from selfcal.adequacy.identify_document import as_typed
 from selfcal.adequacy.summary import MOST_TIMES, noisier
+from selfcal.bank.axis_result import FAINT, likeliest
 from selfcal.bank.priors import OF_RECORD
-from selfcal.bank.result import FAINT, likeliest
 from selfcal.base import units
 from selfcal.base.errors import called, few, printable
 from selfcal.base.output import TABLE_WIDTH, console_of, print_line, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
-from selfcal.readings.misread import MISREAD
-from selfcal.readings.motion import events_of
+from selfcal.readings.changed_words import MISREAD
+from selfcal.readings.moves import events_of
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 #: A check, its axes, and their outcomes.

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.bank.result import FAINT
+from selfcal.bank.axis_result import FAINT
 from selfcal.base.errors import printable
 from selfcal.base.output import plotter, save_picture
 from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from selfcal.adequacy.drawn import draw, has_nodes, simulate_bank_samples
-from selfcal.bank.result import HALF_90, likeliest
+from selfcal.bank.axis_result import HALF_90, likeliest
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model

@@ -19,8 +19,8 @@ from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
 
 if TYPE_CHECKING:
+    from selfcal.bank.axis_result import AxisResult
     from selfcal.bank.library import Bank
-    from selfcal.bank.result import AxisResult
 
 SCHEMA = "selfcal.navigate/1"
 #: Factor by which filter designers inflate a data sheet's noise.

@@ -11,7 +11,7 @@ from typing import Any
 from selfcal.base.errors import few
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.show.chart import Figure, draw
-from selfcal.show.template import render
+from selfcal.show.page_template import render
 from selfcal.studies.paper_figures import section4
 from selfcal.studies.paper_figures.reproduction import Reproduction
 

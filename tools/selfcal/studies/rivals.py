@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich.table import Table
 
-from selfcal.adequacy.document import recording_entry
 from selfcal.adequacy.identify import chosen_axes
+from selfcal.adequacy.identify_document import recording_entry
 from selfcal.bank.blocks import MOST_DENSE
 from selfcal.bank.priors import for_record
 from selfcal.base import units

@@ -68,8 +68,8 @@ def diagnose(
     Under the command a signal ends it within 2 s: what was found so far is reported and written, axes that show nothing
     yet have an error. The caller then ends by `Held().check()`; a second signal ends at once.
     """
-    from selfcal.adequacy.document import of_errors, recording_entry
     from selfcal.adequacy.identify import chosen_axes
+    from selfcal.adequacy.identify_document import of_errors, recording_entry
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.ending import held
     from selfcal.base.output import check_writable, write_json, write_text
@@ -78,7 +78,7 @@ def diagnose(
     from selfcal.batch.verdicts import Limits, add_verdicts, check_options
     from selfcal.diagnosis import hidden
     from selfcal.diagnosis.diagnose import add_carried, add_posteriors, entry_of, events_of, options_given, shared_by
-    from selfcal.diagnosis.document import SCHEMA, to_document
+    from selfcal.diagnosis.diagnose_document import SCHEMA, to_document
     from selfcal.diagnosis.events import add_findings
     from selfcal.diagnosis.extend import check_not_by_hand, extended, left_out, write_extended
     from selfcal.diagnosis.record import of_recording
@@ -169,9 +169,9 @@ def _looked(
     """The look at means, whose findings go to stderr, then at every sample: the record, what the first look found, what
     both found together, and why the other axes have no result."""
     from selfcal.diagnosis import diagnose as looks
+    from selfcal.diagnosis.axis_verdict import joined
     from selfcal.diagnosis.loop import INTERRUPTED
     from selfcal.diagnosis.record import of_recording
-    from selfcal.diagnosis.verdict import joined
 
     first: dict[str, Diagnosed] = {}
     record = of_recording(recording, model, decimate, names)
@@ -201,4 +201,4 @@ def _looked(
     return record, first, diagnosed, errors
 
 
-show = shared.shown_by("show.findings", "details", judged=True)
+show = shared.shown_by("show.diagnosis_lines", "details", judged=True)

@@ -12,7 +12,7 @@ from selfcal.logs.loaders import Reading
 from selfcal.verbs import _shared as shared
 
 if TYPE_CHECKING:
-    from selfcal.batch.files import Named
+    from selfcal.batch.batch_files import Named
     from selfcal.batch.unit_table import Unit
 
 
@@ -147,7 +147,7 @@ def fleet(
 
 def _note(batch: Sequence[Unit]) -> None:
     """Name dates that are left out, and damaged files."""
-    from selfcal.batch.files import DATE_FORM
+    from selfcal.batch.batch_files import DATE_FORM
 
     for unit in batch:
         if unit.undated:
@@ -164,7 +164,7 @@ def _named(
     others: Sequence[Path | str | None],
 ) -> Named:
     """The recordings with their devices. `outputs`, `others`: the run's own files, which are no recordings."""
-    from selfcal.batch.files import sources_of
+    from selfcal.batch.batch_files import sources_of
 
     given = {Path(str(pattern)).resolve() for pattern in patterns}
     own = [[Path(file) for file in files if file is not None] for files in (outputs, others)]

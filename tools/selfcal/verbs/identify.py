@@ -78,8 +78,8 @@ def identify(
     place: {"error": ...}. Raises UserError for what the user can put right, and if no axis has a result.
     """
     from selfcal.adequacy.checks import against
-    from selfcal.adequacy.document import Identified, to_document
     from selfcal.adequacy.identify import chosen_axes, identify_axis, with_reasons
+    from selfcal.adequacy.identify_document import Identified, to_document
     from selfcal.bank.priors import add_sources, for_record
     from selfcal.base.output import check_picture, check_writable, print_line, write_json
     from selfcal.base.progress import bar
@@ -159,16 +159,16 @@ def identify(
 
 
 def _suspect(document: dict[str, Any], recording: Recording, model: Model, names: Sequence[str]) -> dict[str, Look]:
-    """Name the strongest suspicion of each axis in the document: a test of the readings that are not left out, else the
-    look that explains most. The looks by axis."""
+    """Name the strongest suspicion of each axis in the document: a fault of the readings that are not left out, else
+    the look that explains most. The looks by axis."""
     from selfcal.diagnosis.suspicion import suspicions
-    from selfcal.readings.tests import TESTS
+    from selfcal.readings.faults import FAULTS
 
     suspected = suspicions(recording, model, names)
     for name in names:
         axis = document["axes"][name]
         causes = [suspected[name].cause] if name in suspected else []
-        causes += [test.name for test in TESTS if test.name in axis["checks"].keys() - LEFT_OUT]
+        causes += [fault.name for fault in FAULTS if fault.name in axis["checks"].keys() - LEFT_OUT]
         axis |= {"suspicion": causes[-1]} if causes else {}
     return suspected
 

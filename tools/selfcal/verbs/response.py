@@ -37,7 +37,7 @@ def response(
     Returns the document `selfcal.response/1` and writes it to `json`; `plot` is of one input. Raises UserError for what
     the user can put right.
     """
-    from selfcal.adequacy.document import recording_entry
+    from selfcal.adequacy.identify_document import recording_entry
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.diagnosis.diagnose import BELOW_LATTICE
     from selfcal.diagnosis.record import of_recording

@@ -54,9 +54,9 @@ def tumble(
     from selfcal.batch.fail_on import INADEQUATE
     from selfcal.calibration import accelerometer, gyroscope
     from selfcal.calibration.earth import place
-    from selfcal.calibration.rests import MOST, tumble_of
     from selfcal.calibration.tumble_document import document_of
     from selfcal.calibration.tumble_export import FORMS, write
+    from selfcal.calibration.tumble_rests import MOST, tumble_of
     from selfcal.calibration.tumble_show import plot as picture
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model

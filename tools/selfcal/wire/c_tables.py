@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from selfcal import _library32
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
 from selfcal.base.output import whole
-from selfcal.base.templates import of_code
 from selfcal.base.units import factor
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.file import NODES, NOT_HANDLED, Model

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
-from selfcal.base.templates import of_code
 from selfcal.base.units import SENSOR_UNITS, parameter_unit
 from selfcal.model.file import MOST_COLUMNS, MOST_HYPOTHESES
 

@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 
 from selfcal import _firmware, _library32
-from selfcal.bank.result import AxisResult, Estimate
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.base.errors import UserError, called, few, install
 from selfcal.base.units import SENSOR_UNITS, SENSORS
 from selfcal.logs.framelog import LONGEST_FRAME, LONGEST_LINE

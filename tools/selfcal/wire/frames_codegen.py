@@ -14,8 +14,8 @@ from cantools.database.can import Database, Message
 from cantools.database.can.signal import Signal
 from jinja2 import Template
 
+from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError
-from selfcal.base.templates import of_code
 from selfcal.logs.framelog import LONGEST_FRAME
 from selfcal.wire.dbc_file import COLUMNS, COMMON, HYPOTHESES, NODE_IDS, NODES, PLACE_NAMES, REASON, VALUE_BITS, dbc
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, cast
 
 from selfcal.adequacy.checks import Judged
-from selfcal.adequacy.document import Identified, to_document
+from selfcal.adequacy.identify_document import Identified, to_document
 from selfcal.base.ending import Held
 from selfcal.base.errors import UserError
 from selfcal.logs.framelog import FrameLog

@@ -24,13 +24,13 @@ import numpy as np
 from rich.console import Console
 
 from selfcal.adequacy.checks import Judged
-from selfcal.adequacy.document import Identified, as_typed, to_document
 from selfcal.adequacy.identify import Fed, concluded, may_act, with_reasons
+from selfcal.adequacy.identify_document import Identified, as_typed, to_document
 from selfcal.adequacy.one_over_f import with_white
 from selfcal.adequacy.summary import summarize
+from selfcal.bank.axis_result import AxisResult, in_unit
 from selfcal.bank.blocks import usable_blocks
 from selfcal.bank.firmware import Played
-from selfcal.bank.result import AxisResult, in_unit
 from selfcal.bank.subsets import Inclusion, Scored, normal_coefficient
 from selfcal.base.ending import held
 from selfcal.base.errors import OutsidePriors, UserError, called, note

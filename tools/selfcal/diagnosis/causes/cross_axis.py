@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.diagnosis import forms, hidden
+from selfcal.diagnosis import channel_looks, hidden
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, shown, sized
+from selfcal.diagnosis.channel_looks import Channel, form_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
-from selfcal.diagnosis.forms import Channel, form_of
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.joint import WIDTHS, act_apart
@@ -30,7 +30,7 @@ RATE_WINDOWS_S = (0.0, 5.0, 20.0, 60.0, 150.0)
 def looks(state: State, record: Record) -> list[Look]:
     """One look for every other axis."""
     others = {name: values for name, values in record.other_axes(state.axis).items() if np.ptp(values) > 0.0}
-    return forms.look(state, [_channel(record, name, values) for name, values in others.items()])
+    return channel_looks.look(state, [_channel(record, name, values) for name, values in others.items()])
 
 
 def _channel(record: Record, name: str, values: Array) -> Channel:
@@ -148,7 +148,7 @@ def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
     if quantity is not None and quantity.explains(source, names):
         return
     for name in {*names} - {name for name, other, _ in leaks(found) if other == source}:
-        for look in forms.look(free[name], [_channel(record, source, columns[name])])[:1]:
+        for look in channel_looks.look(free[name], [_channel(record, source, columns[name])])[:1]:
             after = free[name].refit(**look.changes)
             found[name].findings.append(Finding(look, 0, free[name], after))
             found[name].state = after
@@ -162,7 +162,7 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> None:
         if all(column.cause == "cross_axis" for column in source.regressors):
             continue
         source, free = without(source, name), without(found[name].state, other)
-        rest = forms.look(free, [_channel(record, other, bridged(source.rest))])
+        rest = channel_looks.look(free, [_channel(record, other, bridged(source.rest))])
         if not any(look.net >= NET_LEAST for look in rest):
             _drop(found[name], other, free)
 
@@ -188,7 +188,7 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
             continue
         axis, source = found[name], found[other]
         free = without(axis.state, other)
-        back = forms.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
+        back = channel_looks.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
         lost = axis.state.best.ln_likelihood - free.best.ln_likelihood
         if back and back[0].gain > lost - ALIKE:  # of the pair that is shown already, the likelier source
             _drop(axis, other, free)
@@ -269,11 +269,11 @@ CAUSE = Cause(
         piece=lambda look, axes, jumps: look.estimate["other"] in axes and look.estimate.get("source") == hidden.ID,
         settle=_settle,
     ),
-    written=Written(entry=_entry, of_column=forms.of_other),
+    written=Written(entry=_entry, of_column=channel_looks.of_other),
     simulated=Simulated(
-        keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **forms.EFFECT_KEYS},
+        keys={"coefficient": Key(lambda s: 0.5, "cross_coefficient"), **channel_looks.EFFECT_KEYS},
         follows=True,
-        of_estimate=forms.of_look,
-        add=lambda keys, channels: forms.added(keys, channels, channels.axes[str(keys["other"])]),
+        of_estimate=channel_looks.of_look,
+        add=lambda keys, channels: channel_looks.added(keys, channels, channels.axes[str(keys["other"])]),
     ),
 )

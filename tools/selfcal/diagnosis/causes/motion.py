@@ -6,7 +6,7 @@ from typing import Any
 
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, counted, shown
 from selfcal.likelihood.state import Look
-from selfcal.readings.motion import Moved, events_of
+from selfcal.readings.moves import Moved, events_of
 
 
 def look_of(moved: Moved) -> Look:

@@ -31,7 +31,7 @@ from selfcal.diagnosis.cause import (
 )
 from selfcal.diagnosis.causes import vibration
 from selfcal.diagnosis.causes.step import ONE_EVENT_S
-from selfcal.diagnosis.forms import SMOOTHING_S
+from selfcal.diagnosis.channel_looks import SMOOTHING_S
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, NEARLY
@@ -40,7 +40,7 @@ from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
-from selfcal.readings.motion import LEVEL
+from selfcal.readings.moves import LEVEL
 
 #: A change of the noise keeps this many samples, and this share of the record, from either end.
 EDGE_SAMPLES, EDGE_SHARE = 20, 1.0 / 200.0

@@ -49,10 +49,10 @@ class Rival:
 RIVALS = {
     rival.name: rival
     for rival in (
-        Rival("library", "selfcal, the library", "library", "library"),
-        Rival("grid", "the bank on a dense grid, own", "grid", "grid"),
-        Rival("allan_slopes", "Allan deviation, slopes read", "allan", "slopes"),
-        Rival("allan_fit", "Allan deviation, weighted fit", "allan", "fit"),
+        Rival("library", "selfcal, the library", "own_bank", "library"),
+        Rival("grid", "the bank on a dense grid, own", "dense_grid", "grid"),
+        Rival("allan_slopes", "Allan deviation, slopes read", "allan_fits", "slopes"),
+        Rival("allan_fit", "Allan deviation, weighted fit", "allan_fits", "fit"),
         Rival("gmwm", "wavelet moments (GMWM)", "wavelets", "gmwm"),
         Rival("autocorrelation", "autocorrelation fit", "autocorrelation", "autocorrelation"),
         Rival("whittle", "spectrum (Whittle) fit", "whittle", "whittle"),

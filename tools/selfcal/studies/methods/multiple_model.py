@@ -13,7 +13,7 @@ import numpy as np
 from filterpy.kalman import KalmanFilter, MMAEFilterBank
 
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.grid import ln_density, ln_limits
+from selfcal.studies.methods.dense_grid import ln_density, ln_limits
 from selfcal.studies.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value
 
 #: Nodes of the drift's parameter and of alpha, each in the middle of a cell of the prior's range.

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from selfcal.adequacy.allan import LONGEST, Terms, overlapping, terms_of
-from selfcal.bank.result import HALF_90
+from selfcal.bank.axis_result import HALF_90
 from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Group, Prior
 from selfcal.model.laws import NAMED

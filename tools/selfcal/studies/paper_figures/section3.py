@@ -13,7 +13,7 @@ from scipy import signal
 
 from selfcal.adequacy.allan import terms_of
 from selfcal.adequacy.drawn import draw, simulate_bank_samples
-from selfcal.bank.result import AxisResult
+from selfcal.bank.axis_result import AxisResult
 from selfcal.base.grid import Array
 from selfcal.batch.spread import Row, spread
 from selfcal.model.file import DEFAULT, Model, settings_of
@@ -21,7 +21,7 @@ from selfcal.model.laws import NAMED
 from selfcal.model.tables import make_tables
 from selfcal.readings.budget import FALSE_ALARM
 from selfcal.show.chart import Band, Curve, Figure, Panel
-from selfcal.studies.methods.allan import curve, fit
+from selfcal.studies.methods.allan_fits import curve, fit
 from selfcal.studies.methods.problem import Problem
 from selfcal.studies.methods.whittle import whittle
 from selfcal.studies.paper_figures.reproduction import Reproduction

@@ -11,14 +11,14 @@ import numpy as np
 
 from selfcal.adequacy.drawn import simulate_bank_samples
 from selfcal.adequacy.summary import NOISIER
-from selfcal.bank.result import HALF_90, AxisResult, Estimate
+from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.base.grid import Array
 from selfcal.logs.recording import as_float, load
 from selfcal.model.file import Model, Prior
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import Tables, make_tables
 from selfcal.show.chart import Band, Curve, Figure, Panel
-from selfcal.studies.methods.allan import fit
+from selfcal.studies.methods.allan_fits import fit
 from selfcal.studies.methods.problem import Problem, Value
 from selfcal.studies.paper_figures.reproduction import Reproduction
 from selfcal.studies.paper_figures.section3 import PAPER, by_chance, over_time

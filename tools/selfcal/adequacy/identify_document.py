@@ -13,7 +13,7 @@ from typing import Any
 from selfcal.adequacy.allan import Sampled
 from selfcal.adequacy.checks import Judged, against, allan_limit
 from selfcal.adequacy.summary import Number
-from selfcal.bank.result import AxisResult, Estimate
+from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.subsets import Scored
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable, short

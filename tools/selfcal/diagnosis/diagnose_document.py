@@ -9,7 +9,7 @@ from copy import deepcopy
 from types import MappingProxyType
 from typing import Any
 
-from selfcal.adequacy.document import recording_entry
+from selfcal.adequacy.identify_document import recording_entry
 from selfcal.base import units as unit_module
 from selfcal.base.ending import Stopped
 from selfcal.base.errors import UserError
