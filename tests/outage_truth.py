@@ -65,7 +65,7 @@ def of_truth(second: Recording, added: Callable[[Floats, Floats], Floats]) -> di
     """Flights with the second record's errors by a filter that is told the truth."""
     time_s = np.arange(second.samples) / second.rate_hz
     errors = second.columns["gx"].values - added(time_s, second.columns["temp"].values)
-    return outage.flights({"gx": outage.Known({"N": N, "K": K}, errors - np.median(errors))})
+    return outage.flights({"gx": outage.KnownAxis({"N": N, "K": K}, errors - np.median(errors))})
 
 
 def stated(cause: str, seed: int, folder: Path) -> dict[str, Mapping[str, Any]] | None:

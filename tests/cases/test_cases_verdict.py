@@ -15,7 +15,7 @@ from scipy.stats import binom, kurtosistest, norm
 
 from selfcal.adequacy.checks import against, kurtosis_at
 from selfcal.base.errors import UserError
-from selfcal.diagnosis.axis_verdict import coherence, joined, look_of
+from selfcal.diagnosis.axis_verdict import coherence, joined_looks, look_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import LEAST, Record
@@ -150,18 +150,18 @@ def test_neither_look_overrules_the_other() -> None:
     sure = Look("ramp", 30.0, 30.0, {}, {"regressors": ()})
     weak = Look("ramp", NET_LEAST + 0.1, NET_LEAST + 0.1, {}, {"regressors": ()})
     none, found = result(random, None), result(random, sure)
-    assert joined(none, found, "stopped") is found
-    assert joined(found, none, "stopped") is found
-    assert joined(none, none, "stopped") is none
+    assert joined_looks(none, found, "stopped") is found
+    assert joined_looks(found, none, "stopped") is found
+    assert joined_looks(none, none, "stopped") is none
     # Two looks cost ln 2.
-    assert joined(none, result(random, weak), "stopped") is none
-    assert joined(result(random, weak), none, "stopped") is not none
+    assert joined_looks(none, result(random, weak), "stopped") is none
+    assert joined_looks(result(random, weak), none, "stopped") is not none
     cut = result(random, None, "stopped")
-    told = joined(cut, found, "stopped")
+    told = joined_looks(cut, found, "stopped")
     assert told is not None
     assert told.findings == found.findings
     assert told.unfinished == "every sample: stopped"
-    assert joined(cut, None, "stopped") is None
+    assert joined_looks(cut, None, "stopped") is None
 
 
 def test_the_allan_deviation_is_the_picture_of_its_statistic() -> None:

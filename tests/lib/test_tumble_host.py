@@ -20,7 +20,7 @@ from tumbled import G0, POSITIONS, draw_part, matrices
 
 from selfcal.calibration import accelerometer
 from selfcal.calibration.earth import Place
-from selfcal.calibration.noise import Noise, Term, drift
+from selfcal.calibration.noise import DriftTerm, Noise, drift
 from selfcal.calibration.tumble_rests import ACCEL, GYRO, PIECES, Rest, Tumble
 
 from conftest import ROOT
@@ -79,7 +79,7 @@ class Drawn:
 
     def noise_of(self, axis: int) -> Noise:
         N, K, sigma_m, alpha = (float(one) for one in self.noise[axis])
-        return Noise(N**2, (Term(K**2), Term(sigma_m**2, alpha)), "")
+        return Noise(N**2, (DriftTerm(K**2), DriftTerm(sigma_m**2, alpha)), "")
 
 
 def drawn(positions: int, seed: int) -> Drawn:

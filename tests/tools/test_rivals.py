@@ -25,7 +25,7 @@ from selfcal.studies import methods as registry
 from selfcal.studies.methods import RIVALS, particles, rao_blackwell
 from selfcal.studies.methods.autocorrelation import covariances
 from selfcal.studies.methods.dual import transition
-from selfcal.studies.methods.ensemble import summary
+from selfcal.studies.methods.ensemble import ensemble_summary
 from selfcal.studies.methods.problem import Floats, Problem, weights
 from selfcal.studies.methods.recursive import update
 from selfcal.studies.methods.steady_state import ln_likelihood
@@ -314,7 +314,7 @@ def test_errors_of_an_ensemble() -> None:
             weight = 0.8 if seed else 0.3
             row |= {"weight.Bayes.random_walk": weight, "weight.Bayes.gauss_markov": 1.0 - weight}
             rows.append(row)
-    entry = next(one for one in summary(rows, group) if one["rival"] == "library")
+    entry = next(one for one in ensemble_summary(rows, group) if one["rival"] == "library")
     assert entry["parameters"]["K"]["rmse_ln"] == pytest.approx(math.sqrt(0.05))
     assert entry["parameters"]["K"]["ratio"] == pytest.approx(math.sqrt(0.05) / 0.2)
     assert entry["parameters"]["K"]["coverage_90"] == 0.5

@@ -25,7 +25,7 @@ from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.blocks import Blocks
 from selfcal.base.grid import SLOPE_STEP, bisected
 from selfcal.model.file import Group
-from selfcal.model.laws import FORGOTTEN, KINDS, Law, named
+from selfcal.model.laws import FORGOTTEN, KINDS, Law, named_law
 from selfcal.model.tables import Tables
 
 _Floats = NDArray[np.float64]
@@ -41,7 +41,7 @@ PER_OCTAVE = 4
 
 
 @dataclass(frozen=True)
-class Terms:
+class AllanTerms:
     """A law at one value of its parameters, per reading: the white noise's `variance` and its correlation `lag1` with
     the reading before, the variance of the walk's `step`, and each Gauss-Markov drift's variance and its bandwidth
     times the interval between readings. An oscillation is the real part of one whose numbers are complex. `lacking`:
@@ -89,12 +89,12 @@ class Terms:
         return np.asarray(power)
 
 
-def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> Terms:
+def allan_terms(law: Law, parameters: Mapping[str, float], dt_s: float, block: int = 1) -> AllanTerms:
     """A law at `parameters` (continuous time, units.py), for readings every `dt_s`, means of `block` samples."""
     drift, second = law.node(parameters)
     variance, lag1 = law.noise(parameters["N"] ** 2 / dt_s, second)
     terms = [KINDS[term.kind].averages(term, dt_s, block) for term in law.sized(drift, second)]
-    return Terms(
+    return AllanTerms(
         variance,
         lag1,
         sum(step for step, _, _ in terms),
@@ -103,7 +103,7 @@ def terms_of(law: Law, parameters: Mapping[str, float], dt_s: float, block: int 
     )
 
 
-def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
+def overlapping_variance(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
     """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading; and which
     windows these are [n - 2 m + 1]. NaN without a window."""
     missing = np.isnan(y)
@@ -114,7 +114,7 @@ def overlapping(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
     return (0.5 * float((u**2).mean()) if u.size else math.nan), whole
 
 
-def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
+def relative_variance(terms: AllanTerms, m: int, whole: NDArray[np.bool_]) -> float:
     """Variance of the overlapping Allan variance over windows `whole`, over its mean squared, under `terms`: normal
     readings have Var = 2 / M^2 sum of Cov(u_k, u_l)^2 / 4."""
     count = int(whole.sum())
@@ -131,34 +131,36 @@ def relative_variance(terms: Terms, m: int, whole: NDArray[np.bool_]) -> float:
 
 
 @dataclass(frozen=True)
-class Fit:
+class AllanFit:
     """The curve of a law whose parameters were estimated from a record, at `m` [t] readings: `allan_variance` [t] at
     the estimate, the `variance` [t] of its logarithm, and the `covariance` [d, d] of the logarithms of the parameters.
     `terms_at`: the terms at other logarithms of the parameters."""
 
-    terms_at: Callable[[_Floats], Terms]
-    terms: Terms
+    terms_at: Callable[[_Floats], AllanTerms]
+    terms: AllanTerms
     allan_variance: _Floats
     variance: _Floats
     covariance: _Floats
 
-    def drawn(self, draws: Mapping[str, _Floats]) -> Iterable[Terms]:
+    def drawn(self, draws: Mapping[str, _Floats]) -> Iterable[AllanTerms]:
         """The terms at each draw [k] of the parameters."""
         return map(self.terms_at, np.log(np.column_stack([*draws.values()])))
 
 
-def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floats], Terms]:
+def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floats], AllanTerms]:
     """The terms of a law at given ln parameters. `white` multiplies the white noise's variance."""
 
-    def terms_at(ln_theta: _Floats) -> Terms:
+    def terms_at(ln_theta: _Floats) -> AllanTerms:
         theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
-        terms = terms_of(of, theta, dt_s, block)
+        terms = allan_terms(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
 
     return terms_at
 
 
-def _slopes(terms_at: Callable[[_Floats], Terms], ln_theta: _Floats, of: Callable[[Terms], _Floats]) -> _Floats:
+def _slopes(
+    terms_at: Callable[[_Floats], AllanTerms], ln_theta: _Floats, of: Callable[[AllanTerms], _Floats]
+) -> _Floats:
     """Derivatives [d, t] of the logarithm of a curve `of` terms [t] in each ln parameter."""
     steps = np.eye(ln_theta.size) * SLOPE_STEP
     sides = [(of(terms_at(ln_theta + step)), of(terms_at(ln_theta - step))) for step in steps]
@@ -188,7 +190,7 @@ def fit_of(
     white: float = 1.0,
     *,
     block: int,
-) -> Fit:
+) -> AllanFit:
     """The curve at `parameters` that `n` readings have determined, with the group's priors. `white` multiplies the
     white noise's variance. A reading is the mean of `block` samples."""
     of = group.laws[law]
@@ -199,7 +201,7 @@ def fit_of(
     jacobian = _slopes(terms_at, ln_estimate, lambda terms: terms.allan_variance(m))
     variance = np.asarray(np.einsum("dt,de,et->t", jacobian, covariance, jacobian))
     terms = terms_at(ln_estimate)
-    return Fit(terms_at, terms, terms.allan_variance(m), variance, np.asarray(covariance, np.float64))
+    return AllanFit(terms_at, terms, terms.allan_variance(m), variance, np.asarray(covariance, np.float64))
 
 
 def lengths(n: int, per_octave: int = 1) -> NDArray[np.int64]:
@@ -225,7 +227,7 @@ def ratio_at(deviations: float, variance: float) -> float:
 
 
 @dataclass(frozen=True)
-class Curve:
+class AllanCurve:
     """Allan deviation of a record of bank readings, and of a law that was identified from it, at `tau_s` [t], s.
 
     `recording` [t] with its `freedom`, the equivalent degrees of freedom of its square under the law; `model` [t] at
@@ -249,7 +251,7 @@ class Curve:
         return self.model * np.sqrt([ratio_at(deviations, variance) for variance in self.left.tolist()])
 
 
-def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> Curve | None:
+def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -> AllanCurve | None:
     """The means of `blocks` (NaN: missing), compared with the most probable law at its posterior medians.
 
     None if there are too few readings.
@@ -270,7 +272,7 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     if n < 2 * LONGEST:
         return None
     y = y - float(np.nanmean(y))
-    rows = [(int(m), *overlapping(y, int(m))) for m in lengths(n, PER_OCTAVE)]
+    rows = [(int(m), *overlapping_variance(y, int(m))) for m in lengths(n, PER_OCTAVE)]
     rows = [entry for entry in rows if int(entry[2].sum()) >= entry[0]]  # gaps leave too few windows
     m = np.array([entry[0] for entry in rows], float)
     recorded = np.array([entry[1] for entry in rows])
@@ -282,7 +284,7 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     ratio = recorded / fit.allan_variance
     curves = [terms.allan_variance(m) for terms in fit.drawn(posterior_draws(estimates, fit.covariance))]
     low, high = np.sqrt(np.quantile(curves, [0.05, 0.95], axis=0)) if m.size else (m, m)
-    return Curve(
+    return AllanCurve(
         m * dt_s,
         np.sqrt(recorded),
         2.0 / own,
@@ -338,7 +340,7 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
     values = values.astype(np.float64)  # its sums of 10^6 and more readings in float32 are off by 1e-4 and more
     n = int(np.isfinite(values).sum())
     parted = np.insert(values - np.nanmean(values), np.flatnonzero(missing_before), np.nan)
-    each = (overlapping(parted, length) for length in m.tolist())  # a mask of all samples each: one at a time
+    each = (overlapping_variance(parted, length) for length in m.tolist())  # a mask of all samples each: one at a time
     variance, count = np.array([(value, whole.sum()) for value, whole in each]).T
     kept = (variance > 0.0) & (count >= m)
     m, deviation = m[kept], np.sqrt(variance[kept])
@@ -352,10 +354,10 @@ def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, 
 def freedom_of(power: float, m: int, n: int) -> float:
     """Equivalent degrees of freedom of the overlapping Allan variance at `m` of `n` readings, as Greenhall & Riley
     (2003) define them, of noise whose variance goes as tau^`power`: -1 white, 0 flicker, 1 a walk."""
-    flicker = named("flicker")
+    flicker = named_law("flicker")
     terms = {
-        -1.0: Terms(1.0),
-        0.0: terms_of(flicker, {"N": 0.0, "B": 1.0, "alpha": 1.0 / m}, 1.0),
-        1.0: Terms(0.0, step=1.0),
+        -1.0: AllanTerms(1.0),
+        0.0: allan_terms(flicker, {"N": 0.0, "B": 1.0, "alpha": 1.0 / m}, 1.0),
+        1.0: AllanTerms(0.0, step=1.0),
     }
     return 2.0 / relative_variance(terms[power], m, np.ones(n - 2 * m + 1, np.bool_))

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
-from selfcal.adequacy.allan import LEFT_LEAST, Curve, curve_of, ratio_at, terms_of
+from selfcal.adequacy.allan import LEFT_LEAST, AllanCurve, allan_terms, curve_of, ratio_at
 from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.blocks import FEWEST, MOST_DENSE, Blocks
 from selfcal.bank.priors import rounded
@@ -42,10 +42,10 @@ class Judged:
     its Allan deviation, None where the record is too short, or too long."""
 
     checks: Mapping[str, Mapping[str, Any]]
-    curve: Curve | None
+    curve: AllanCurve | None
 
 
-def judge(
+def judge_record(
     blocks: Blocks,
     tables: Tables,
     group: Group,
@@ -82,7 +82,7 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
     if tables.block == 1:
         return {}
     medians = {name: estimate.median for name, estimate in result.parameters[result.best].items()}
-    terms = terms_of(group.laws[result.best], medians, tables.dt_s, tables.block)
+    terms = allan_terms(group.laws[result.best], medians, tables.dt_s, tables.block)
     share = terms.lacking / (terms.variance * (1.0 - 2.0 * terms.lag1))
     return {"drift_in_average": {"value": share, "limit": HIDDEN_MOST, "passed": share <= HIDDEN_MOST}}
 
@@ -212,7 +212,7 @@ def coefficients_of(result: AxisResult) -> NDArray[np.float64]:
     return np.array([mean for mean, _ in result.coefficients[result.best]])
 
 
-def allan_checks(curve: Curve) -> dict[str, dict[str, Any]]:
+def allan_checks(curve: AllanCurve) -> dict[str, dict[str, Any]]:
     """Is the record's Allan deviation the model's, at averaging times of 2, 4, 8 ... bank intervals to a fifth of the
     record? `value` is the model's deviation over the record's less 1, `limit` how far on this side it may be, and
     `deviations` by how many standard deviations the record's variance is above the model's.
@@ -231,7 +231,7 @@ def allan_checks(curve: Curve) -> dict[str, dict[str, Any]]:
     return checks
 
 
-def allan_limit(curve: Curve) -> float:
+def allan_limit(curve: AllanCurve) -> float:
     """How many standard deviations an averaging time may be off. All together fail as often as one other check
     (CHECK_LIMIT): a single one counts as outside beyond the limit that makes this so (Bonferroni's). Once one is, every
     one beyond CHECK_LIMIT is named."""

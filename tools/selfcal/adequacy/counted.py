@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from selfcal.adequacy.one_over_f import Beside, Rerun, weigh_law
+from selfcal.adequacy.one_over_f import AddedLaw, Rerun, weigh_law
 from selfcal.bank.axis_result import AxisResult
 from selfcal.model.file import Prior
 from selfcal.model.laws import RATIO_LIMITS
@@ -24,7 +24,7 @@ SURE_ODDS = 100.0
 MATTERS = 0.5
 
 
-def weigh_counted(lattice: Lattice | None, result: AxisResult, rerun: Rerun) -> Beside | None:
+def weigh_counted(lattice: Lattice | None, result: AxisResult, rerun: Rerun) -> AddedLaw | None:
     """White noise with quantization noise, where the lattice of the readings makes that possible and N would change.
     None elsewhere, and where the remainders are not white."""
     tables = rerun.tables

@@ -20,7 +20,7 @@ from selfcal.base.errors import UserError
 from selfcal.base.grid import block_means, half_means
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, Shape
-from selfcal.likelihood.fit import ROUGH_FTOL, finish
+from selfcal.likelihood.fit import ROUGH_FTOL, fit_at
 from selfcal.likelihood.state import MEANS_MOST, NET_LEAST, SCREEN, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
@@ -83,7 +83,7 @@ def _check(
         full, *smaller = (
             max(float(state.scores([shape.columns], fit.shrunk(by))[0]) for fit in state.fits) for by in SIZES
         )
-        none = finish(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
+        none = fit_at(state.series, state.best.terms, state.best.shrunk(1e3).theta)  # within its limits
         drifts = state.best.ln_likelihood > none.ln_likelihood + CLEARLY
         worth = worth if drifts and max(smaller) > full + CLEARLY else 0.0
     passed = {"value": worth, "limit": NET_LEAST, "passed": worth <= NET_LEAST, "deviations": math.sqrt(2.0 * worth)}

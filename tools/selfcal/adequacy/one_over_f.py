@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.allan import LONGEST, fit_of, posterior_draws, terms_of
+from selfcal.adequacy.allan import LONGEST, allan_terms, fit_of, posterior_draws
 from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.priors import MOST_INTERVALS, NARROW
 from selfcal.base.errors import UserError
@@ -49,13 +49,13 @@ def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
     whole = float((passed / image).sum())  # 1 / (2 pi f), f per interval
     law = NAMED[FLICKER]
     own = [
-        float(terms_of(law, {"N": 0.0, "B": 1.0, "alpha": bandwidth}, dt_s, block).spectrum(np.array(_OMEGA)))
+        float(allan_terms(law, {"N": 0.0, "B": 1.0, "alpha": bandwidth}, dt_s, block).spectrum(np.array(_OMEGA)))
         for bandwidth in alpha.tolist()
     ]
     return np.asarray(dt_s * (whole - np.array(own)))
 
 
-def white_of(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floats:
+def white_beside(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floats:
     """N [k] next to 1/f noise, of draws [k] of the parameters of the law `flicker`."""
     square = draws["N"] ** 2
     left = square - density_above(draws["alpha"], dt_s, block) * draws["B"] ** 2
@@ -77,7 +77,7 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
         return result
     fit = fit_of(FLICKER, medians, group, dt_s, n, np.ones(1), block=block)
     draws = posterior_draws(estimates, fit.covariance)
-    white = white_of(draws, dt_s, block)
+    white = white_beside(draws, dt_s, block)
     low, middle, high = np.quantile(white, (0.05, 0.5, 0.95)).tolist()
     identified = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
     own = Estimate(float(white.mean()), middle, float(white.std()), low, high, identified, estimates["N"].off_grid)
@@ -85,7 +85,7 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
 
 
 @dataclass(frozen=True)
-class Beside:
+class AddedLaw:
     """A `law` added to a model's laws: its probability among them, and its posterior of `n` means over `block` samples,
     one every `dt_s`, under the priors of `group`."""
 
@@ -118,7 +118,7 @@ class Rerun:
     offset: float = 0.0
 
 
-def weigh(rerun: Rerun) -> Beside | None:
+def weigh(rerun: Rerun) -> AddedLaw | None:
     """The law `flicker` with the prior odds of an average law of the tables. None where the tables have the law, no
     room for it, or no result."""
     tables, group, samples = rerun.tables, rerun.group, rerun.samples
@@ -133,7 +133,7 @@ def weigh(rerun: Rerun) -> Beside | None:
     return weigh_law(FLICKER, own, 1.0, replace(rerun, tables=tables))
 
 
-def weigh_law(name: str, priors: Mapping[str, Prior], odds: float, rerun: Rerun) -> Beside | None:
+def weigh_law(name: str, priors: Mapping[str, Prior], odds: float, rerun: Rerun) -> AddedLaw | None:
     """A named law of two drift parameters as weigh() has it, with `priors` of its own. `odds`: over an average law."""
     from selfcal.bank.library import Bank
 
@@ -155,4 +155,4 @@ def weigh_law(name: str, priors: Mapping[str, Prior], odds: float, rerun: Rerun)
         return None
     if not math.isfinite(result.probability[name]):
         return None
-    return Beside(result.probability[name], result.parameters[name], own, tables.dt_s, result.n, tables.block, name)
+    return AddedLaw(result.probability[name], result.parameters[name], own, tables.dt_s, result.n, tables.block, name)

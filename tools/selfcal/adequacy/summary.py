@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.allan import DRAWS, LONGEST, PER_OCTAVE, Terms, fit_of, posterior_draws
-from selfcal.adequacy.one_over_f import FLICKER, SURE, Beside, white_of
+from selfcal.adequacy.allan import DRAWS, LONGEST, PER_OCTAVE, AllanTerms, fit_of, posterior_draws
+from selfcal.adequacy.one_over_f import FLICKER, SURE, AddedLaw, white_beside
 from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
@@ -50,7 +50,7 @@ ONE_OVER_F = "the drift is 1/f noise"
 
 
 @dataclass(frozen=True)
-class Number:
+class SheetNumber:
     """One of the numbers. `reason`: why it is not identified, else ""; its 95 % quantile is then an upper limit."""
 
     estimate: Estimate
@@ -63,9 +63,9 @@ def summarize(
     dt_s: float,
     n: int,
     block: int,
-    beside: Beside | None = None,
-    counted: Beside | None = None,
-) -> dict[str, Number]:
+    beside: AddedLaw | None = None,
+    counted: AddedLaw | None = None,
+) -> dict[str, SheetNumber]:
     """The numbers of an axis by their keys (arw, rrw, bias_instability, and quantization_noise where there is any), in
     the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
     record is too short for an Allan deviation. `beside`: 1/f noise, added to the laws of the result. `counted`:
@@ -75,7 +75,7 @@ def summarize(
     more = 0.0 if beside is None else beside.probability
     left = 1.0 if counted is None else 1.0 - counted.probability
     laws = [
-        Beside(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
+        AddedLaw(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
         if probability >= _LEAST  # of the model's, whatever is added to them
     ]
@@ -130,7 +130,7 @@ def summarize(
         most = [end for end in ends if math.isfinite(end)]
         if (w_walk * walk > 0.0).any():
             most.append(_number(walk, np.where(walk > 0.0, w_walk, 0.0) / w_walk[walk > 0.0].sum()).estimate.q95)
-        numbers["rrw"] = _without(Number(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
+        numbers["rrw"] = _without(SheetNumber(replace(rrw, q95=max(most, default=group.priors["K"].min))), why)
     if float(w[side == 0].sum()) < _SURE:
         reason = BELOW if float(w[side < 0].sum()) > float(w[side > 0].sum()) else NO_MINIMUM
         numbers["bias_instability"] = _without(numbers["bias_instability"], reason)
@@ -139,11 +139,11 @@ def summarize(
     return numbers
 
 
-def _identified(law: Beside) -> list[str]:
+def _identified(law: AddedLaw) -> list[str]:
     return [name for name, estimate in law.estimates.items() if estimate.identified]
 
 
-def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
+def _draws(beside: AddedLaw) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
     """Draws of a law's posterior [k] each: white noise, walk (0: none), Q, the first minimum of the Allan deviation,
     and where it is."""
     law, group, dt_s, n, block = beside.law, beside.group, beside.dt_s, beside.n, beside.block
@@ -152,7 +152,7 @@ def _draws(beside: Beside) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]
     fit = fit_of(law, medians, group, dt_s, n, m, block=block)
     draws = posterior_draws(beside.estimates, fit.covariance)
     if law == FLICKER:
-        white, floor = white_of(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
+        white, floor = white_beside(draws, dt_s, block), draws["B"] * units.FLICKER_FLOOR
         side = (white**2 / (0.5 * n * dt_s) > floor**2).astype(float)  # below the white noise everywhere
     else:
         lowest = [_minimum(terms, m) for terms in fit.drawn(draws)]
@@ -211,7 +211,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     return {name: rest_s(name) for name in open_}
 
 
-def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
+def _minimum(terms: AllanTerms, m: _Floats) -> tuple[float, int]:
     """The first minimum of the Allan deviation at `m` readings, and 0; where none lies inside, the lowest value
     with -1 (it rises from the first on) or 1 (it falls to the last)."""
     variance = terms.allan_variance(m)
@@ -220,15 +220,15 @@ def _minimum(terms: Terms, m: _Floats) -> tuple[float, int]:
     return math.sqrt(max(0.0, float(variance[lowest]))), 0 if inside.size else (-1 if lowest == 0 else 1)
 
 
-def _number(values: _Floats, weight: _Floats) -> Number:
+def _number(values: _Floats, weight: _Floats) -> SheetNumber:
     """Mean, sd and quantiles of weighted draws."""
     order = np.argsort(values, kind="stable")
     values, weight = values[order], weight[order]
     mean = float(weight @ values)
     sd = math.sqrt(max(0.0, float(weight @ (values - mean) ** 2)))
     low, middle, high = weighted_quantiles(values, weight, (0.05, 0.5, 0.95)).tolist()
-    return Number(Estimate(mean, middle, sd, low, high, identified=True))
+    return SheetNumber(Estimate(mean, middle, sd, low, high, identified=True))
 
 
-def _without(number: Number, reason: str) -> Number:
-    return Number(replace(number.estimate, identified=False), reason)
+def _without(number: SheetNumber, reason: str) -> SheetNumber:
+    return SheetNumber(replace(number.estimate, identified=False), reason)

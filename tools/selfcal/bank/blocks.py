@@ -53,7 +53,7 @@ def usable_blocks(
     """block_means() of float32 samples [n] and columns [n, p]. Raises UserError if no report can come of them.
     `counted`: the samples kept out by reason, from those that the averaging knows."""
     z = None if columns is None else columns.astype(np.float64)
-    blocks = block_means(samples, missing_before, tables.block, group, z)
+    blocks = blocks_of(samples, missing_before, tables.block, group, z)
     blocks = replace(blocks, kept_out=counted(blocks.kept_out))
     present = blocks.mean[np.isfinite(blocks.mean)]
     needed = _library32.REPORT_MIN + len(tables.regressors)
@@ -98,7 +98,7 @@ def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDAr
     return {"not_finite": ~finite, "saturated": saturated, "stuck": stuck}
 
 
-def block_means(
+def blocks_of(
     samples: NDArray[np.floating[Any]],
     missing_before: NDArray[np.int64],
     block: int,

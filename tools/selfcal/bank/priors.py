@@ -69,7 +69,7 @@ def for_record(model: Model, recording: Recording, axes: Sequence[str]) -> Model
     for name in axes:
         with suppress(UserError):  # of another kind, or without a sample: said where the axis is read
             group, seen = model.group_of(name), at_rest(recording, name, model)
-            if seen is None or known(group):
+            if seen is None or noise_is_known(group):
                 continue
             laid_out = about(group, seen) if outside(group, seen) else dict(group.priors)
             moved = moved_along(model, recording, name, laid_out, seen)
@@ -175,7 +175,7 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
     return Seen(level, *(np.array(column) for column in zip(*rows, strict=True)))
 
 
-def known(group: Group) -> bool:
+def noise_is_known(group: Group) -> bool:
     """Whether the limits of N are knowledge of the part."""
     return group.priors["N"].max < NARROW * group.priors["N"].min
 
@@ -184,7 +184,7 @@ def outside(group: Group, seen: Seen) -> bool:
     """Whether a resting axis lies outside the priors of its group: its noise, its drift or its level. Never of a group
     whose N is known."""
     N = group.priors["N"]
-    if known(group):
+    if noise_is_known(group):
         return False
     # Two sd of ln N beyond a limit: 1.2 over sqrt(n) each.
     margin = math.exp(2.0 * 1.2 / math.sqrt(float(seen.differences[0])))

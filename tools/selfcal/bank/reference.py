@@ -56,7 +56,7 @@ class _Posterior:
     var: _Floats
 
 
-def identify_axis(
+def reference_axis(
     y: _Floats,
     dt: float,
     group: Group,

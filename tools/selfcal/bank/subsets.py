@@ -42,7 +42,7 @@ class Inclusion:
 
 
 @dataclass(frozen=True)
-class Scored:
+class ScoredSubsets:
     """All subsets of the regressors weighed together.
 
     `result`: probabilities, evidence and bias over all subsets; parameters of each law are those of its most probable
@@ -58,7 +58,7 @@ class Scored:
 
 def combine(
     choices: Sequence[Choice], results: Sequence[AxisResult], hypotheses: Mapping[str, float], unit: str
-) -> Scored:
+) -> ScoredSubsets:
     """Weigh the subsets by their evidence; `unit` is that of the axis. At least one must have evidence."""
     from scipy.special import logsumexp
 
@@ -95,7 +95,7 @@ def combine(
                     parts.append((of_choice[i], *widest))
             coefficients.append(_coefficient(column, coefficient_unit(unit, regressor.unit), np.array(parts)))
         inclusion[regressor.name] = Inclusion(float(of_choice[having].sum()), tuple(coefficients))
-    return Scored(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
+    return ScoredSubsets(combined, inclusion, tuple(choices), tuple(of_choice.tolist()), int(np.argmax(of_choice)))
 
 
 def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coefficient:

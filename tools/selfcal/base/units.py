@@ -228,7 +228,7 @@ def factor(unit: str, to: str) -> float:
     return source.size / target.size
 
 
-def convert(value: _Value, unit: str, to: str) -> _Value:
+def converted(value: _Value, unit: str, to: str) -> _Value:
     """`value` (any shape) of `unit` in `to`, unchanged if alike; temperatures as points on their scales. Raises
     UserError as `factor`."""
     scale = factor(unit, to)

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from selfcal.base import units as unit_module
 from selfcal.base.grid import Array
-from selfcal.batch.batch_summary import Batch, group_lines, plain, seen_from_words, unidentified_lines
+from selfcal.batch.batch_summary import Batch, group_lines, plain_interval, seen_from_words, unidentified_lines
 from selfcal.batch.population import Population
 from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, draw
 from selfcal.show.page_template import render
@@ -33,7 +33,7 @@ KINDS = {
 INDIVIDUALS, RANGES = 2.66, 3.267
 
 
-def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> str:
+def fleet_html(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) -> str:
     """The page of the document `selfcal.fleet/1` and the batch that it is made of. `pages`: where the own page of a
     device is, from this page's folder on."""
     marked = _marked(batch)
@@ -46,7 +46,7 @@ def page(document: Mapping[str, Any], batch: Batch, pages: Mapping[str, str]) ->
         "commands": {name: f"selfcal diagnose {shlex.quote(path)} --report page.html" for name, path in paths.items()},
         "groups": list(group_lines(batch)),
         "populations": batch.populations,
-        "plain": plain,
+        "plain": plain_interval,
         "seen_from": seen_from_words,
         "unidentified": list(unidentified_lines(batch)),
         "distributions": _drawn(_histogram(population, document["limits"]) for population in histograms),

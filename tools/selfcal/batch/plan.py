@@ -23,7 +23,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.adequacy.allan import information_of, terms_of
+from selfcal.adequacy.allan import allan_terms, information_of
 from selfcal.adequacy.drawn import has_nodes, simulate_bank_samples
 from selfcal.adequacy.summary import MOST_TIMES
 from selfcal.bank.axis_result import HALF_90
@@ -38,7 +38,7 @@ from selfcal.diagnosis.simulate import truth_of
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import made
 from selfcal.model.laws import PLACES, Law
-from selfcal.model.regressors import channels_of, offered, sources_of
+from selfcal.model.regressors import channels_of, column_sources, offered
 from selfcal.model.tables import make_tables
 from selfcal.show.plot import COLORS
 
@@ -116,7 +116,7 @@ def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
     """float64[n]: the column that a channel [n] at this rate makes. The window of a rate is of whole intervals."""
     if regressor.kind == "rate":
         regressor = replace(regressor, window_s=max(1, round(regressor.window_s * rate_hz)) / rate_hz)
-    return made(sources_of(regressor, channels_of((regressor,))), 1.0 / rate_hz, channel[:, None])[:, 0]
+    return made(column_sources(regressor, channels_of((regressor,))), 1.0 / rate_hz, channel[:, None])[:, 0]
 
 
 def bracket(lacks: Callable[[int], bool], least: int) -> tuple[int, int | None]:
@@ -133,7 +133,7 @@ def bracket(lacks: Callable[[int], bool], least: int) -> tuple[int, int | None]:
     return low, high
 
 
-class Ensemble:
+class PlannedRecords:
     """The records at each length that was asked for: metrics [records, wishes], NaN where a wish is not of the law."""
 
     def __init__(
@@ -208,7 +208,8 @@ def cycling(
         omega = np.array([2.0 * math.pi * cycles / samples])
         one_swing = column_of(regressor, swung(samples, cycles, 1.0), model.bank_rate_hz)
         power = [
-            float(terms_of(bare.laws[law], truth, 1.0 / model.bank_rate_hz).spectrum(omega)[0]) for law, truth in parts
+            float(allan_terms(bare.laws[law], truth, 1.0 / model.bank_rate_hz).spectrum(omega)[0])
+            for law, truth in parts
         ]
         swing = math.sqrt(float(np.quantile(power, SHARE)) * max(needed, 0.0) / (samples * float(one_swing.var())))
         if swing > 0.0:
@@ -356,7 +357,7 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
     print_lines(_lines(document), to_stderr=to_stderr)
 
 
-def steady(curve: Sequence[Mapping[str, float]]) -> float | None:
+def steady_level(curve: Sequence[Mapping[str, float]]) -> float | None:
     """What nine records of ten keep at the longest length, if half of that length has it too, but for ALIKE."""
     longest = curve[-1]
     half = [point for point in curve if point["duration_s"] <= 0.5 * longest["duration_s"]]
@@ -379,7 +380,7 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         there = wish["duration_s"]
         said = "no length that can be simulated suffices" if there is None else f"record {duration_words(there)}"
         lines.append(f"{wish['wish']}: {_swings(wish) if 'cycling' in wish else said}")
-        if wish["wish"].startswith("bias") and (least := steady(wish["curve"])):
+        if wish["wish"].startswith("bias") and (least := steady_level(wish["curve"])):
             lines.append(f"  nine of ten such parts know it within {least:.2g} at any length: longer does not help")
         for rate in document["rates"]:
             times = math.nan if there is None or rate["wish"] != wish["wish"] else rate["duration_s"] / there

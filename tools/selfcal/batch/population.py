@@ -70,7 +70,7 @@ class Interval:
 
 
 @dataclass(frozen=True)
-class Fit:
+class PopulationFit:
     """A population: spreads `t` [p] with weights, mean and its variance at each."""
 
     t: Array
@@ -103,10 +103,10 @@ class Fit:
         return _tail(self.weight, (y[:, None] - self.mean) / sd)
 
 
-def fit(y: Array, s: Array) -> Fit:
+def fit_population(y: Array, s: Array) -> PopulationFit:
     """The population of measured `y` [n] with errors `s` [n]."""
     t, weight, mean, variance = _on_grid(y, s, np.ones((1, y.size), np.bool_))
-    return Fit(t, weight, mean[0], variance[0])
+    return PopulationFit(t, weight, mean[0], variance[0])
 
 
 def _on_grid(y: Array, s: Array, sides: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
@@ -170,7 +170,7 @@ class Population:
     `offset` [n] of each unit by its groups. `seen_from`: how far off a unit with the usual error is unlike."""
 
     measured: Measured
-    fit: Fit
+    fit: PopulationFit
     offset: Array
     kept: NDArray[np.bool_]
     seen_from: float
@@ -269,14 +269,14 @@ def _population(measured: Measured, apart: Sequence[Apart], others: Set[int], li
         own = ~np.isin(measured.at, list(others))
         if own.sum() < FEWEST:
             own[:] = True
-        own |= fit(centred[own], measured.s[own]).log_p(centred, measured.s) > math.log(0.01)
+        own |= fit_population(centred[own], measured.s[own]).log_p(centred, measured.s) > math.log(0.01)
         kept = own.copy()
         kept[own] = _kept(centred[own], measured.s[own], limit)
         split = None if apart and apart[-1].kind == TWO_GROUPS else _split(measured, centred, kept)
         if split is None:
             break
         apart.append(split)
-    population = fit(centred[kept], measured.s[kept])
+    population = fit_population(centred[kept], measured.s[kept])
     log_p = population.log_p(centred, measured.s)
     off = centred - population.middle.median
     unlike = [
@@ -291,7 +291,7 @@ def _seen_from(y: Array, s: Array, limit: float) -> float:
     """How far off a unit is unlike, at ln probability `limit`, by all others of the population `y` [n]: the unit that
     is odd makes them one fewer, so the unit nearest to their mean leaves."""
     fewer = np.arange(y.size) != int(np.argmin(np.abs(y - np.median(y))))
-    others = fit(y[fewer], s[fewer])
+    others = fit_population(y[fewer], s[fewer])
     error = float(np.median(s))
     off = math.hypot(others.spread.median, error) * np.geomspace(0.5, 500.0, 400)
     log_p = others.log_p(others.middle.median + off, np.full(off.size, error))
@@ -305,7 +305,7 @@ def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
     most = min(math.ceil(MOST_ODD * y.size), y.size - FEWEST)
     for k in sorted({round(count) for count in np.geomspace(1.0, max(most, 1), _TRIED)} if most > 0 else [])[::-1]:
         rest = order[k:]
-        others = fit(y[rest], s[rest])
+        others = fit_population(y[rest], s[rest])
         if others.log_p(y[order[k - 1 : k]], s[order[k - 1 : k]])[0] <= limit:
             kept: NDArray[np.bool_] = others.log_p(y, s) > limit
             kept[rest] = True

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from selfcal.base.errors import MOST_NAMED, UserError, first_line
 from selfcal.batch.spread import Job, Kept, Row, spread
-from selfcal.batch.unit_table import Unit
+from selfcal.batch.unit_table import BatchUnit
 from selfcal.readings.faults import FAULTS
 
 #: Keys kept of an axis of `identify`, and of an axis of `diagnose`.
@@ -82,7 +82,7 @@ def _record(verbs: Verbs, options: Options, path: str) -> Row:
 def own_pages(
     folder: Path | str,
     names: Sequence[str],
-    devices: Mapping[str, Sequence[Unit]],
+    devices: Mapping[str, Sequence[BatchUnit]],
     verbs: Verbs,
     options: Options,
     kept: Kept,
@@ -133,7 +133,7 @@ def _looks(axis: Mapping[str, Any]) -> dict[str, Any]:
     return {"marks": list(dict.fromkeys(marks)), **stated}
 
 
-def settings_of(options: Options, model: str, version: str) -> dict[str, Any]:
+def record_settings(options: Options, model: str, version: str) -> dict[str, Any]:
     """All that decides a record apart from its recording; `model`: its content."""
     kept = [*IDENTIFIED, *DIAGNOSED]
     return {"schema": "selfcal.fleet/1", "kept": kept, **asdict(options), "model": model, "version": version}

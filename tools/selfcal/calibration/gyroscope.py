@@ -25,7 +25,7 @@ from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.calibration import accelerometer
 from selfcal.calibration.accelerometer import ANGLE_SD, NONE, SCALE_SD, Accelerometer, forces, means_covariance, shaped
 from selfcal.calibration.noise import drift
-from selfcal.calibration.tumble_fit import Fit, Problem
+from selfcal.calibration.tumble_fit import Problem, TumbleFit
 from selfcal.calibration.tumble_rests import GYRO, Tumble, Turn
 
 #: Stated priors, sd: bias, rad/s (10 deg/s); g-sensitivity, rad/s/g (0.1 deg/s/g); temperature coefficient,
@@ -49,7 +49,7 @@ PLACES = ((0, 1), (0, 2), (1, 0), (1, 2), (2, 0), (2, 1))
 class Gyroscope:
     """The answer: its fit, of which the first `of_accel` parameters are the accelerometers', and the turns."""
 
-    fit: Fit
+    fit: TumbleFit
     of_accel: int
     turns: tuple[Turn, ...]
 

@@ -38,7 +38,7 @@ class Whole:
     lines: tuple[str, ...]
 
 
-def write(
+def write_calibration(
     form: str, path: Path | str, accel: Accelerometer, gyro: Gyroscope | None, document: Mapping[str, Any]
 ) -> None:
     """Write a file in one of FORMS. Raises UserError where the bias or scale of an axis is not identified."""

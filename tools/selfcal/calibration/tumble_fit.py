@@ -30,7 +30,7 @@ WIDER: float = _library32.TUMBLE_WIDER
 
 
 @dataclass(frozen=True)
-class Fit:
+class TumbleFit:
     """Parameters `theta` [n] with their covariance [n, n], and the `prior` covariance [n, n] that they are held by.
     `white` [m] are the residuals and `columns` [m, n] their derivatives, both in units of their noise; `root` [m, m]
     scales them: it is the factor of their covariance. `pulled`: the prior's part of the sum of squares. `step`
@@ -110,8 +110,8 @@ class Fit:
         return [(said, min(1.0, p)) for p, _, said in sorted(ranked) if p < FALSE_ALARM]
 
 
-def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
-    """The problem at parameters, as `fit` has it. Raises UserError."""
+def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: Mask | None = None) -> TumbleFit:
+    """The problem at parameters, as `fit_tumble` has it. Raises UserError."""
     free = np.ones(theta.size, bool) if held is None else ~held
     block = np.ix_(free, free)
     unit = np.sqrt(np.diag(prior))[free]
@@ -132,10 +132,12 @@ def linearized(problem: Problem, theta: Array, mean: Array, prior: Array, held: 
     pull = own.T @ white + inverse @ apart
     moved = -covariance @ pull
     step[free] = moved * unit
-    return Fit(theta, whole, prior, white, columns, root, float(apart @ inverse @ apart), step, float(-moved @ pull))
+    return TumbleFit(
+        theta, whole, prior, white, columns, root, float(apart @ inverse @ apart), step, float(-moved @ pull)
+    )
 
 
-def fit(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None) -> Fit:
+def fit_tumble(problem: Problem, start: Array, mean: Array, prior: Array, held: Mask | None = None) -> TumbleFit:
     """The likeliest parameters [n] under a normal prior of `mean` [n] and covariance `prior` [n, n]. Those `held` [n]
     stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
     Raises UserError where none settles."""

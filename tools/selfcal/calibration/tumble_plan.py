@@ -52,7 +52,7 @@ _WISH = re.compile(r"\s*(\S.*?)\s+within\s+([0-9.]+(?:e-?\d+)?)\s*(\S+)\s*", re.
 
 
 @dataclass(frozen=True)
-class Wish:
+class TumbleWish:
     """Half of the 90 % interval of every parameter of a group `name` is at most `most`, in SI units."""
 
     text: str
@@ -60,7 +60,7 @@ class Wish:
     most: float
 
     @staticmethod
-    def of(text: str) -> Wish:
+    def of(text: str) -> TumbleWish:
         """A wish as `scale within 100 ppm`. Raises UserError."""
         match = _WISH.fullmatch(text)
         known = ", ".join(WISHES)
@@ -74,12 +74,12 @@ class Wish:
                 raise UserError(f"--want '{text}': a scale is in ppm or %")
             size = float(match[2]) * sizes[unit]
         elif units.known(unit) and units.same_kind(unit, own):
-            size = units.convert(float(match[2]), unit, own)
+            size = units.converted(float(match[2]), unit, own)
         else:
             raise UserError(f"--want '{text}': {match[1]} is in {own}, which {unit} cannot be converted to")
         if not size > 0.0:
             raise UserError(f"--want '{text}': the size must be above 0")
-        return Wish(text, match[1], size)
+        return TumbleWish(text, match[1], size)
 
 
 def reached(model: Model, count: int, length_s: float) -> dict[str, float]:
@@ -128,7 +128,7 @@ def _of_placement(noise: dict[str, Noise], readings: Array, length_s: float) -> 
 
 def plan_of(model: Model, texts: Sequence[str]) -> dict[str, Any]:
     """The document: by count of rests the shortest of LENGTHS_S that meets all wishes, None for none of them."""
-    wishes = [Wish.of(text) for text in texts]
+    wishes = [TumbleWish.of(text) for text in texts]
     rows = []
     for count in POSITIONS:
         for length_s in LENGTHS_S:

@@ -13,8 +13,8 @@ from scipy.stats import chi2
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array, Mask, block_means, runs
 from selfcal.base.units import factor
-from selfcal.calibration.noise import LONG_S, Noise, drift, measured, of_model, of_rest, rounding
-from selfcal.calibration.tumble_fit import Fit, Problem, fit, linearized
+from selfcal.calibration.noise import LONG_S, Noise, drift, measured_noise, of_model, of_rest, rounding_variance
+from selfcal.calibration.tumble_fit import Problem, TumbleFit, fit_tumble, linearized
 from selfcal.logs.recording import Recording, bridged, check_column
 from selfcal.model.file import Model
 from selfcal.readings.lattice import step_of
@@ -96,7 +96,7 @@ class Tumble:
     def fitted(
         self, names: Sequence[str], problem_of: Callable[[Tumble], Problem], start: Array, mean: Array, prior: Array,
         held: Mask | None = None,
-    ) -> tuple[Fit, Tumble]:  # fmt: skip
+    ) -> tuple[TumbleFit, Tumble]:  # fmt: skip
         """The fit, and the tumble with the wide drift of axes as this log has it: posterior means of the variances of
         its terms. Before, each term by itself is as likely, and its deviation uniform. A prior of its logarithm would
         be decided by the least of SHARES, which no log contradicts (Gelman 2006). A rest in which the mount moved is
@@ -104,7 +104,7 @@ class Tumble:
         weighed, count = self, self.wide(names)
         if count:
             middle = self.with_drift(names, np.full(count, SHARES[SHARES.size // 2]))
-            start = fit(problem_of(middle), start, mean, prior, held).theta
+            start = fit_tumble(problem_of(middle), start, mean, prior, held).theta
             tried = [[self.with_drift(names, share * term) for share in SHARES] for term in np.eye(count)]
             within = np.array([[tumble.within(names) for tumble in row] for row in tried])
             likely = np.maximum(within - within.max(axis=(0, 1)), -RESTLESS).sum(axis=2)
@@ -112,7 +112,7 @@ class Tumble:
             likely += [[linearized(p, start, mean, prior, held).evidence for p in row] for row in problems]
             weight = np.sqrt(SHARES) * np.exp(likely - likely.max())
             weighed = self.with_drift(names, weight @ SHARES / weight.sum())
-        return fit(problem_of(weighed), start, mean, prior, held), weighed
+        return fit_tumble(problem_of(weighed), start, mean, prior, held), weighed
 
     def _pieces(self, names: Sequence[str]) -> Iterator[tuple[int, Array, Array]]:
         """Number, pieces [PIECES] and their covariance, less their common part, of each rest and axis."""
@@ -279,7 +279,7 @@ def _noise(logs: Sequence[_Log], name: str, model: Model, long_rest: Recording |
     for log in logs:
         size = max(1, round(PIECE_S * log.recording.rate_hz))
         pieces += [block_means(log.whole[name][rows], size) for rows in log.rests]
-    white = measured(pieces, PIECE_S)
+    white = measured_noise(pieces, PIECE_S)
     return of_model(model, name, UNITS[name], None if white is None else math.sqrt(white))
 
 
@@ -318,7 +318,7 @@ def _rest(number: int, log: _Log, rows: slice) -> Rest:
     for name in ACCEL + GYRO:
         step = log.steps.get(name, 0.0)
         scatter = float(np.var(log.whole[name][rows])) if name in own else 0.0
-        rounded.append(rounding(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
+        rounded.append(rounding_variance(step, math.sqrt(max(scatter - step**2 / 12.0, 0.0))))
     begin, end = float(time[rows.start]), float(time[rows.stop - 1]) + 1.0 / recording.rate_hz
     return Rest(
         number,

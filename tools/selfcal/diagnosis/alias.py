@@ -19,7 +19,7 @@ WANDERS = 0.02
 LEAST = 10.0
 
 
-def of_readings(
+def alias_of(
     recording: Recording, axis: str, frequency_hz: float, half_width_hz: float, rate_hz: float
 ) -> tuple[float, float] | None:
     """Frequency, Hz, and amplitude, in the recording's unit, of the line of an axis that makes one of `frequency_hz` in

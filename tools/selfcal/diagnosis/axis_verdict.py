@@ -62,7 +62,7 @@ def of_checks(checks: Mapping[str, Mapping[str, Any]]) -> Look | None:
     return None
 
 
-def joined(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted: str) -> Diagnosed | None:
+def joined_looks(every_sample: Diagnosed | None, means: Diagnosed | None, interrupted: str) -> Diagnosed | None:
     """The result of an axis by two looks, of which each may be missing: neither overrules the other.
 
     Every sample has the causes, if that look ended or has any. Where it shows none, the means of 1 s have them, at the

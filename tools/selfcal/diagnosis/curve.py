@@ -19,7 +19,7 @@ from selfcal.likelihood import columns
 from selfcal.likelihood.columns import SMALLER, Shape, Tried
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.fit import left as left_of
-from selfcal.likelihood.state import ABREAST, NET_LEAST, Look, Regressor, State, net
+from selfcal.likelihood.state import ABREAST, NET_LEAST, FittedColumn, Look, State, net
 from selfcal.likelihood.statemodel import Array
 
 #: Knots of the splines, even over the channel's range.
@@ -114,7 +114,7 @@ def _picked(state: State, fit: Fit, terms: Array) -> list[int]:
 def _as_one(
     state: State,
     found: Tried,
-    column: Regressor,
+    column: FittedColumn,
     means: Array,
     places: Sequence[float] | Array,
     heights: Sequence[float] | Array,
@@ -148,7 +148,7 @@ def trained(look: Look, before: State, after: State, record: Record, split: int)
     return after.refit(regressors=(*(regressor for regressor in after.regressors if regressor is not own), *heights))
 
 
-def shape(column: Regressor, means: Array, price: float, unit: str, stated: dict[str, object]) -> Shape:
+def shape(column: FittedColumn, means: Array, price: float, unit: str, stated: dict[str, object]) -> Shape:
     """The spline through the knots of a column with its heights free."""
     rows = spline(means, column.entry["knots"])
     return Shape(FREE, rows, (column,), tuple(("coefficient", unit) for _ in rows), price, len(rows), stated=stated)

@@ -29,7 +29,7 @@ SCHEMA = "selfcal.diagnose/1"
 G_SENSITIVITY_UNIT = coefficient_unit("deg/s", "m/s^2")
 
 
-def to_document(
+def diagnose_document(
     recording: Recording,
     found: Mapping[str, Diagnosed],
     errors: Mapping[str, str],

@@ -10,7 +10,7 @@ from selfcal.diagnosis.hidden import Hidden
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.heldout import HeldOut
-from selfcal.likelihood.state import Look, Regressor, State
+from selfcal.likelihood.state import FittedColumn, Look, State
 from selfcal.likelihood.statemodel import Array, Mask
 
 #: Rounds at most: a recording that holds more is told as it is then.
@@ -59,7 +59,7 @@ class Finding:
         return replace(self, ends=(less, final))
 
     @property
-    def columns(self) -> tuple[Regressor, ...]:
+    def columns(self) -> tuple[FittedColumn, ...]:
         """The columns that it added to the model."""
         known = {regressor.name for regressor in self.before.regressors}
         return tuple(regressor for regressor in self.after.regressors if regressor.name not in known)

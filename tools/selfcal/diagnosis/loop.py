@@ -21,11 +21,11 @@ from selfcal.diagnosis.causes import CAUSES, motion, tilt, variance_change
 from selfcal.diagnosis.channel_looks import side_looks
 from selfcal.diagnosis.curve import FREE
 from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding, rarer
-from selfcal.diagnosis.record import TIMES, Record, carried
+from selfcal.diagnosis.record import TIMES, Record, is_counter
 from selfcal.diagnosis.statistics import judged
 from selfcal.likelihood import edges, work
 from selfcal.likelihood.heldout import HeldOut, harmful, in_sd
-from selfcal.likelihood.state import ALIKE, NET_LEAST, SLOW_S, Look, Regressor, State
+from selfcal.likelihood.state import ALIKE, NET_LEAST, SLOW_S, FittedColumn, Look, State
 from selfcal.readings.moves import Moved
 
 #: Looks that one round tries on an axis.
@@ -74,7 +74,7 @@ def diagnose_record(
     left_out = {
         name
         for name, state in states.items()
-        if state.below_lattice and (state.redrawn or state.lattice_is_stated or carried(record, name))
+        if state.below_lattice and (state.redrawn or state.lattice_is_stated or is_counter(record, name))
     }
     states = {name: state for name, state in states.items() if name not in left_out}
     record = replace(record, axes=states)
@@ -285,7 +285,7 @@ def _give(
     record: Record,
     found: Mapping[str, Diagnosed],
     states: dict[str, State],
-    event: module.Event,
+    event: module.JointEvent,
     number: int,
     span: float,
 ) -> bool:
@@ -357,7 +357,7 @@ def _of_means(record: Record, found: Mapping[str, Diagnosed], means: Mapping[str
     return _with(record, found, dict(zip(record.axes, work.each(taken_over, record.axes), strict=True)))
 
 
-def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
+def _stretched(column: FittedColumn, means: Record, state: State) -> FittedColumn:
     """A column of means on the grid of a state. The edges of an event are moved to where the samples have them."""
     n, span = state.y.size, 1.0 / means.rate_hz
     times = {key: float(column.entry[key]) for key in TIMES if key in column.entry}
@@ -368,7 +368,7 @@ def _stretched(column: Regressor, means: Record, state: State) -> Regressor:
     return replace(column, values=edges.raised(n, *places), entry=entry)
 
 
-def _sharper(finding: Finding, means: Record, columns: Sequence[Regressor], state: State) -> Finding:
+def _sharper(finding: Finding, means: Record, columns: Sequence[FittedColumn], state: State) -> Finding:
     """A finding of means with the times of its jumps that the samples show, where none is left out about them."""
     finding = replace(finding, record=means, round=0)
     of_name = {column.name: column.entry for column in columns}

@@ -23,7 +23,7 @@ from selfcal.base.grid import half_means
 from selfcal.diagnosis.alias import WANDERS
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
-from selfcal.diagnosis.causes.variance_change import ln_changes, stretches
+from selfcal.diagnosis.causes.variance_change import ln_changes, noisy_stretches
 from selfcal.diagnosis.channel_looks import FORMS, LN_FORMS, shape_of, side_of, variants_of
 from selfcal.diagnosis.hidden import Hidden, weighed
 from selfcal.likelihood import work
@@ -40,7 +40,7 @@ from selfcal.likelihood.joint import (
     bins_of,
     bridged_rows,
     course,
-    fitted,
+    fit_joint,
     information,
     refitted,
     without_lines,
@@ -101,7 +101,7 @@ Shape = tuple[str, tuple[float, ...], Array, float]
 
 
 @dataclass(frozen=True)
-class Event:
+class JointEvent:
     """What the axes `names` have in common, of the shape `theta`, and what it is worth, nats. `passing`: from and
     before which means it passes from one level to the other."""
 
@@ -136,10 +136,10 @@ class Candidate:
         """[m, n]: what it adds to each axis."""
         return np.asarray(self.act.size.T @ self.columns)
 
-    def of(self, names: Sequence[str]) -> Event:
+    def of(self, names: Sequence[str]) -> JointEvent:
         """As an event of the axes `names` that have it."""
         held = tuple(names[k] for k in self.act.axes)
-        return Event(held, self.cause, self.theta, self.evidence, self.passing)
+        return JointEvent(held, self.cause, self.theta, self.evidence, self.passing)
 
     def share_of(self, loading: Array) -> float:
         """Share of its information that one size of a quantity with these loadings explains."""
@@ -152,7 +152,7 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Seen:
+class SeenAxes:
     """The axes together: records `y` [m, n] of means `dt` s long in units of their noise, their joint `model`, and side
     `channels` [n]. `kept_out` [n // 2 + 1]: frequencies that are left to the axes."""
 
@@ -222,7 +222,7 @@ def _shared(gain: Array, at: int) -> float:
     return float(logsumexp(np.minimum(near, 0.0)))
 
 
-def steps(seen: Seen) -> Iterator[Candidate]:
+def steps(seen: SeenAxes) -> Iterator[Candidate]:
     """A jump of the levels at each sample."""
     score = np.where(seen.passed[:, None], 0.0, seen.course.shock)
     score[: seen.edge] = score[-seen.edge :] = 0.0
@@ -233,7 +233,7 @@ def steps(seen: Seen) -> Iterator[Candidate]:
         yield Candidate("step", (at * seen.dt,), found, math.log(seen.n) - _shared(gain, at), column[None])
 
 
-def pulses(seen: Seen) -> Iterator[Candidate]:
+def pulses(seen: SeenAxes) -> Iterator[Candidate]:
     """Two jumps of one size, there and back. A first search takes their information as it is far from the ends."""
     count = max(1, int(math.log(seen.n / 3.0 / SHORTEST) / math.log(LONGER)))
     lengths = np.unique((SHORTEST * LONGER ** np.arange(count)).astype(int))
@@ -271,7 +271,7 @@ def pulses(seen: Seen) -> Iterator[Candidate]:
         yield Candidate("pulse", (begin * seen.dt, end * seen.dt), found, price, column[None])
 
 
-def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int, float]:
+def _moved(seen: SeenAxes, begin: int, end: int) -> tuple[int, int, float]:
     """Each place of a pulse in turn at its best within a fifth of its length, and ln of the number of pairs of places
     that share its evidence."""
     shock, alike = seen.course.shock, [0.0, 0.0]
@@ -294,7 +294,7 @@ def _moved(seen: Seen, begin: int, end: int) -> tuple[int, int, float]:
     return begin, end, sum(alike)
 
 
-def lines(seen: Seen) -> Iterator[Candidate]:
+def lines(seen: SeenAxes) -> Iterator[Candidate]:
     """A sine of each frequency. Its noise is the weights' own about it: no model of drift knows the colour there."""
     n, weights = seen.n, seen.course.weights
     U = rfft(weights, axis=0)
@@ -391,7 +391,7 @@ def _level(ratio: Array, beside: int, axis: int) -> Array:
     return np.maximum(found, 0.5)
 
 
-def fast_lines(states: Mapping[str, State]) -> list[Event]:
+def fast_lines(states: Mapping[str, State]) -> list[JointEvent]:
     """Lines of several axes above the band of means. They are looked for in the innovations of every sample, over the
     level of their neighbours. One that an axis shows beyond doubt is left to it."""
     names = [name for name, state in states.items() if not state.below_lattice]
@@ -425,20 +425,20 @@ def fast_lines(states: Mapping[str, State]) -> list[Event]:
         joint, price = max(((acts, price) for acts, price, _ in tried), key=lambda each: each[0].evidence - each[1])
         evidence = joint.evidence - price - float(ln_lines(np.array(turn * n), n, np.array(joint.evidence)))
         if evidence >= EVIDENT and len(joint.axes) > 1:
-            found.append(Event(tuple(names[k] for k in joint.axes), "periodic", (turn / dt,), evidence))
+            found.append(JointEvent(tuple(names[k] for k in joint.axes), "periodic", (turn / dt,), evidence))
         gain[max(0, at - 8) : at + 9] = 0.0
     return found
 
 
-def louder(states: Mapping[str, State]) -> Event | None:
+def louder(states: Mapping[str, State]) -> JointEvent | None:
     """The stretch in which the noise of several axes has another level; None: they show none. Beside it each axis has
     its own noise, so that its evidence is that of the axes apart."""
     names = [name for name, state in states.items() if not state.below_lattice]
     if len({(states[name].y.size, states[name].dt) for name in names}) != 1 or len(names) < 2:
         return None
     of, dt = [states[name] for name in names], states[names[0]].dt
-    found = list[Event]()
-    for power, (begin, end) in stretches(of):
+    found = list[JointEvent]()
+    for power, (begin, end) in noisy_stretches(of):
         level, n = (rows[:, :, 0] for rows in power.levels(begin, end))
         wide = power.wide(of, begin, end)
         gain, widths = power.gain(begin, end) / wide[:, None], np.array(WIDTHS)
@@ -447,7 +447,7 @@ def louder(states: Mapping[str, State]) -> Event | None:
         acts = act_apart(ln_bf, np.log(level[0] / level[1]), sd)
         price = ln_changes(power.n, float(gain[acts.axes].sum()), 1 + (end < power.n))
         held = tuple(names[k] for k in acts.axes)
-        found.append(Event(held, "variance_change", (begin * dt, end * dt), acts.evidence - price))
+        found.append(JointEvent(held, "variance_change", (begin * dt, end * dt), acts.evidence - price))
     best = max(found, key=lambda event: event.evidence)
     return best if best.evidence >= EVIDENT and len(best.names) > 1 else None
 
@@ -495,7 +495,7 @@ def _of_columns(y: Array, model: Joint, weights: Array, multiples: Sequence[int]
     return gain
 
 
-def transients(seen: Seen) -> Iterator[Candidate]:
+def transients(seen: SeenAxes) -> Iterator[Candidate]:
     """A constant rate, and a bias that settles: theta is its time constant, s, and how far off that may be, in its
     logarithm."""
     t = (np.arange(seen.n) + 0.5) * seen.dt
@@ -517,7 +517,7 @@ def _simplest(found: Iterable[Candidate]) -> list[Candidate]:
     return [candidate for candidate in found if candidate.cause == "ramp" or candidate.evidence > ramp + ALIKE]
 
 
-def channels(seen: Seen) -> Iterator[Candidate]:
+def channels(seen: SeenAxes) -> Iterator[Candidate]:
     """Temperature and supply in their forms."""
     for cause, values in seen.channels.items():
         side = replace(side_of(cause, "", values), forms=CHANNEL_FORMS)
@@ -532,13 +532,13 @@ def channels(seen: Seen) -> Iterator[Candidate]:
         yield from _weighed(seen, shapes, _scored(seen, shapes))
 
 
-def _scored(seen: Seen, shapes: Sequence[Shape]) -> tuple[Array, Array, Array]:
+def _scored(seen: SeenAxes, shapes: Sequence[Shape]) -> tuple[Array, Array, Array]:
     """The columns [k, n], their scores [k, m], and the information of each [k, m, m]."""
     columns = np.array([shape[2] / max(float(np.std(shape[2])), 1e-300) for shape in shapes])
     return columns, columns @ seen.course.weights, information(seen.model, seen.y, columns)
 
 
-def _weighed(seen: Seen, shapes: Sequence[Shape], scored: tuple[Array, Array, Array]) -> Iterator[Candidate]:
+def _weighed(seen: SeenAxes, shapes: Sequence[Shape], scored: tuple[Array, Array, Array]) -> Iterator[Candidate]:
     """Slow columns. The best ones are weighed over the drifts of each axis that its record leaves possible: a law
     alone is too sure of what a drift does over the whole record. Beside a quantity, which the axes have in common, the
     drifts are fitted anew."""
@@ -563,14 +563,14 @@ def _alone(row: bytes, dt: float) -> State:
     return State("", "", y, dt, 0.0, np.ones(y.size)).refit()
 
 
-def apart(seen: Seen, candidate: Candidate) -> Candidate:
+def apart(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A slow candidate over the drifts of each axis that its record leaves possible."""
     states = [_alone(row.tobytes(), seen.dt) for row in seen.y]
     each = [state.bayes(candidate.columns[0], np.array(WIDTHS)) for state in states]
     return replace(candidate, act=act_apart(*map(np.array, zip(*each, strict=True))), more=0.0)
 
 
-def beside(seen: Seen, candidate: Candidate) -> Candidate:
+def beside(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """The candidate with the drifts fitted anew beside its column, which it may have on any axis."""
     known = information(seen.model, seen.y, candidate.columns[:1])[0]
     effect = sizes(candidate.columns @ seen.course.weights, known).T @ candidate.columns
@@ -580,14 +580,14 @@ def beside(seen: Seen, candidate: Candidate) -> Candidate:
     return _gained(seen, replace(candidate, act=act(score, known)), score, model, found)
 
 
-def _gained(seen: Seen, candidate: Candidate, score: Array, model: Joint, found: Course) -> Candidate:
+def _gained(seen: SeenAxes, candidate: Candidate, score: Array, model: Joint, found: Course) -> Candidate:
     """The candidate, of scores [p, m] at a new `model`, with what the records less its effect gain there. `found`: the
     records at that model, which may suit them better without it too."""
     gain = course(model, seen.y - candidate.effect).ln_likelihood - max(seen.course.ln_likelihood, found.ln_likelihood)
     return replace(candidate, more=gain - 0.5 * float((candidate.act.size * score).sum()))
 
 
-def locked(seen: Seen, candidate: Candidate) -> Candidate:
+def locked(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A line with the drifts fitted anew beside it, at the frequency that it has there: drifts that were fitted without
     have swallowed the most of a slow one, and what they left lies elsewhere."""
     n, multiples = seen.n, (1, *map(round, candidate.theta[1:]))
@@ -606,7 +606,7 @@ def locked(seen: Seen, candidate: Candidate) -> Candidate:
     return candidate
 
 
-def settled(seen: Seen, candidate: Candidate) -> Candidate:
+def settled(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A bias that settles with the drifts fitted anew beside it, by the time constants that it may have there: ever
     closer ones, until the record no longer tells them apart."""
     t, (tau, step) = (np.arange(seen.n) + 0.5) * seen.dt + seen.since_s, candidate.theta
@@ -631,7 +631,7 @@ def settled(seen: Seen, candidate: Candidate) -> Candidate:
     return candidate if seen.model.has_f else apart(seen, candidate)
 
 
-def between_levels(seen: Seen, candidate: Candidate) -> Candidate:
+def between_levels(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A jump less the means in which it passes from one level to the other, with the drifts fitted anew: the one that a
     jump widens takes a half for the whole."""
     passing = []
@@ -660,7 +660,7 @@ def between_levels(seen: Seen, candidate: Candidate) -> Candidate:
 #: Causes whose shape is looked for once more with the drifts beside them: their family, and that look.
 FIRMED = {"periodic": ("line", locked), "turn_on": ("transient", settled)}
 #: The searches; a jump's has the name of its cause.
-FAMILIES: dict[str, Callable[[Seen], Iterator[Candidate]]] = {
+FAMILIES: dict[str, Callable[[SeenAxes], Iterator[Candidate]]] = {
     "step": steps,
     "pulse": pulses,
     "line": lines,
@@ -693,8 +693,8 @@ class Search:
     single: list[Candidate] = field(default_factory=list)
 
     @cached_property
-    def seen(self) -> Seen:
-        return Seen(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s)
+    def seen(self) -> SeenAxes:
+        return SeenAxes(self.rest, self.dt, self.model, self.channels, self.kept_out, self.since_s)
 
     @cached_property
     def known(self) -> dict[str, list[Candidate]]:
@@ -778,7 +778,7 @@ def together(
     channels: Mapping[str, Array],
     since_s: float = 0.0,
     apart: Mapping[str, Mask] = MappingProxyType({}),
-) -> Module | None:
+) -> JointModule | None:
     """What acts on several axes of one grid; None: there are too few axes or means to tell.
 
     `channels` [n]: temperature and supply. `apart` [n]: as a record has it. Before the quantity is
@@ -794,7 +794,7 @@ def together(
     y, kept_out, scale = in_means(np.array(list(found.values())))
     span = block * dt
     side = {cause: half_means(values, block)[0] for cause, values in channels.items()}
-    null = fitted(bins_of(y), span, False)
+    null = fit_joint(bins_of(y), span, False)
     search = Search(span, side, kept_out, since_s, null, y)
     search.go(CERTAIN)
     model = weighed(search.model, search.rest, span)
@@ -806,7 +806,7 @@ def together(
         y = np.where(np.isfinite(search.rest), y, np.nan) - sum(candidate.effect for candidate in search.several)
         model = refitted(search.model, y, span)
         of = Hidden(tuple(found), model, y, scale, span).calm()
-    return Module(tuple(found), span, tuple(search.several), of, scale)
+    return JointModule(tuple(found), span, tuple(search.several), of, scale)
 
 
 def in_means(y: Array) -> tuple[Array, Mask, Array]:
@@ -820,7 +820,7 @@ def in_means(y: Array) -> tuple[Array, Mask, Array]:
 
 
 @dataclass(frozen=True)
-class Module:
+class JointModule:
     """What acts on several of the axes `names`: `events`, of means `dt` s long, and one quantity that nobody recorded
     or None. `scale` [m]: units of the search."""
 

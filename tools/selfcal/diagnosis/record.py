@@ -13,10 +13,10 @@ from selfcal import _library32
 from selfcal.bank.blocks import MOST_DENSE
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Rows
-from selfcal.likelihood.state import Regressor, State
+from selfcal.likelihood.state import FittedColumn, State
 from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
-from selfcal.logs.sampling import Change
+from selfcal.logs.sampling import RateChange
 from selfcal.logs.timebase import Clock
 from selfcal.model.file import REGRESSORS, Group, Model
 from selfcal.model.file import Regressor as Stated
@@ -73,7 +73,7 @@ class Record:
     missing: Mapping[str, Missing] = field(default_factory=dict)
     recorded_hz: float = 1.0
     readings: Mapping[str, Readings] = field(default_factory=dict)
-    changes: tuple[Change, ...] = ()
+    changes: tuple[RateChange, ...] = ()
     redrawn: Mapping[str, Array] = field(default_factory=dict)
     left_out: Mapping[str, str] = field(default_factory=dict)
     start_s: float = 0.0
@@ -184,7 +184,7 @@ def _grid_of(recording: Recording, decimate: float | None, axes: Sequence[str]) 
     return _Grid(base, block, n)
 
 
-def of_recording(recording: Recording, model: Model, decimate: float | None = None, axes: Sequence[str] = ()) -> Record:
+def record_from(recording: Recording, model: Model, decimate: float | None = None, axes: Sequence[str] = ()) -> Record:
     """Every sensor column that the model knows, in the unit of each axis' group, and the side channels. What the model
     file states is in the model of each axis from the start. Stuck readings are left out. Where every axis holds its
     readings the record has the part's own rate; where some do, the repeats of those are left out.
@@ -317,9 +317,9 @@ def _axis_of(
     )
 
 
-def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple[Regressor, ...]:
+def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple[FittedColumn, ...]:
     """The model file's regressors of an axis."""
-    stated: list[Regressor] = []
+    stated: list[FittedColumn] = []
     own = recording.along(name) if offered(model, name) else recording
     for regressor in offered(model, name):
         values = columns_of((regressor,), own)
@@ -332,11 +332,11 @@ def _stated(recording: Recording, model: Model, name: str, grid: _Grid) -> tuple
             if regressor.kind == "periodic" and np.abs(row).max() < 0.01:
                 continue
             about = bridged(grid.means(own.clock, np.ascontiguousarray(row))[0]) - regressor.offset
-            stated.append(Regressor(column, _cause(regressor, model), about, regressor.unit, entry))
+            stated.append(FittedColumn(column, _cause(regressor, model), about, regressor.unit, entry))
     return tuple(stated)
 
 
-def carried(record: Record, name: str) -> bool:
+def is_counter(record: Record, name: str) -> bool:
     """Whether the readings are increments of a counter."""
     readings = record.readings.get(name)
     return readings is not None and readings.lattice is not None and readings.lattice.carried > 0.0

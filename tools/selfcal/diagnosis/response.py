@@ -17,10 +17,10 @@ from selfcal.base import units
 from selfcal.base.errors import UserError, printable
 from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
 from selfcal.diagnosis import transfer
-from selfcal.diagnosis.estimators import beside
+from selfcal.diagnosis.estimators import methods_beside
 from selfcal.diagnosis.record import Record
-from selfcal.diagnosis.transfer import DRAWS, PROBABILITY, STRUCTURES, Drive, Empirical, Input, Posterior, Tried
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Regressor, State
+from selfcal.diagnosis.transfer import DRAWS, PROBABILITY, STRUCTURES, Draws, Drive, Empirical, Input, Trial
+from selfcal.likelihood.state import ALIKE, NET_LEAST, FittedColumn, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import POWER
@@ -72,7 +72,7 @@ def inputs_of(recording: Recording, record: Record, name: str) -> list[Input]:
         reason = reason if known else "is neither temp, nor supply, nor an axis of the model"
         raise UserError(f"{recording.path}: column '{name}' {reason}: choose another --input")
     unit = recording.columns[name].unit
-    values = units.convert(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
+    values = units.converted(record.channel_of(name), dict(SIDE_CHANNELS.values())[name], unit)
     clock = recording.clock
     rows = updates(recording.columns[name].values, clock.place)
     read_at = clock.time_s if rows is None else clock.time_s[rows]
@@ -107,7 +107,7 @@ def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str,
 
     def beside_others(name: str, apart: Sequence[str] = ()) -> State:
         columns = [(other, column) for other, block in known.items() if other not in (name, *apart) for column in block]
-        added = [Regressor(f"{other}_{k}", "input", column, "1", {}) for k, (other, column) in enumerate(columns)]
+        added = [FittedColumn(f"{other}_{k}", "input", column, "1", {}) for k, (other, column) in enumerate(columns)]
         return state.refit(regressors=(*state.regressors, *added)) if added else state
 
     for _ in range(ROUNDS if len(inputs) > 1 else 0):
@@ -146,7 +146,7 @@ def _best(state: State, inputs: Sequence[Input]) -> tuple[float, Array]:
     return best.score, best.columns
 
 
-def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Tried], Input]:
+def _found(state: State, inputs: Sequence[Input]) -> tuple[list[Trial], Input]:
     """Every structure of the input as it acts likeliest, and that input."""
     each = [[transfer.tried(state, Drive(u.values, state.dt), structure) for structure in STRUCTURES] for u in inputs]
     # Of two that explain a record alike, the first is meant.
@@ -217,10 +217,10 @@ def answer_of(state: State, inputs: Sequence[Input], against: Sequence[str] = ()
 class Pooled:
     """Posteriors of the structures that a record leaves possible, the likeliest first, and the weight of each."""
 
-    each: Sequence[Posterior]
+    each: Sequence[Draws]
     weight: Array
 
-    def of(self, value: Callable[[Posterior], NDArray[Any]], key: str = "gain") -> NDArray[Any]:
+    def of(self, value: Callable[[Draws], NDArray[Any]], key: str = "gain") -> NDArray[Any]:
         """Draws of a value, from each structure that has the key by its weight."""
         chosen = [k for k, answer in enumerate(self.each) if key in answer.structure.keys]
         share = self.weight[chosen] / self.weight[chosen].sum()
@@ -301,7 +301,7 @@ def _estimate(pooled: Pooled, output: str, unit: str) -> dict[str, Any]:
     }
 
 
-def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
+def _methods(state: State, drive: Drive, read: Array, chosen: Trial, pooled: Pooled, seen: Empirical) -> dict[str, Any]:
     """Estimates of other methods beside an answer that is linear and has a static gain, and the step of their means."""
     if "gain" not in chosen.structure.keys or not chosen.structure.linear:
         return {}
@@ -312,7 +312,7 @@ def _methods(state: State, drive: Drive, read: Array, chosen: Tried, pooled: Poo
     own = len(chosen.structure.keys)
     parts = chosen.fit.c[-len(chosen.columns) :, None] * chosen.columns
     answers = np.vstack([parts[:own].sum(axis=0), *pooled.answers(drive, RECORDS - 1)])
-    found = beside(state, chosen.fit, drive.u, read, answers, parts[own:].sum(axis=0), steps)
+    found = methods_beside(state, chosen.fit, drive.u, read, answers, parts[own:].sum(axis=0), steps)
     step_s = steps * state.dt
     clear = seen.coherence > seen.chance
     # Its own errors are in the answer's ratio too.

@@ -21,7 +21,7 @@ from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import passed, run
-from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut, error_entry, score_entry, spread
+from selfcal.likelihood.heldout import HORIZONS_S, PIECES, HeldOut, error_entry, score_entry, sd_of_mean
 from selfcal.likelihood.state import Look, Sequential, State
 from selfcal.likelihood.statemodel import Array, Mask, matrices
 
@@ -87,7 +87,7 @@ def gain(
         first = split + min(int(np.argmax(column[split:] != 0.0)) for column in added)
         piece = int(np.searchsorted(cut.edges, first, "right")) - 1
         later[piece] -= max(0.0, look.gain - look.net) / cut.sizes[piece]
-    return _held_out(cut, scores, later, spread(later - scores), before.unit, _errors(after, old, new, horizons))
+    return _held_out(cut, scores, later, sd_of_mean(later - scores), before.unit, _errors(after, old, new, horizons))
 
 
 def _held_out(

@@ -20,7 +20,7 @@ from selfcal.diagnosis.record import LEAST, Record
 from selfcal.diagnosis.statistics import states_of
 from selfcal.likelihood.columns import Shape, possible
 from selfcal.likelihood.fit import Fit, Series, ln_likelihood, run
-from selfcal.likelihood.state import Look, Regressor, State
+from selfcal.likelihood.state import FittedColumn, Look, State
 from selfcal.likelihood.statemodel import Array, Terms, matrices
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, curved, formed, slope
@@ -36,11 +36,11 @@ NODES = 9
 
 
 @dataclass(frozen=True)
-class Rival:
+class RivalShape:
     """A shape as the first record leaves it: its columns at each place of its numbers, and for each drift and place the
     mean [d, p, k] and the information [d, p, k, k] of their coefficients, and the probability [d, p]."""
 
-    columns: tuple[tuple[Regressor, ...], ...]
+    columns: tuple[tuple[FittedColumn, ...], ...]
     mean: Array
     information: Array
     probability: Array
@@ -79,7 +79,7 @@ def _nested(a: Shape, b: Shape) -> bool:
     return names[0] < names[1] or names[1] < names[0]
 
 
-def _known(shape: Shape, state: State) -> Rival:
+def _known(shape: Shape, state: State) -> RivalShape:
     """A shape by the first record."""
     points, _ = possible(state, shape)
     shapes = shape.near(np.exp(points[:: 1 + len(points) // NODES])) if shape.numbers else [shape]
@@ -93,12 +93,12 @@ def _known(shape: Shape, state: State) -> Rival:
     information = np.where(np.expand_dims(known, (2, 3)), G * (1.0 + 1e-9 * unit), unit)
     ln_weight = np.array([[ln_likelihood(sums_of) for sums_of in each] for each in sums])
     ln_weight = np.where(known, ln_weight - 0.5 * np.linalg.slogdet(information)[1], -math.inf)
-    return Rival(
+    return RivalShape(
         tuple(shape.regressors for shape in shapes), mean, information, np.exp(ln_weight - logsumexp(ln_weight))
     )
 
 
-def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any]:
+def _shortest(a: RivalShape, b: RivalShape, state: State, record: Record) -> dict[str, Any]:
     """The shortest record that tells two rivals apart, with the smallest cycle that suffices in the time of the first
     record. A cycle takes a quarter of that time or more: of faster changes the first record says little."""
     causes = {name: cause for cause, name in record.channel_names.items()}
@@ -139,7 +139,7 @@ def _shortest(a: Rival, b: Rival, state: State, record: Record) -> dict[str, Any
 
 
 def _drawn(
-    a: Rival, b: Rival, state: State, record: Record, drive: str, swing: float, period_s: float
+    a: RivalShape, b: RivalShape, state: State, record: Record, drive: str, swing: float, period_s: float
 ) -> tuple[Array, Array]:
     """The longest record in which a channel is cycled and the others are held, [d, n, 1 + m + 2 DRAWN]: a level, the
     columns of both rivals, and readings drawn under each, behind the filter of every drift; ln of their variances [d,
@@ -185,7 +185,7 @@ def _noise(drift: tuple[Terms, Array, float], dt: float, n: int, random: np.rand
     return np.asarray(sigma * (random.standard_normal(n) + states))
 
 
-def _column(column: Regressor, values: Mapping[str, Array], t: Array, dt: float) -> Array:
+def _column(column: FittedColumn, values: Mapping[str, Array], t: Array, dt: float) -> Array:
     """[n]: a column of the model file in a record with these channels, `t` s from power-on."""
     entry = column.entry
     if entry["kind"] == "turn_on":
@@ -209,7 +209,7 @@ def _drift(at: Fit, dt: float) -> tuple[Terms, Array, float]:
     return terms, theta, (at.N_of_color if at.terms.color else at.N) / math.sqrt(dt)
 
 
-def _differences(a: Rival, b: Rival, white: Array, ln_variance: Array) -> Array:
+def _differences(a: RivalShape, b: RivalShape, white: Array, ln_variance: Array) -> Array:
     """Evidence for the true rival over the other one in the drawn records of `_drawn`, nats [2, DRAWN]."""
     G = white.transpose(0, 2, 1) @ white
     ln_det = ln_variance.sum(axis=1) + np.log(G[:, 0, 0])

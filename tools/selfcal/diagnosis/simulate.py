@@ -61,7 +61,7 @@ def _markov(deviation: float, rate: float, n: int, random: np.random.Generator) 
     return found
 
 
-def read_out(
+def put_faults(
     applied: Sequence[Mapping[str, Any]],
     model: Model,
     axes: Sequence[_reference.Axis],
@@ -83,7 +83,7 @@ def read_out(
     return changed
 
 
-def slower(
+def slowed(
     stamps: NDArray[np.float64], columns: Mapping[str, tuple[str, NDArray[np.float64]]], time_s: float, block: int
 ) -> tuple[NDArray[np.float64], dict[str, tuple[str, NDArray[np.float64]]]]:
     """Means of `block` rows from `time_s` on, at the time of the last."""

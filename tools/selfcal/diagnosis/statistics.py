@@ -54,7 +54,7 @@ class Statistic:
 
 
 @dataclass(frozen=True)
-class Judged:
+class JudgedStatistics:
     """Every statistic of a state against its band, the most striking first; `p`: probability that the most striking of
     a fitting record is as striking."""
 
@@ -379,12 +379,12 @@ def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tu
         yield w, w
 
 
-def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
+def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> JudgedStatistics:
     """Every statistic of the state against `count` records of its model."""
     jumps = jumps_of(_step_response(state.series, state.best))
     measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, jumps)
     if SPREAD in measured:
-        return Judged([Statistic(SPREAD, measured[SPREAD], 0.9, 1.1, 0.0)], 0.0)
+        return JudgedStatistics([Statistic(SPREAD, measured[SPREAD], 0.9, 1.1, 0.0)], 0.0)
     rows = []
     for w, y in _drawn(state, np.random.default_rng(seed), count):
         found = all_statistics(w, None if state.redrawn else y, state.lsb, jumps)
@@ -393,7 +393,7 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
     usual = np.isfinite(sample).sum(axis=0) >= FEWEST
     names = [name for name, kept in zip(measured, usual, strict=True) if kept]
     if not names:
-        return Judged([], 1.0)
+        return JudgedStatistics([], 1.0)
     sample, value = sample[:, usual], np.array([measured[name] for name in names])
     # A statistic that some records do not have is usual in those.
     sample = np.where(np.isfinite(sample), sample, np.nanmean(sample, axis=0))
@@ -405,7 +405,7 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> Judged:
         Statistic(name, float(value[k]), float(mean[k] - half[k]), float(mean[k] + half[k]), math.exp(ln_p[k]))
         for k, name in enumerate(names)
     ]
-    return Judged(sorted(found_all, key=lambda statistic: statistic.p), _family(ln_p, sample, least))
+    return JudgedStatistics(sorted(found_all, key=lambda statistic: statistic.p), _family(ln_p, sample, least))
 
 
 def _ln_tails(values: Array, sample: Array, least: Array, *, own: bool = False) -> Array:

@@ -16,7 +16,7 @@ from scipy.fft import rfft
 from scipy.ndimage import uniform_filter1d
 
 from selfcal.likelihood.columns import FIT_ADDS, NEARLY
-from selfcal.likelihood.fit import Fit, best, finish, left, moved
+from selfcal.likelihood.fit import Fit, best, fit_at, left, moved
 from selfcal.likelihood.state import State, net
 from selfcal.likelihood.statemodel import PERIOD_LIMITS
 from selfcal.model.laws import DAMPING_LIMITS, SWING_LEAST
@@ -109,6 +109,6 @@ def _search(
             size = 0.5 * math.log(2.0 * width * (float(mean[at]) - 1.0) / n)
             damping = math.log(min(SHARE * width / at, DAMPING_LIMITS[1]))
             own = {"ln_period": math.log(n * state.dt / at), "ln_damping": damping, "ln_swing": size}
-            value = finish(state.series, terms, moved(drift, terms, own)).ln_likelihood - fit.ln_likelihood
+            value = fit_at(state.series, terms, moved(drift, terms, own)).ln_likelihood - fit.ln_likelihood
             tried.append((own, less, value))
     return max(tried, key=lambda each: each[2], default=None)

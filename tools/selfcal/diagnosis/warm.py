@@ -18,7 +18,7 @@ import numpy as np
 
 from selfcal.bank.axis_result import FAINT, HALF_90
 from selfcal.base import units
-from selfcal.base.errors import UserError, short, shown
+from selfcal.base.errors import UserError, short, short_value
 from selfcal.base.limits import read_text, reading
 from selfcal.model.file import LONGEST_TEXT, MOST_HYPOTHESES, Model
 from selfcal.model.laws import PARAMETERS, PLACES, RATIOS
@@ -97,7 +97,7 @@ def _regressor(column: RegressorTable, known: list[AxisStart | None]) -> Regress
     return replace(column, coefficient_sd=tuple(sd), coefficient_mean=tuple(mean), ln_odds=tuple(odds))
 
 
-def load(path: Path | str, model: Model) -> Start:
+def load_start(path: Path | str, model: Model) -> Start:
     """Read the file that `diagnose --json` writes. Raises UserError for any other, and for one of another model."""
     return _Reader(Path(path), model).start()
 
@@ -123,7 +123,7 @@ class _Reader:
             tree = json.loads(text)
         told = tree.get("schema") if isinstance(tree, dict) else None
         if told != SCHEMA:
-            said = f"schema {shown(told)}" if told is not None else "no schema"
+            said = f"schema {short_value(told)}" if told is not None else "no schema"
             raise self.fail("", f"not a diagnosis: {said}, not {SCHEMA} (the JSON that `selfcal diagnose` writes)")
         assert isinstance(tree, dict)
         return tree
@@ -131,7 +131,7 @@ class _Reader:
     def mapping(self, tree: Any, key: str, where: str) -> dict[str, Any]:
         found = tree.get(key)
         if not isinstance(found, dict):
-            raise self.fail(f"{where}{key}", f"must be a mapping, not {shown(found)}")
+            raise self.fail(f"{where}{key}", f"must be a mapping, not {short_value(found)}")
         return found
 
     def number(self, tree: Mapping[str, Any], key: str, where: str, low: float = -math.inf) -> float:
@@ -142,7 +142,7 @@ class _Reader:
             number = math.inf
         if not math.isfinite(number) or number <= low:
             above = "" if low == -math.inf else f" above {low:g}"
-            raise self.fail(f"{where}.{key}", f"must be a finite number{above}, not {shown(value)}")
+            raise self.fail(f"{where}.{key}", f"must be a finite number{above}, not {short_value(value)}")
         return number
 
     def probability(self, tree: Mapping[str, Any], key: str, where: str) -> float:
@@ -157,7 +157,7 @@ class _Reader:
         recording = self.mapping(tree, "recording", "")
         name = Path(str(recording.get("path"))).name
         if not name.isprintable() or not 0 < len(name) <= LONGEST_TEXT:
-            raise self.fail("recording.path", f"must be the name of a file, not {shown(name)}")
+            raise self.fail("recording.path", f"must be the name of a file, not {short_value(name)}")
         duration_s = self.number(recording, "duration_s", "recording", 0.0)
         if _meaning(Model.of_tree(self.mapping(tree, "model", ""), self.path)) != _meaning(self.model):
             raise self.fail(
@@ -182,7 +182,7 @@ class _Reader:
     def axis(self, axis: str, entry: Any) -> AxisStart:
         where, group = f"axes.{axis}", self.model.group_of(axis)
         if not isinstance(entry, dict):
-            raise self.fail(where, f"must be a mapping, not {shown(entry)}")
+            raise self.fail(where, f"must be a mapping, not {short_value(entry)}")
         try:
             factor = units.factor(str(entry.get("unit")), group.unit)
         except UserError as error:

@@ -22,13 +22,13 @@ from selfcal.likelihood.state import (
     ALIKE,
     NET_LEAST,
     SCREEN,
+    FittedColumn,
     Look,
-    Regressor,
     State,
     gain_for,
-    interval,
     mixture,
     net,
+    normal_entry,
 )
 from selfcal.likelihood.statemodel import Array
 
@@ -85,7 +85,7 @@ class Shape:
 
     form: str
     columns: Array
-    regressors: tuple[Regressor, ...]
+    regressors: tuple[FittedColumn, ...]
     keys: tuple[tuple[str, str], ...]
     price: float | Callable[[float], float] = 0.0
     free: int = 1
@@ -265,9 +265,9 @@ def _estimate(chosen: Tried) -> dict[str, Any]:
     shape, fit = chosen.shape, chosen.fit
     k = len(shape.columns)
     c, sd = _sizes(shape, fit.c[-k:], fit.sd[-k:])
-    found = {key: interval(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
+    found = {key: normal_entry(float(c[j]), float(sd[j]), unit) for j, (key, unit) in enumerate(shape.keys)}
     values = shape.told(np.array(shape.theta))
-    numbers = {number.key: interval(float(values[number.key]), 0.0, number.unit) for number in shape.numbers}
+    numbers = {number.key: normal_entry(float(values[number.key]), 0.0, number.unit) for number in shape.numbers}
     return {**shape.where(fit), **found, **numbers, **shape.stated}
 
 
@@ -302,7 +302,7 @@ def measured(shape: Shape, state: State) -> dict[str, Any]:
 
 
 def possible(state: State, shape: Shape) -> tuple[Array, Array]:
-    """As `nodes`, of a shape's numbers beside the drift that is fitted with it."""
+    """As `number_nodes`, of a shape's numbers beside the drift that is fitted with it."""
     if not shape.numbers:
         return np.empty((1, 0)), np.empty((0, 0))
     fit = fitted(state, shape).fit
@@ -310,10 +310,10 @@ def possible(state: State, shape: Shape) -> tuple[Array, Array]:
     def scores(thetas: Array) -> Array:
         return state.scores([other.columns for other in shape.near(thetas)], fit)[None]
 
-    return nodes(scores, shape.theta, shape.limits)
+    return number_nodes(scores, shape.theta, shape.limits)
 
 
-def nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Array) -> tuple[Array, Array]:
+def number_nodes(scores: Callable[[Array], Array], start: Sequence[float], limits: Array) -> tuple[Array, Array]:
     """Logarithms of numbers that the record leaves possible [points, m], on a lattice about the best with the steps
     [m, m], its columns. `scores` [d, points] of [points, m] at some drifts, the likeliest first."""
     limits, m = np.log(limits), len(limits)

@@ -13,7 +13,7 @@ import numpy as np
 from selfcal.base.grid import Rows
 from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
-from selfcal.likelihood.state import Regressor, State, interval, ln_looks, mixture, net
+from selfcal.likelihood.state import FittedColumn, State, ln_looks, mixture, net, normal_entry
 from selfcal.likelihood.statemodel import Array, Mask
 
 #: Least share of its information that a step keeps beside the level before it; and the least share of a mid-record
@@ -152,7 +152,7 @@ def shape(state: State, cause: str, places: tuple[int, ...], steps: Scan) -> Sha
     return Shape(
         cause,
         values[None],
-        (Regressor(name(cause, times), cause, values, "1", entry),),
+        (FittedColumn(name(cause, times), cause, values, "1", entry),),
         (("amplitude", state.unit),),
         partial(steps.price, edges=len(places)),
         steps.free(len(places)),
@@ -175,9 +175,9 @@ def known(state: State, places: Sequence[int] | Rows, samples: Sequence[int] | R
     """When a change is: each edge lies between the last reading before it and the first one after it, so many samples
     apart. Means begin with their first reading."""
     width = np.asarray(samples) * state.dt / math.sqrt(12.0)
-    found = {"time_s": interval(float(places[0] - 0.5 / state.block) * state.dt, float(width[0]), "s")}
+    found = {"time_s": normal_entry(float(places[0] - 0.5 / state.block) * state.dt, float(width[0]), "s")}
     if len(places) > 1:
-        found["duration_s"] = interval(float(places[1] - places[0]) * state.dt, math.hypot(*width), "s")
+        found["duration_s"] = normal_entry(float(places[1] - places[0]) * state.dt, math.hypot(*width), "s")
     return found
 
 

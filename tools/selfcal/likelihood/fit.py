@@ -345,7 +345,7 @@ def slopes(series: Series, at: Fit) -> tuple[Array, Array]:
 
 def refit(series: Series, known: Fit) -> Fit:
     """The same model on much the same record, from where it was."""
-    return _climbed(series, finish(series, known.terms, known.theta))
+    return _climbed(series, fit_at(series, known.terms, known.theta))
 
 
 def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
@@ -355,10 +355,10 @@ def fit(series: Series, terms: Terms, start: Array | None = None) -> Fit:
     and a Gauss-Markov drift may have gone there with the wrong rate."""
     low, high = np.array(terms.limits(series.dt)).reshape(-1, 2).T
     starts = [start] if start is not None else _starts(terms, np.array([low, high]).T)
-    found = _climbed(series, best([finish(series, terms, np.clip(start, low, high)) for start in starts]))
+    found = _climbed(series, best([fit_at(series, terms, np.clip(start, low, high)) for start in starts]))
     promised: list[tuple[float, Fit]] = []
     for place in _larger(terms, found.theta):
-        at = finish(series, terms, place)
+        at = fit_at(series, terms, place)
         slope, information = slopes(series, at)
         k = int(np.flatnonzero(place != found.theta)[0])
         if slope[k] > 0.0:
@@ -402,11 +402,11 @@ def _climbed(series: Series, here: Fit) -> Fit:
         while True:
             move, gain = _move(size, slope, information, low - here.theta, high - here.theta, reach)
             if gain >= SETTLED * series.ftol:
-                there = finish(series, terms, here.theta + move)
+                there = fit_at(series, terms, here.theta + move)
             elif falling.any():
                 move, gain = np.where(falling, low - here.theta, 0.0), 0.0
                 falling[:] = False
-                there = finish(series, terms, here.theta + move)
+                there = fit_at(series, terms, here.theta + move)
             else:
                 return here
             more = there.ln_likelihood - here.ln_likelihood
@@ -518,7 +518,7 @@ def _possible(series: Series, found: Fit, direction: Array, limits: Array) -> Ar
     return moves[bent[0] : bent[-1] + 2] if bent.size else np.zeros(1)
 
 
-def finish(series: Series, terms: Terms, theta: Array) -> Fit:
+def fit_at(series: Series, terms: Terms, theta: Array) -> Fit:
     """The fit at given parameters."""
     sums = run(series, terms, theta)[0][0]
     c, inverse, rss = sums.coefficients()

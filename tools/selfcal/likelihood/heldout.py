@@ -39,7 +39,7 @@ def score_entry(before: float, after: float, sd: float, samples: float) -> dict[
     return {"log_score_per_sample": {"before": before, "after": after, "sd": sd, "samples": int(samples)}}
 
 
-def spread(steps: Array) -> float:
+def sd_of_mean(steps: Array) -> float:
     """Standard deviation of the mean of pieces."""
     return float(np.std(steps, ddof=1)) / math.sqrt(len(steps))
 
@@ -53,7 +53,7 @@ def error_entry(before: Array, after: Array) -> dict[str, float] | None:
     squares = [error[good] ** 2 for error in (before, after)]
     rms = [math.sqrt(float(each.mean())) for each in squares]
     first, second = (np.array([part.mean() for part in np.array_split(each, PIECES // 3)]) for each in squares)
-    return {"before": rms[0], "after": rms[1], "sd": spread(second - first) / max(sum(rms), 1e-300)}
+    return {"before": rms[0], "after": rms[1], "sd": sd_of_mean(second - first) / max(sum(rms), 1e-300)}
 
 
 def harmful(parts: Sequence[HeldOut]) -> bool:

@@ -272,7 +272,7 @@ class _Cost:
         return value, slope
 
 
-def fitted(bins: Bins, dt: float, f: bool, start: Joint | None = None, *, held: bool = False) -> Joint:
+def fit_joint(bins: Bins, dt: float, f: bool, start: Joint | None = None, *, held: bool = False) -> Joint:
     """The model of most likelihood, with f or without. `start`: one near it, to which f is added if it has none. It
     keeps f as that has it where f is `held`."""
     cost, m = _Cost(bins, f), bins.power.shape[1]
@@ -318,7 +318,7 @@ def _least(cost: _Cost, start: Array, bounds: Array) -> tuple[float, Array]:
 
 def refitted(model: Joint, y: Array, dt: float) -> Joint:
     """The model of records [m, n] near another one, with f if that has it."""
-    return fitted(bins_of(y), dt, model.has_f, model)
+    return fit_joint(bins_of(y), dt, model.has_f, model)
 
 
 def without_each(bins: Bins, model: Joint) -> Array:

@@ -46,7 +46,7 @@ Sequential = tuple[Array, Mapping[float, Array]]
 
 
 @dataclass(frozen=True)
-class Regressor:
+class FittedColumn:
     """A column that is in an axis' model. `entry` is the model file's (without prior), empty where it
     cannot state the column; `unit` the column's."""
 
@@ -74,7 +74,7 @@ class State:
     dt: float
     level: float
     r: Array
-    regressors: tuple[Regressor, ...] = ()
+    regressors: tuple[FittedColumn, ...] = ()
     extras: Terms = NONE
     lsb: float = 0.0
     stated_lsb: float = 0.0
@@ -402,7 +402,7 @@ class Look:
         return replace(self, estimate={**self.estimate, **self.measure(beside)})
 
 
-def interval(value: float, sd: float, unit: str) -> dict[str, Any]:
+def normal_entry(value: float, sd: float, unit: str) -> dict[str, Any]:
     """A posterior that is normal, in the form of the contract."""
     return {
         "mean": value,

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, short, shown
+from selfcal.base.errors import UserError, short, short_value
 from selfcal.base.grid import runs
 from selfcal.base.limits import FEWEST_ROWS, LONGEST_S, MOST_CLOCKS
 from selfcal.logs import written
@@ -21,7 +21,7 @@ from selfcal.logs.chosen_columns import Header, number_in
 from selfcal.logs.loaders.damage import Damaged
 from selfcal.logs.loaders.headings import PART, split
 from selfcal.logs.loaders.table import Rows
-from selfcal.logs.order import few, in_order
+from selfcal.logs.order import few_rows, in_order
 from selfcal.logs.recorded import SIDE_UNITS, Column, Recording, bridged, bridged_at
 from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
 
@@ -66,7 +66,7 @@ def assembled(rows: Rows, header: Header) -> Recording:
             raise UserError(f"{rows.path}: there is no time column: add t[s]{mapped} or give --rate HZ")
         return _on_clocks(rows, rate, columns, count, None, header)
     if header.written and np.isfinite(stamps.values).all():
-        return _as_written(rows, columns, units.convert(stamps.values, stamps.unit, "s"), header)
+        return _as_written(rows, columns, units.converted(stamps.values, stamps.unit, "s"), header)
     ordered, kept = _ordered(rows, stamps, part, columns, header)
     if kept.size < count or (np.diff(kept) < 0).any():
         columns = {name: replace(column, values=column.values[kept]) for name, column in columns.items()}
@@ -103,7 +103,7 @@ def _ordered(
     number = [field.name for field in rows.fields].index("t")
     known = np.flatnonzero(np.isfinite(stamps.values))
     unknown = stamps.values.size - known.size
-    if unknown and not (mend and few(unknown, stamps.values.size)):
+    if unknown and not (mend and few_rows(unknown, stamps.values.size)):
         rows.fail(int(np.argmax(np.isnan(stamps.values))), number, "no time stamp (an empty cell or NaN)")
     twice = _twice(_at(stamps.values, known), (_at(column.values, known) for column in columns.values()))
     if twice.size and not mend:
@@ -112,9 +112,9 @@ def _ordered(
     known = np.delete(known, twice)
     values = _at(stamps.values, known)
     tick_s = units.factor(stamps.unit, "s") * rows.fields[number].lsb
-    since = units.convert(values - values[0], stamps.unit, "s")
+    since = units.converted(values - values[0], stamps.unit, "s")
     if part is not None:
-        since += units.convert(np.nan_to_num(part.values[known]), part.unit, "s")
+        since += units.converted(np.nan_to_num(part.values[known]), part.unit, "s")
     order = in_order(since, tick_s, mend)
     kept = known[order.rows]
     if unknown:
@@ -126,8 +126,8 @@ def _ordered(
     return (
         _Stamps(
             order.time - order.time[0],
-            units.convert(float(np.spacing(np.abs(values).max())), stamps.unit, "s"),
-            units.convert(rows.started + float(values[0]), stamps.unit, "s") + float(order.time[0]),
+            units.converted(float(np.spacing(np.abs(values).max())), stamps.unit, "s"),
+            units.converted(rows.started + float(values[0]), stamps.unit, "s") + float(order.time[0]),
             lambda row, what: rows.fail(int(kept[row]), number, what),
         ),
         kept,
@@ -274,7 +274,7 @@ def _clock_at(rows: Rows, rate: float | None, sampled: Places, stamps: _Stamps |
             raise UserError(f"{rows.path}: {what}")
         return clock_of_rows(lines, rate)
     time = stamps.time
-    if count - sampled.size > 0 and few(count - sampled.size, count):
+    if count - sampled.size > 0 and few_rows(count - sampled.size, count):
         empty = np.setdiff1d(np.arange(1, count - 1), sampled)
         steps = np.diff(time)
         if empty.size and np.median(np.minimum(steps[empty - 1], steps[empty])) > 0.75 * np.median(steps):
@@ -309,4 +309,4 @@ def _check_truth(path: Path, meta: Mapping[str, Any]) -> None:
             if key == "units" or (isinstance(value, str) and value == short(value)):
                 continue
             if not math.isfinite(number_in(value)):
-                raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {shown(value)}")
+                raise UserError(f"{path}: meta: truth of '{short(axis)}': '{short(key)}' is {short_value(value)}")

@@ -193,7 +193,7 @@ class Recording:
         column = self.columns[name]
         if not units.same_kind(column.unit, unit):
             raise UserError(f"{self.path}: column '{name}' is in {column.unit}, which cannot be converted to {unit}")
-        return units.convert(column.values, column.unit, unit)
+        return units.converted(column.values, column.unit, unit)
 
     def along(self, *names: str) -> Recording:
         """The recording by the clock of these axes: its rows are those in which one of them has a sample.

@@ -506,7 +506,7 @@ def _periods(steps: NDArray[np.floating[Any]] | Places) -> list[tuple[int, NDArr
     return [(k, (each[:, k:] == each[:, :-k]).all(axis=0)) for k in periods]
 
 
-def overlapping(time: Floats) -> bool:
+def batches_overlap(time: Floats) -> bool:
     """Whether stamps fall in a rhythm of some rows, and go on from there: batches overlap. Where rows are swapped they
     catch up."""
     steps = np.diff(time)
@@ -551,7 +551,7 @@ def _usual(steps: Floats) -> float:
 
 
 @dataclass(frozen=True)
-class Change:
+class RateChange:
     """The first `row` at another rate, its time since the first row, s, the rates before and after it, and the evidence
     in nats."""
 
@@ -562,7 +562,7 @@ class Change:
     nats: float
 
 
-def rate_changes(time: Floats) -> list[Change]:
+def rate_changes(time: Floats) -> list[RateChange]:
     """Every change of rate in stamps float64[n], s, in order of time: where the laws of the stamps on its two sides
     have another interval.
 
@@ -570,7 +570,7 @@ def rate_changes(time: Floats) -> list[Change]:
     return _changes(time, 3 * _STEPS) or _changes(time, _STEPS)
 
 
-def _changes(time: Floats, least: int) -> list[Change]:
+def _changes(time: Floats, least: int) -> list[RateChange]:
     """The changes between parts of some pieces, which have `least` rows or more."""
     size = max(least, time.size // _PIECES)
     if time.size < 6 * size:
@@ -598,7 +598,7 @@ def _changes(time: Floats, least: int) -> list[Change]:
         return []
     intervals = [_interval(time[a:b][:_HEAD], lattice) for a, b in pairwise(rows)]
     unsure = 4.0 * lattice / min(intervals) / min(np.diff(rows)) ** 1.5  # four sd of a slope of rounded stamps
-    scatter, changes = max(CHANGE, _scatter(value, parts)), list[Change]()
+    scatter, changes = max(CHANGE, _scatter(value, parts)), list[RateChange]()
     for row, (before, after) in zip(rows[1:-1], pairwise(intervals), strict=True):
         ratio = math.log(after / before)
         # A burst after a stall makes up for it: samples of one rate, stamped late.
@@ -606,7 +606,7 @@ def _changes(time: Floats, least: int) -> list[Change]:
         if late or abs(ratio) < max(0.5 * CHANGE, unsure):
             return []
         nats = min(1e6, 0.5 * time.size * (ratio / scatter) ** 2)
-        changes.append(Change(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
+        changes.append(RateChange(row, float(time[row] - time[0]), 1.0 / before, 1.0 / after, nats))
     return changes
 
 

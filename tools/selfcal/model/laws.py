@@ -77,7 +77,7 @@ Later = tuple[tuple[_Floats, ...], _Floats]
 
 
 @dataclass(frozen=True)
-class Kind:
+class TermKind:
     """A kind of term: all that tools/ knows of it.
 
     `later(term, time_s)` and `averages(term, dt_s, block)`: the term ahead, and in means of `block` readings. `keys`:
@@ -129,10 +129,10 @@ def _oscillation_averages(term: Sized, dt_s: float, block: int) -> Averages:
 
 
 #: Kinds of terms, in the order of `selfcal_term_kind_t`.
-KINDS: dict[str, Kind] = {
-    "walk": Kind(_walk_later, _walk_averages),
-    "markov": Kind(_markov_later, _markov_averages, ("bandwidth", "correlation_time_s"), "correlation_time_s"),
-    "oscillation": Kind(
+KINDS: dict[str, TermKind] = {
+    "walk": TermKind(_walk_later, _walk_averages),
+    "markov": TermKind(_markov_later, _markov_averages, ("bandwidth", "correlation_time_s"), "correlation_time_s"),
+    "oscillation": TermKind(
         _oscillation_later,
         _oscillation_averages,
         ("period_s", "damping"),
@@ -295,6 +295,6 @@ SUMS = tuple(name for name, law in NAMED.items() if law.is_sum)
 PLAIN = tuple(name for name, law in NAMED.items() if not law.is_sum)
 
 
-def named(name: str, correlation_time_s: float = math.nan) -> Law:
+def named_law(name: str, correlation_time_s: float = math.nan) -> Law:
     """A named law; `correlation_time_s` is for walk_and_markov."""
     return NAMED[name].with_time(correlation_time_s)

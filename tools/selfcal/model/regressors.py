@@ -51,7 +51,7 @@ def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray
         for name, unit, by in channels
     ]
     rows = np.column_stack([as_float(row) for row in values]) if values else np.empty((recording.samples, 0))
-    sources = [source for regressor in regressors for source in sources_of(regressor, channels)]
+    sources = [source for regressor in regressors for source in column_sources(regressor, channels)]
     columns = made(sources, 1.0 / recording.rate_hz, rows, missing, recording.powered)
     first = 0
     for regressor in regressors:
@@ -101,7 +101,7 @@ def _channel(regressor: Regressor) -> tuple[str, str, str]:
     return regressor.column, regressor.channel_unit, regressor.input
 
 
-def sources_of(regressor: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
+def column_sources(regressor: Regressor, channels: Sequence[tuple[str, str, str]]) -> list[Source]:
     """`selfcal_source_t` of each column of a regressor."""
     if regressor.kind in _SHAPES:
         names, keys = _SHAPES[regressor.kind]

@@ -43,7 +43,9 @@ def generator(law: str, seed: int, stream: int) -> np.random.Generator:
     return np.random.default_rng([seed, LAWS.index(law), stream])
 
 
-def simulate(law: str, samples: int, seed: int, *, axis: str = "gx", rate_hz: float = 1.0) -> tuple[Floats, Floats]:
+def simulate_axis(
+    law: str, samples: int, seed: int, *, axis: str = "gx", rate_hz: float = 1.0
+) -> tuple[Floats, Floats]:
     """Readings of an axis, means over 1 / `rate_hz`, and the bias in them, both [samples]; units of AXES.
 
     The bias is the turn-on bias and a drift that stands still for the time of a reading.

@@ -18,7 +18,7 @@ from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
 from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior
 from selfcal.model.laws import KINDS, NAMED, PARAMETERS, PLACES, Law
-from selfcal.model.regressors import channels_of, sources_of
+from selfcal.model.regressors import channels_of, column_sources
 
 #: Most samples a bank interval: the float sums of one block lose digits with more.
 MOST_BLOCK = 1_000_000
@@ -294,7 +294,7 @@ def _regressor_tables(model: Model, names: Sequence[str]) -> Iterator[RegressorT
         channels = channels_of((regressor,))
         for place, column in enumerate(regressor.columns):
             odds = len(names) * (ln_odds if place == 0 else 0.0,)
-            kind, _, number, second = sources_of(regressor, channels)[place]
+            kind, _, number, second = column_sources(regressor, channels)[place]
             source = (kind, number, second, *(channels[0][:2] if channels else ("", "")))
             yield RegressorTable(column, regressor.unit, regressor.offset, sd, source, odds)
 

@@ -15,7 +15,7 @@ from selfcal.model.file import Model
 from selfcal.model.tables import GateTable, gate_table, make_tables
 
 
-def table_of(recording: Recording, model: Model, axes: tuple[str, ...]) -> GateTable:
+def gate_of_recording(recording: Recording, model: Model, axes: tuple[str, ...]) -> GateTable:
     """The gate's configuration for the recording's rate. Raises UserError where the model has none for it."""
     table = gate_table(model, make_tables(model, recording.rate_hz, axes))
     if table is None:
@@ -59,7 +59,7 @@ def gated(recording: Recording, model: Model) -> Recording:
     """
     axes = tuple(name for name in model.axes if name in recording.columns and recording.columns[name].clock is None)
     tables = make_tables(model, recording.rate_hz, axes)
-    table = table_of(recording, model, axes)
+    table = gate_of_recording(recording, model, axes)
     samples = np.column_stack([as_float(bridged(recording.in_unit(name, model.group_of(name).unit))) for name in axes])
     samples = np.ascontiguousarray(samples, np.float32)
     used, ended = _resting(samples, recording.missing_before, table)

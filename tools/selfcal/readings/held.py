@@ -50,7 +50,7 @@ class Held:
     even: bool = True
 
 
-def held(columns: Sequence[Array], places: Rows, off: Array | None) -> Held | None:
+def held_of(columns: Sequence[Array], places: Rows, off: Array | None) -> Held | None:
     """The part's own readings among rows [n], where the values of all columns [n] are held; None where they are not.
 
     `places` [n]: places of the rows on the logger's grid; `off` [n]: the stamps' distance from it, in intervals.
@@ -68,7 +68,7 @@ def held(columns: Sequence[Array], places: Rows, off: Array | None) -> Held | No
     if of_part is None or of_part is regular:
         return of_part
     # Repeats that stretches of a lower rate explain are theirs.
-    of_stretches = sum(stretch.rows.size for stretch in slower(columns[0]))
+    of_stretches = sum(stretch.rows.size for stretch in slower_stretches(columns[0]))
     return None if 2 * of_stretches > places.size - of_part.rows.size else of_part
 
 
@@ -81,7 +81,7 @@ class Slower:
     nats: float
 
 
-def slower(values: Array) -> list[Slower]:
+def slower_stretches(values: Array) -> list[Slower]:
     """Stretches of readings [n], NaN where there is none, in which the part or the logger ran at a part of its rate.
 
     In a stretch every row but each `ratio`th repeats. A repeat counts by its chance: the share of the readings that

@@ -121,8 +121,10 @@ def moves_of(recording: Recording) -> dict[str, Moved]:
         for stretch in stretches(energy):
             for k in np.flatnonzero(stretch.axes).tolist():
                 of_axis[names[k]].append(stretch)
-        times = {name: joined([_times(energy, stretch, recording) for stretch in of_axis[name]]) for name in names}
-        events = events_of(times).values()
+        times = {
+            name: joined_intervals([_times(energy, stretch, recording) for stretch in of_axis[name]]) for name in names
+        }
+        events = motion_events(times).values()
 
         def within(k: int, spans: Sequence[tuple[float, float]]) -> Moved:
             name = names[k]
@@ -471,13 +473,13 @@ def _of_one_source(energy: Energy, moved: Sequence[Stretch]) -> bool:
     return float(nats[:-1].sum()) < -math.log(SHARE)
 
 
-def events_of(
+def motion_events(
     intervals: Mapping[str, Sequence[tuple[float, float]]],
 ) -> dict[tuple[str, ...], list[tuple[float, float]]]:
     """Events by their axes, of the intervals of each axis: those that meet are one, and those of the same axes are one
     again."""
     events: dict[tuple[str, ...], list[tuple[float, float]]] = {}
-    for each in joined([each for own in intervals.values() for each in own]):
+    for each in joined_intervals([each for own in intervals.values() for each in own]):
         names = tuple(name for name, own in intervals.items() if _overlap(own, *each))
         events.setdefault(names, []).append(each)
     return events
@@ -487,7 +489,7 @@ def _overlap(intervals: Sequence[tuple[float, float]], begin: float, end: float)
     return any(a <= end and begin <= b for a, b in intervals)
 
 
-def joined(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:
+def joined_intervals(intervals: Sequence[tuple[Time, Time]]) -> list[tuple[Time, Time]]:
     """In order of time, those that touch made one."""
     spans: list[tuple[Time, Time]] = []
     for a, b in sorted(intervals):

@@ -18,12 +18,12 @@ from scipy.special import kl_div, log_ndtr, ndtr, ndtri_exp
 
 from selfcal.base.grid import Array, Mask, Rows, block_means, equal_runs, noise_of, runs
 from selfcal.logs.recording import Recording
-from selfcal.logs.sampling import Change, rate_changes
+from selfcal.logs.sampling import RateChange, rate_changes
 from selfcal.model.file import Group
 from selfcal.readings.budget import nats_of
 from selfcal.readings.changed_words import misread_of, spans_of
 from selfcal.readings.codes import CHANGED_LEAST, ELSEWHERE, PIECE, PIECES, UNEVEN, Cells, Misread
-from selfcal.readings.held import Held, Slower, held, repeats_of, slower
+from selfcal.readings.held import Held, Slower, held_of, repeats_of, slower_stretches
 from selfcal.readings.lattice import Lattice, lattice_of, step_of
 from selfcal.readings.lost_words import MOST, Recurring, is_limit, recurring_of
 from selfcal.readings.moves import Moved, moves_of
@@ -97,7 +97,7 @@ class Readings:
     moved: Moved | None = None
     kept_out: Mapping[str, int] = field(default_factory=dict)
     held: Held | None = None
-    changes: tuple[Change, ...] = ()
+    changes: tuple[RateChange, ...] = ()
     slower: tuple[Slower, ...] = ()
 
     def counted(self, kept_out: Mapping[str, int]) -> dict[str, int]:
@@ -258,7 +258,7 @@ def _known(values: NDArray[Any]) -> NDArray[Any]:
 # ------------------------------------------------------------------------------------------------------ change of rate
 
 
-def evened(recording: Recording) -> tuple[Recording, tuple[Change, ...]]:
+def evened(recording: Recording) -> tuple[Recording, tuple[RateChange, ...]]:
     """The recording on one even grid, where its rate changes: means over an interval that all rates share."""
     off = recording.off_grid_s
     if off is None:
@@ -358,7 +358,7 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
     off = recording.off_grid_s
     places = recording.clock.place
     values = [recording.columns[name].values for name in axes]
-    return held(values, places, None if off is None else off * recording.rate_hz)
+    return held_of(values, places, None if off is None else off * recording.rate_hz)
 
 
 # ------------------------------------------------------------------------------------------------------- stuck readings
@@ -367,11 +367,11 @@ def _held(recording: Recording, axes: tuple[str, ...]) -> Held | None:
 def _repeated(values: Array, lattice: Lattice | None, stated: int) -> tuple[Mask, float, tuple[Slower, ...]]:
     """Stuck readings [n], their nats, and the stretches of a lower rate. Repeats belong to the likelier of the two."""
     stuck, nats = _stuck(values, lattice, stated)
-    stretches = slower(values)
+    stretches = slower_stretches(values)
     if sum(stretch.nats for stretch in stretches) > nats:
         stuck, nats = _stuck(np.where(repeats_of(stretches, values.size), np.nan, values), lattice, stated)
     elif stuck.any():
-        stretches = slower(np.where(stuck, np.nan, values))
+        stretches = slower_stretches(np.where(stuck, np.nan, values))
     return stuck, nats, tuple(stretches)
 
 

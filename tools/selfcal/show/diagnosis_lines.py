@@ -16,7 +16,7 @@ from selfcal.base import units
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.diagnosis import words
 from selfcal.diagnosis.events import parted
-from selfcal.show.identification import heading
+from selfcal.show.identification import recording_heading
 
 #: Width of a line without a terminal, characters.
 WIDTH = 114
@@ -32,7 +32,7 @@ def show(
             console.width = WIDTH
 
     say = partial(print_line, console)
-    say(heading(document["recording"]))
+    say(recording_heading(document["recording"]))
     shown, less = parted(document["findings"])
     axes = {name: axis for name, axis in document["axes"].items() if "error" not in axis}
     if shown:

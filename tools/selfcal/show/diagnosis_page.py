@@ -44,7 +44,7 @@ Options = Sequence[tuple[str, str]]
 Entry = Mapping[str, Any]
 
 
-def page(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()) -> str:
+def diagnosis_html(document: Entry, record: Record, diagnosed: Mapping[str, Diagnosed], options: Options = ()) -> str:
     """The page. Numbers and words are the document's (selfcal.diagnose/1); pictures are made from `record` and
     `diagnosed`.
     `options`: how the recording was read and looked at, for the commands that reproduce it.

@@ -21,7 +21,7 @@ from selfcal.base.output import TABLE_WIDTH, console_of, print_line, table_of
 from selfcal.base.units import duration_words
 from selfcal.model.laws import RATIOS
 from selfcal.readings.changed_words import MISREAD
-from selfcal.readings.moves import events_of
+from selfcal.readings.moves import motion_events
 
 Reason = TypeVar("Reason", str, tuple[str, str])
 #: A check, its axes, and their outcomes.
@@ -47,7 +47,7 @@ def show(
     summary = fitting(console, [_summary_table(numbered, left_out) for left_out in range(3)])
     laws = fitting(console, [_law_table(axes, left_out, datasheet) for left_out in range(4)])
     first = summary if numbered else laws
-    first.title = escape(heading(document["recording"]))
+    first.title = escape(recording_heading(document["recording"]))
     if numbered:
         console.print(summary)
     console.print(laws)
@@ -57,7 +57,7 @@ def show(
         print_line(console, line)
 
 
-def heading(recording: Mapping[str, Any]) -> str:
+def recording_heading(recording: Mapping[str, Any]) -> str:
     """A recording's name and extent, and where a stretch of it begins."""
     start = f" from {recording['start_s']:g} s on" if recording.get("start_s") else ""
     extent = f"{recording['samples']} samples, {recording['rate_hz']:g} Hz, {recording['duration_s']:g} s"
@@ -294,7 +294,9 @@ def _events(axes: Mapping[str, Any], *, passed: bool) -> list[_Event]:
             same[1].append(name)
             same[2].append(outcome)
     for check, outcomes in lasting.items():
-        for names, intervals in events_of({name: outcome["intervals"] for name, outcome in outcomes.items()}).items():
+        for names, intervals in motion_events(
+            {name: outcome["intervals"] for name, outcome in outcomes.items()}
+        ).items():
             events.append((check, [*names], [{**outcomes[names[0]], "intervals": intervals}]))
     return events
 

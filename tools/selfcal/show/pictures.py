@@ -29,7 +29,7 @@ Summary = Callable[[Array, Array], Array]
 
 
 @dataclass(frozen=True)
-class Compared:
+class BeforeAfter:
     """A curve of a record and the band of the same curve in simulated records, before and after.
 
     `summary(y, w)` makes the curve [x.size] of readings y [n] and their residual innovations w [n]. It may differ
@@ -70,19 +70,19 @@ def figures(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> t
         ]
         for finding in diagnosed.findings
     ]
-    compared = [*overview, *(item for plan in plans for item in plan if isinstance(item, Compared))]
+    compared = [*overview, *(item for plan in plans for item in plan if isinstance(item, BeforeAfter))]
     pairs = _ensembles(compared)
 
-    def figure(item: Compared | Figure) -> Figure:
+    def figure(item: BeforeAfter | Figure) -> Figure:
         return item if isinstance(item, Figure) else _figure(item, pairs)
 
     sides = _sides(diagnosed, record, factor, unit)
     return [sides, *(figure(item) for item in overview)], [[figure(item) for item in plan] for plan in plans]
 
 
-def _ensembles(items: Sequence[Compared]) -> _Pairs:
+def _ensembles(items: Sequence[BeforeAfter]) -> _Pairs:
     """Every band. Each state is simulated once for all the pictures that need it: with a record in memory at a time."""
-    jobs: dict[int, tuple[State, list[tuple[int, Compared]]]] = {}
+    jobs: dict[int, tuple[State, list[tuple[int, BeforeAfter]]]] = {}
     for item in items:
         for side, state in enumerate(item.states):
             jobs.setdefault(id(state), (state, []))[1].append((side, item))
@@ -102,7 +102,7 @@ def _ensembles(items: Sequence[Compared]) -> _Pairs:
     return pairs
 
 
-def _figure(item: Compared, pairs: _Pairs) -> Figure:
+def _figure(item: BeforeAfter, pairs: _Pairs) -> Figure:
     panels = []
     same = item.states[0] is item.states[1]
     for side, title in enumerate(("Model as it is",) if same else ("Before", "After")):
@@ -123,7 +123,7 @@ def _figure(item: Compared, pairs: _Pairs) -> Figure:
     return Figure(item.name, item.caption, panels)
 
 
-def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> Compared | Figure:
+def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> BeforeAfter | Figure:
     """The picture of the statistic that shows the finding."""
     name, state = finding.look.shown_by, finding.before
     if "allan" in name:
@@ -143,7 +143,7 @@ def _unexplained(finding: Finding, record: Record, factor: float, unit: str) -> 
     return _histogram_of_readings((finding.before, finding.after), "How often each reading comes.", factor, unit)
 
 
-def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
+def _allan(before: State, after: State, factor: float, unit: str) -> BeforeAfter:
     n = before.y.size
     most = max(2, n // 6)
     count = max(2, round(8 * math.log10(most)) + 1)
@@ -152,7 +152,7 @@ def _allan(before: State, after: State, factor: float, unit: str) -> Compared:
     def summary(y: Array, w: Array) -> Array:
         return factor * allan_deviation(y, sizes)
 
-    return Compared(
+    return BeforeAfter(
         "Allan deviation",
         "A slope of −1/2 is white noise, +1/2 a random walk, level ground flicker.",
         "averaging time, s",
@@ -174,7 +174,7 @@ def _power(y: Array, dt: float) -> tuple[Array, Array]:
     return rfftfreq(x.size, dt), power
 
 
-def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared:
+def _spectrum(before: State, after: State, factor: float, unit: str) -> BeforeAfter:
     n, dt = before.y.size, before.dt
     frequency = rfftfreq(n, dt)
     first = min(3, frequency.size - 2)
@@ -187,7 +187,7 @@ def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared
     def summary(y: Array, w: Array) -> Array:
         return factor * np.sqrt(np.add.reduceat(_power(y, dt)[1], edges) / size)
 
-    return Compared(
+    return BeforeAfter(
         "Spectrum",
         "Level ground is the white noise density N.",
         "frequency, Hz",
@@ -201,7 +201,7 @@ def _spectrum(before: State, after: State, factor: float, unit: str) -> Compared
     )
 
 
-def _line(finding: Finding, factor: float, unit: str) -> Compared:
+def _line(finding: Finding, factor: float, unit: str) -> BeforeAfter:
     """The spectrum close to a line."""
     state = finding.before
     f = float(finding.look.estimate["frequency_hz"]["median"])
@@ -213,7 +213,7 @@ def _line(finding: Finding, factor: float, unit: str) -> Compared:
         effect = _effect(finding) if state is finding.after else np.zeros(state.y.size)
         return lambda y, w: factor * np.sqrt(_power(y - effect, state.dt)[1][low:high])
 
-    return Compared(
+    return BeforeAfter(
         "Spectrum about the line",
         "After: the fitted line is subtracted from measured and simulated readings.",
         "frequency, Hz",
@@ -226,7 +226,7 @@ def _line(finding: Finding, factor: float, unit: str) -> Compared:
     )
 
 
-def _correlation(before: State, after: State, magnitude: bool = False) -> Compared:
+def _correlation(before: State, after: State, magnitude: bool = False) -> BeforeAfter:
     lags = min(LAGS, before.y.size // 4)
 
     def summary(y: Array, w: Array) -> Array:
@@ -237,7 +237,7 @@ def _correlation(before: State, after: State, magnitude: bool = False) -> Compar
         return np.asarray(product[1:] / product[0])
 
     what = "magnitudes of the residual innovations" if magnitude else "residual innovations"
-    return Compared(
+    return BeforeAfter(
         f"Correlation of the {what}",
         "A model that fits leaves no correlation between prediction errors.",
         "lag, samples",
@@ -257,7 +257,7 @@ def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
 
 def _level(
     finding: Finding, record: Record, means: bool = False, marked: bool = False, pieces: int = PIECES
-) -> Compared:
+) -> BeforeAfter:
     edges, middle = _pieces(record, pieces)
     size = np.sqrt(np.diff(edges))
 
@@ -265,7 +265,7 @@ def _level(
         return means_of(edges, w) * size if means else np.sqrt(means_of(edges, w * w))
 
     what = "Mean" if means else "Noise level"
-    return Compared(
+    return BeforeAfter(
         f"{what} of the residual innovations",
         f"{what} of the prediction errors in {edges.size - 1} pieces of the record, in units of the expected one.",
         "time, s",
@@ -277,14 +277,14 @@ def _level(
     )
 
 
-def _largest(finding: Finding, record: Record) -> Compared:
+def _largest(finding: Finding, record: Record) -> BeforeAfter:
     edges, middle = _pieces(record, POINTS // 2)
 
     def summary(y: Array, w: Array) -> Array:
         largest = np.maximum.reduceat(np.where(np.isfinite(w), np.abs(w), -1.0), edges[:-1])
         return np.asarray(np.where(largest < 0.0, np.nan, largest))
 
-    return Compared(
+    return BeforeAfter(
         "Largest residual innovations",
         f"The largest prediction error in each of {edges.size - 1} pieces of the record. Gaps: samples kept out.",
         "time, s",
@@ -295,14 +295,14 @@ def _largest(finding: Finding, record: Record) -> Compared:
     )
 
 
-def _histogram(before: State, after: State) -> Compared:
+def _histogram(before: State, after: State) -> BeforeAfter:
     edges = np.linspace(-8.0, 8.0, BINS + 1)
 
     def summary(y: Array, w: Array) -> Array:
         counts = np.histogram(np.clip(w[np.isfinite(w)], -7.999, 7.999), edges)[0]
         return np.asarray(np.log10(np.maximum(counts, 0.3)))
 
-    return Compared(
+    return BeforeAfter(
         "Histogram of the residual innovations",
         "Prediction errors over their expected sd; those beyond 8 are counted at 8. The lowest line is an empty bin.",
         "size over the expected sd",
@@ -314,13 +314,13 @@ def _histogram(before: State, after: State) -> Compared:
     )
 
 
-def _lattice(finding: Finding, factor: float, unit: str) -> Compared:
+def _lattice(finding: Finding, factor: float, unit: str) -> BeforeAfter:
     """Histogram of the readings; before, the model reads out on no lattice."""
     free = replace(finding.before, lsb=0.0)
     return _histogram_of_readings((free, finding.after), "Before: without a lattice.", factor, unit, finding.before.lsb)
 
 
-def _limit(finding: Finding, factor: float, unit: str) -> Compared:
+def _limit(finding: Finding, factor: float, unit: str) -> BeforeAfter:
     """Histogram of the readings; before, the model reads out without a limit."""
     before = finding.before
     # The state after saturation holds clipped readings drawn anew: the readings are the record's own.
@@ -331,7 +331,7 @@ def _limit(finding: Finding, factor: float, unit: str) -> Compared:
 
 def _histogram_of_readings(
     states: tuple[State, State], caption: str, factor: float, unit: str, lattice: float = 0.0, edge: float = math.inf
-) -> Compared:
+) -> BeforeAfter:
     """`lattice`: of the readings where it is to be seen; `edge`: the limit, less the level, that clips them after."""
     before, after = states
     y = before.y[np.isfinite(before.y)]
@@ -357,7 +357,7 @@ def _histogram_of_readings(
 
         return summary
 
-    return Compared(
+    return BeforeAfter(
         "Histogram of the readings",
         caption,
         f"reading less {factor * before.level:.6g}, {unit}" if before.level else f"reading, {unit}",
@@ -473,7 +473,7 @@ def _series(finding: Finding, record: Record, factor: float, unit: str) -> Figur
     return Figure("Means of the readings", caption, panels)
 
 
-def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
+def _evidence(finding: Finding, record: Record) -> Iterator[BeforeAfter]:
     """How the evidence for a column grows along the record: the score of its whitened form, in standard deviations."""
     effect = _effect(finding)
     if not np.ptp(effect) > 0.0:
@@ -489,7 +489,7 @@ def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
         z = z / max(float(np.linalg.norm(z)), 1e-300)
         return lambda y, w: np.cumsum(np.nan_to_num(w) * z)[marks]
 
-    yield Compared(
+    yield BeforeAfter(
         "Evidence along the record",
         "Sum of prediction errors times the effect's expected trace in them, in standard deviations of chance. "
         "A steady climb is an effect that acts all the time; one jump is a single event.",
@@ -503,7 +503,7 @@ def _evidence(finding: Finding, record: Record) -> Iterator[Compared]:
 
 
 #: The pictures by the names that causes give: of a finding, in a record, with the factor to a unit.
-_PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[Compared | Figure]]] = {
+_PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[BeforeAfter | Figure]]] = {
     "means": lambda finding, record, factor, unit: [_series(finding, record, factor, unit)],
     "evidence": lambda finding, record, factor, unit: _evidence(finding, record),
     "spectrum": lambda finding, record, factor, unit: [_spectrum(finding.before, finding.after, factor, unit)],

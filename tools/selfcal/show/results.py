@@ -15,7 +15,7 @@ from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, get_args, get_origin, get_type_hints
 
-from selfcal.base.errors import UserError, install
+from selfcal.base.errors import UserError, install_line
 from selfcal.base.output import TABLE_WIDTH
 
 
@@ -186,7 +186,7 @@ class Document(Object):
         try:
             import pandas
         except ImportError:
-            raise UserError(f"to_frame() takes pandas: {install('pandas')}") from None
+            raise UserError(f"to_frame() takes pandas: {install_line('pandas')}") from None
         return pandas.DataFrame(list(self._rows()))
 
     def _console(self, **more: Any) -> Any:

@@ -16,7 +16,7 @@ from selfcal.batch.spread import Row
 from selfcal.model.file import Model
 from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
 from selfcal.model.tables import make_tables
-from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, Filters, Noise, Part, nees, true_noise
+from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, FilterNoise, Filters, Part, nees, true_noise
 
 if TYPE_CHECKING:
     from selfcal.bank.axis_result import AxisResult
@@ -74,10 +74,10 @@ def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
 
     bank = Bank(make_tables(Model.load(), 1.0, tuple(AXES), bank_rate_hz=1.0))
     bank.push(rest)
-    return [noise_of(bank, k)[0] for k in range(len(AXES))]
+    return [bank_noise(bank, k)[0] for k in range(len(AXES))]
 
 
-def noise_of(bank: Bank, axis: int, mask: int = 0) -> tuple[dict[str, float], AxisResult]:
+def bank_noise(bank: Bank, axis: int, mask: int = 0) -> tuple[dict[str, float], AxisResult]:
     """The noise of an axis by a bank, as `identified_noise` has it, in the bank's units, and the bank's report."""
     now, *later = (bank.report(axis, mask, ahead) for ahead in (0.0, *HORIZONS_S))
     white = [(now.probability[law], estimates["N"]) for law, estimates in now.parameters.items()]
@@ -115,7 +115,7 @@ def rows_of(job: Job) -> list[Row]:
     }
     rows: list[Row] = [{"law": job.law, "seed": seed} for seed in job.seeds]
     for name, noise in noises.items():
-        filters = Filters(Noise.of(noise), part)
+        filters = Filters(FilterNoise.of(noise), part)
         filters.rest()
         for time, (errors, covariance) in zip(TIMES, filters.fly(), strict=True):
             figures = {

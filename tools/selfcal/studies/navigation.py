@@ -27,9 +27,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from selfcal.base.grid import slices
-from selfcal.base.units import STANDARD_GRAVITY, convert
+from selfcal.base.units import STANDARD_GRAVITY, converted
 from selfcal.calibration.gyroscope import cross
-from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate
+from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate_axis
 
 #: Lengths of the rest, and of the flight with GPS and after its outage, s; the longest outage that is flown.
 REST_S, GPS_S, OUTAGE_S, LONGEST_S = 1800, 300, 60, 300
@@ -43,7 +43,7 @@ TILT_SD, HEADING_SD, START_SD_M = 0.1, 2.0, 3.0
 TURN, TAKE_OFF_S, TURN_PERIOD_S = 10.0, 20.0, 60.0
 #: Units of the filter, by AXES, and the size of each axis' unit in them.
 SI = {"deg/s": "rad/s", "m/s^2": "m/s^2"}
-SCALE = np.array([convert(np.ones(1), unit, SI[unit])[0] for unit in AXES.values()])
+SCALE = np.array([converted(np.ones(1), unit, SI[unit])[0] for unit in AXES.values()])
 _UP = np.array([0.0, 0.0, STANDARD_GRAVITY])
 #: Sizes of the error state: position, velocity, attitude, the biases' constants and drifts (gyros, accelerometers),
 #: latency. What is judged has the sums of the constants and the drifts.
@@ -57,7 +57,7 @@ JUDGED = len(_JUDGED)
 
 
 @dataclass(frozen=True)
-class Noise:
+class FilterNoise:
     """What filters hold of the readings, [filters, 6], by AXES in SI units: white noise N, random walk K, and the drift
     of a Gauss-Markov law; 0 where it is not in the law."""
 
@@ -67,7 +67,7 @@ class Noise:
     alpha: Floats
 
     @classmethod
-    def of(cls, filters: Sequence[Sequence[Mapping[str, float]]]) -> Noise:
+    def of(cls, filters: Sequence[Sequence[Mapping[str, float]]]) -> FilterNoise:
         """The parameters of each axis of each filter, in the units of AXES."""
         values = {
             name: np.array([[axis.get(name, 0.0) for axis in axes] for axes in filters])
@@ -149,7 +149,7 @@ class Part:
 
 def _part(law: str, seed: int, noise: float) -> dict[str, Any]:
     samples = (REST_S + GPS_S + OUTAGE_S) * RATE_HZ
-    simulated = [simulate(law, samples, seed, axis=axis, rate_hz=RATE_HZ) for axis in AXES]
+    simulated = [simulate_axis(law, samples, seed, axis=axis, rate_hz=RATE_HZ) for axis in AXES]
     errors, bias = (noise * SCALE * np.array(both).T for both in zip(*simulated, strict=True))
     rest = REST_S * RATE_HZ
     means = errors[:rest].reshape(REST_S, RATE_HZ, -1).mean(axis=1)
@@ -178,7 +178,7 @@ def _flown(rng: np.random.Generator, rest: Floats, errors: Floats, bias: Floats,
 class Filters:
     """Filters side by side, each with its own noise, of one part or of as many parts as there are filters."""
 
-    def __init__(self, noise: Noise, part: Part) -> None:
+    def __init__(self, noise: FilterNoise, part: Part) -> None:
         count = len(noise.N)
         self.noise, self.part = noise, part
         turn = Rotation.from_rotvec(part.start_attitude).inv().as_matrix()

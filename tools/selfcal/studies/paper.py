@@ -38,7 +38,7 @@ def with_reason(
     ]
 
 
-def page(figures: Sequence[Reproduction], records: int, seed: int) -> str:
+def paper_html(figures: Sequence[Reproduction], records: int, seed: int) -> str:
     """One self-contained page: a table of all figures, then each with its pictures."""
     pictures = [[figure.figures] if isinstance(figure.figures, Figure) else figure.figures for figure in figures]
     drawn = [[draw(picture) for picture in own] for own in pictures]

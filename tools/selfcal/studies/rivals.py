@@ -35,7 +35,7 @@ from selfcal.model.file import DEFAULT, Model, settings_of
 from selfcal.model.laws import NAMED, PLAIN
 from selfcal.show.identification import fitting
 from selfcal.studies.methods import RIVALS, Rival
-from selfcal.studies.methods.ensemble import Cell, over_laws, rows_of, summary
+from selfcal.studies.methods.ensemble import Cell, ensemble_summary, over_laws, rows_of
 from selfcal.studies.methods.problem import Answer, Problem
 
 SCHEMA = "selfcal.rivals/1"
@@ -121,7 +121,7 @@ class Ensemble:
             results=results,
             count=workers,
         )
-        entries = summary(rows, self.model.group_of(self.axis))
+        entries = ensemble_summary(rows, self.model.group_of(self.axis))
         document = {"schema": ENSEMBLE_SCHEMA, "model": str(self.model.path), **given, "records_per_law": self.records}
         return document | {"cells": entries, "choice": over_laws(entries)}
 

@@ -13,11 +13,11 @@ from scipy import signal
 
 from selfcal.base.errors import UserError, printable
 from selfcal.base.output import console_of, print_line, table_of
-from selfcal.base.units import STANDARD_GRAVITY, convert, same_kind
+from selfcal.base.units import STANDARD_GRAVITY, converted, same_kind
 from selfcal.batch.spread import Row
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Group, Model
-from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats, simulate_axis
 from selfcal.model.tables import make_tables
 
 SCHEMA = "selfcal.worth/1"
@@ -127,7 +127,7 @@ class After:
     def errors(self, unit: str) -> dict[str, Floats]:
         """Errors of the minute's corrected readings, by method."""
         errors = {name: self.minute - bias[:RECKONED_S] for name, bias in self.predicted.items()}
-        return {name: convert(error, self.unit, unit) for name, error in errors.items()}
+        return {name: converted(error, self.unit, unit) for name, error in errors.items()}
 
     def row(self, case: str, rest: int, truth: Floats) -> Row:
         """Errors of the bias, `truth` at HORIZONS_S."""
@@ -155,11 +155,11 @@ def simulated(model: Model, job: Job) -> list[Row]:
     """One gyro stands for the upright one and for the one across: no figure has both."""
     after, truth, noise = {}, {}, {}
     for axis in ("gx", "ax"):
-        y, truth[axis] = simulate(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)
+        y, truth[axis] = simulate_axis(job.law, job.rest_s + HORIZONS_S[-1], job.seed, axis=axis)
         noise[axis] = (y - truth[axis])[job.rest_s :][:RECKONED_S]
-        after[axis] = After.of(model, axis, convert(y, AXES[axis], model.group_of(axis).unit), job.rest_s)
+        after[axis] = After.of(model, axis, converted(y, AXES[axis], model.group_of(axis).unit), job.rest_s)
     samples = [job.rest_s - 1 + h for h in HORIZONS_S]
-    row = after["gx"].row(job.law, job.rest_s, convert(truth["gx"][samples], AXES["gx"], after["gx"].unit))
+    row = after["gx"].row(job.law, job.rest_s, converted(truth["gx"][samples], AXES["gx"], after["gx"].unit))
     row |= _heading(after["gx"]) | _position(after["gx"], after["ax"])
     row[f"heading_deg.{KNOWN}"] = heading_error(noise["gx"])
     row[f"position_m.{KNOWN}"] = position_error(noise["gx"], noise["ax"])

@@ -77,7 +77,7 @@ def plan(
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.batch.plan import SCHEMA, Ensemble, Wish, cycling, picture, rates, refusal
+    from selfcal.batch.plan import SCHEMA, PlannedRecords, Wish, cycling, picture, rates, refusal
     from selfcal.batch.spread import record_seeds
     from selfcal.diagnosis.separate import SHARE
     from selfcal.logs.recording import list_of
@@ -117,7 +117,7 @@ def plan(
             raise UserError(f"--want '{wish.text}': {reason}")
     seeds = record_seeds(records, seed)
     plain = replace(loaded, regressors=())
-    ensemble = Ensemble(plain, name, wishes, seeds, scheduler)
+    ensemble = PlannedRecords(plain, name, wishes, seeds, scheduler)
     lengths = [None if wish.parameter in columns else ensemble.length(k) for k, wish in enumerate(wishes)]
     samples = max((known for known in lengths if known is not None), default=round(RECORD_S * loaded.bank_rate_hz))
     entries = []

@@ -40,7 +40,7 @@ def response(
     from selfcal.adequacy.identify_document import recording_entry
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.diagnosis.diagnose import BELOW_LATTICE
-    from selfcal.diagnosis.record import of_recording
+    from selfcal.diagnosis.record import record_from
     from selfcal.diagnosis.response import (
         LINES,
         REFUSED_FROM,
@@ -71,7 +71,7 @@ def response(
     rate_hz = min(recording.clock_of(name).rate_hz for name in axes)
     if decimate is None and recording.duration_s * rate_hz > SAMPLES_MOST:
         decimate = SAMPLES_MOST / recording.duration_s
-    record = of_recording(recording, loaded, decimate, axes)
+    record = record_from(recording, loaded, decimate, axes)
     for name in axes:
         if name not in record.axes:
             raise UserError(f"{recording.path}: {name}: {record.left_out[name]}")
@@ -111,9 +111,9 @@ def response(
 
 def show(document: dict[str, Any], given: Mapping[str, Any]) -> None:
     """Print the answer in a few lines. A signal that came ends the command here."""
-    from selfcal.base.ending import Held
+    from selfcal.base.ending import HeldSignals
     from selfcal.diagnosis.response import show as table
 
     for part in document.get("inputs", [document]):
         table({**document, **part}, to_stderr=to_stderr(given))
-    Held().check()
+    HeldSignals().check()

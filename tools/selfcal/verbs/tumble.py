@@ -54,8 +54,8 @@ def tumble(
     from selfcal.batch.fail_on import INADEQUATE
     from selfcal.calibration import accelerometer, gyroscope
     from selfcal.calibration.earth import place
-    from selfcal.calibration.tumble_document import document_of
-    from selfcal.calibration.tumble_export import FORMS, write
+    from selfcal.calibration.tumble_document import tumble_document
+    from selfcal.calibration.tumble_export import FORMS, write_calibration
     from selfcal.calibration.tumble_rests import MOST, tumble_of
     from selfcal.calibration.tumble_show import plot as picture
     from selfcal.logs.recording import list_of, load
@@ -82,9 +82,9 @@ def tumble(
             gyro = gyroscope.calibrate(accel)
         except UserError as error:
             failed = str(error)
-    document = document_of(recordings, accel, gyro or failed)
+    document = tumble_document(recordings, accel, gyro or failed)
     for form, file in ((("yaml", output),) if output is not None else ()) + ((export,) if export is not None else ()):
-        write(form, file, accel, gyro, document)
+        write_calibration(form, file, accel, gyro, document)
     if plot is not None:
         picture(document, plot)
     write_json(document, json)

@@ -57,7 +57,7 @@ def bank_bytes(tables: Tables, axes: int = 0) -> int:
     return tables.nodes * (56 + 20 * axes + regressors) + tables.term_nodes * (104 + 24 * p + 40 * axes)
 
 
-def left_out(model: Model, tables: Tables, target: str) -> Iterator[str]:
+def unused(model: Model, tables: Tables, target: str) -> Iterator[str]:
     """Parts of the model that have no effect."""
     yield from model.left_out
     measured = {name for name, axis in model.simulate.get("axes", {}).items() if "hypothesis" in axis}

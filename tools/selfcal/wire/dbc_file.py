@@ -30,8 +30,6 @@ BASE, NODE_IDS, NODES = 0x200, 128, 12
 #: meaning is the item's.
 COMMON = {"item": (32, 6), "counter": (38, 6), "time": (44, 8), "crc": (52, 12)}
 VALUE_BITS = COMMON["item"][0]
-#: Hypotheses and regressor columns that telemetry has room for: as many as a model.
-HYPOTHESES, COLUMNS = MOST_HYPOTHESES, MOST_COLUMNS
 #: Names of the places of a hypothesis' parameters where no model gives better ones.
 PLACE_NAMES = ("N", "p1", "p2")
 #: Signal of an axis's judgement whose words are those of every `reason_gx` to `reason_az`, too.
@@ -40,7 +38,7 @@ REASON = "reason"
 LONGEST = 32
 
 
-class Written(NamedTuple):
+class DbcMessage(NamedTuple):
     """One message of the file, made from one of the pattern."""
 
     id: int
@@ -70,9 +68,9 @@ class Names:
 
 #: The names of the places.
 BY_PLACE = Names(
-    tuple(f"h{k}" for k in range(HYPOTHESES)),
-    (PLACE_NAMES,) * HYPOTHESES,
-    tuple((f"c{column}", "") for column in range(COLUMNS)),
+    tuple(f"h{k}" for k in range(MOST_HYPOTHESES)),
+    (PLACE_NAMES,) * MOST_HYPOTHESES,
+    tuple((f"c{column}", "") for column in range(MOST_COLUMNS)),
 )
 
 
@@ -159,7 +157,7 @@ def _different(names: Iterable[str]) -> list[str]:
     return symbols
 
 
-def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENSOR_UNITS)) -> str:
+def dbc_text(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENSOR_UNITS)) -> str:
     """The DBC file of a node, whose model has these names and axes. Messages of node 0 have no prefix; those of node 3
     begin with `M3_`, so that files of several nodes go together."""
     from cantools.database import load_file
@@ -167,7 +165,7 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENS
     pattern = cast("Database", load_file(PATTERN, sort_signals=None))
     reasons = pattern.get_message_by_name("GX_ADEQUACY").get_signal_by_name(REASON).choices
     prefix = f"M{node}_" if node else ""
-    messages: list[Written] = []
+    messages: list[DbcMessage] = []
 
     def same(signal: Signal) -> Signal:
         return _changed(signal, choices=reasons) if signal.name.startswith(f"{REASON}_") else signal
@@ -182,7 +180,7 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENS
             comment = comment.replace(theirs.replace("_", " "), ours)
         signals = [signal for signal in map(change, like.signals) if signal is not None]
         id_ = identifier(node, like.frame_id - BASE + more)
-        messages.append(Written(id_, prefix + (name or of), like.senders[0], signals, comment))
+        messages.append(DbcMessage(id_, prefix + (name or of), like.senders[0], signals, comment))
 
     add("STATUS")
     for axis in axes:
@@ -198,7 +196,8 @@ def dbc(node: int = 0, names: Names = BY_PLACE, axes: Sequence[str] = tuple(SENS
         for k, hypothesis in enumerate(names.hypotheses):
             known_as = f"hypothesis {k}{f', {remark(hypothesis)}' if names.known else ''}"
             change = _hypothesis(names, k, unit)
-            add("GX_H0", f"{big}_{small[k].upper()}", change, HYPOTHESES * index + k, gx=axis, hypothesis_0=known_as)
+            place = MOST_HYPOTHESES * index + k
+            add("GX_H0", f"{big}_{small[k].upper()}", change, place, gx=axis, hypothesis_0=known_as)
     commented: set[tuple[str, str | None]] = set()
 
     def first_with(signal: Signal) -> bool:

@@ -65,9 +65,9 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
         back = pairs.get((other, name))
         if back is None:  # the other one may follow by a lag or a rate alone
             source = found[other].state if other in found else record.axes[other]
-            known = source.best.ln_likelihood - without(source, name).best.ln_likelihood
+            known = source.best.ln_likelihood - without_axis(source, name).best.ln_likelihood
             if known > finding.look.gain - ALIKE:
-                _drop(found[name], other, without(found[name].state, other))
+                _drop(found[name], other, without_axis(found[name].state, other))
             continue
         ahead: float = back.look.gain - finding.look.gain
         if abs(ahead) < ALIKE:
@@ -76,7 +76,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
             sizes = [abs(float(side.look.estimate["coefficient"]["median"])) for side in (finding, back)]
             ahead = sizes[0] - sizes[1]
         if ahead > 0.0:
-            _drop(found[name], other, without(found[name].state, other))
+            _drop(found[name], other, without_axis(found[name].state, other))
     arms: dict[str, set[str]] = {}
     for name, other, _ in leaks(found):
         arms.setdefault(other, set()).add(name)
@@ -135,7 +135,7 @@ def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
     for _, other, finding in leaks(found):
         gains[other] = gains.get(other, 0.0) + finding.look.gain
     source = max(gains, key=lambda name: gains[name], default="")
-    free = {name: without(axis.state, source) for name, axis in found.items() if name != source}
+    free = {name: without_axis(axis.state, source) for name, axis in found.items() if name != source}
     if len(free) < 2 or gains[source] < NET_LEAST:
         return
     columns = {name: record.other_axes(name)[source] for name in free}
@@ -161,7 +161,7 @@ def _own_ramps(record: Record, found: Mapping[str, Diagnosed]) -> None:
         source = found[other].state if other in found else record.axes[other]
         if all(column.cause == "cross_axis" for column in source.regressors):
             continue
-        source, free = without(source, name), without(found[name].state, other)
+        source, free = without_axis(source, name), without_axis(found[name].state, other)
         rest = channel_looks.look(free, [_channel(record, other, bridged(source.rest))])
         if not any(look.net >= NET_LEAST for look in rest):
             _drop(found[name], other, free)
@@ -187,7 +187,7 @@ def _star(record: Record, found: Mapping[str, Diagnosed]) -> None:
         if partners[name] <= partners[other] or other not in found:
             continue
         axis, source = found[name], found[other]
-        free = without(axis.state, other)
+        free = without_axis(axis.state, other)
         back = channel_looks.look(source.state, [_channel(record, name, record.other_axes(other)[name])])
         lost = axis.state.best.ln_likelihood - free.best.ln_likelihood
         if back and back[0].gain > lost - ALIKE:  # of the pair that is shown already, the likelier source
@@ -208,9 +208,9 @@ def _source_shown(
     follow a third.
     """
     final = found[name].state
-    free = without(final, other)
+    free = without_axis(final, other)
     ahead = final.best.ln_likelihood - free.best.ln_likelihood
-    source = without(found[other].state if other in found else record.axes[other], name)
+    source = without_axis(found[other].state if other in found else record.axes[other], name)
     back = source.with_columns(record.other_axes(other)[name])[0]
     lagged = [finding for finding in findings if "lag_s" in finding.look.estimate]
     return ahead - back > ALIKE and all(_is_late(final, finding, record.other_axes(name)[other]) for finding in lagged)
@@ -226,7 +226,7 @@ def _is_late(final: State, finding: Finding, values: Array) -> bool:
     return final.best.ln_likelihood - instead > ALIKE and both - final.best.ln_likelihood < ALIKE
 
 
-def without(state: State, other: str) -> State:
+def without_axis(state: State, other: str) -> State:
     """The state without the columns of another axis."""
     kept = tuple(
         regressor

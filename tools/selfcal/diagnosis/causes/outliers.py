@@ -11,7 +11,7 @@ from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Scored, Sim
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import run
-from selfcal.likelihood.state import NET_LEAST, Look, State, interval, net
+from selfcal.likelihood.state import NET_LEAST, Look, State, net, normal_entry
 from selfcal.likelihood.statemodel import Array
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The two numbers of a mixture are at their limits in
@@ -87,8 +87,8 @@ def mixed(state: State, record: Record) -> list[Look]:
             gain,
             worth,
             {
-                "fraction": interval(fraction, math.sqrt(picked.size) / n, "1"),
-                "time_s": interval(float(record.time_s[largest]), 0.0, "s"),
+                "fraction": normal_entry(fraction, math.sqrt(picked.size) / n, "1"),
+                "time_s": normal_entry(float(record.time_s[largest]), 0.0, "s"),
             },
             {"y": y},
             when=(float(record.time_s[picked[0]]), float(record.time_s[picked[-1]])),

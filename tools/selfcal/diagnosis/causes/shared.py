@@ -19,11 +19,11 @@ from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
 from selfcal.diagnosis.cause import Cause, Grouping, Scored, shown
-from selfcal.diagnosis.causes.cross_axis import leaks, without
+from selfcal.diagnosis.causes.cross_axis import leaks, without_axis
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_EITHER
-from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, interval, net
+from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, net, normal_entry
 from selfcal.likelihood.statemodel import Array
 
 #: Bands are thirds of an octave, of so many bins of the spectrum at least.
@@ -189,13 +189,13 @@ def look(pair: Pair, found: Common, other: str) -> Look:
     size = found.correlation
     sd = (1.0 - size**2) / math.sqrt(max(2.0 * found.bins, 1.0))
     share, share_sd = abs(size), sd
-    estimate: dict[str, Any] = {"other": other, "correlation": interval(size, sd, "1")}
+    estimate: dict[str, Any] = {"other": other, "correlation": normal_entry(size, sd, "1")}
     if found.band is not None:
         U, V = (np.abs(spectrum) ** 2 for spectrum in pair.raw)
         first, end = found.band
         inside = math.sqrt(float(U[first:end].sum() / U.sum()) * float(V[first:end].sum() / V.sum()))
         share, share_sd = share * inside, share_sd * inside
-    estimate["share"] = interval(share, share_sd, "1")
+    estimate["share"] = normal_entry(share, share_sd, "1")
     if found.band is not None:
         hz = 1.0 / (pair.u.size * pair.dt)
         low = 0.0 if found.band[0] == 1 else found.band[0] * hz
@@ -305,7 +305,7 @@ def _leaks(
         other = str(finding.look.estimate["other"])
         if other not in states:
             continue
-        free = without(axis.state, other)
+        free = without_axis(axis.state, other)
         source = record.calm(other, states[other].whitened)
         both = common(pair_of(free.whitened, source, free.dt), ln_pairs)
         if both is None or both.net < NET_LEAST:

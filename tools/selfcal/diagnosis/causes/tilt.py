@@ -18,7 +18,7 @@ from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simu
 from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.state import NET_LEAST, Look, State, interval
+from selfcal.likelihood.state import NET_LEAST, Look, State, normal_entry
 from selfcal.likelihood.statemodel import Array
 
 #: Share by which the specific force at rest may differ from standard gravity.
@@ -84,7 +84,7 @@ def _turn_of(looks: Mapping[str, Look], states: Mapping[str, State]) -> tuple[di
     for k in np.argsort(np.abs(f))[:2]:
         row = -np.cross(f, np.eye(3))[:, k] / float(f @ f)
         sd = math.sqrt(float(row**2 @ weight))
-        angles[f"angle_{axes[k][-1]}_deg"] = interval(math.degrees(turn[k]), math.degrees(sd), "deg")
+        angles[f"angle_{axes[k][-1]}_deg"] = normal_entry(math.degrees(turn[k]), math.degrees(sd), "deg")
     return angles, sure
 
 

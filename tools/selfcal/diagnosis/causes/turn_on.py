@@ -15,7 +15,7 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Number, Shape
-from selfcal.likelihood.state import NET_LEAST, Look, Regressor, State, log_normal
+from selfcal.likelihood.state import NET_LEAST, FittedColumn, Look, State, log_normal
 from selfcal.likelihood.statemodel import Array
 
 #: The fastest time constant looked for, samples.
@@ -56,7 +56,7 @@ def _shape(state: State, record: Record, tau: Sequence[float]) -> Shape:
         f"{len(tau)}",
         rows,
         tuple(
-            Regressor(
+            FittedColumn(
                 f"turn_on_{constant:.4g}s", "turn_on", row, "1", {"kind": "turn_on", "tau_s": digits(float(constant))}
             )
             for constant, row in zip(tau, rows, strict=True)

@@ -37,7 +37,7 @@ from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, NEARLY
 from selfcal.likelihood.edges import WEIGHT_LEAST, raised
 from selfcal.likelihood.fit import run
-from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, interval, ln_looks, mixture, net
+from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, ln_looks, mixture, net, normal_entry
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.readings.moves import LEVEL
@@ -159,7 +159,7 @@ def looks(state: State, record: Record) -> list[Look]:
     if present.sum() < 4 * EDGE_SAMPLES:
         return []
     square = np.minimum(state.whitened[present] ** 2, MOST) + 1e-12
-    times = [_of_time(state, record, *ends) for _, ends in stretches([state])]
+    times = [_of_time(state, record, *ends) for _, ends in noisy_stretches([state])]
     best: dict[str, tuple[float, Level]] = {}
     for level in (*times, *levels(state, record)):
         gain = slope_of(square, level.values[present])[1]
@@ -189,7 +189,7 @@ def filtered(states: Sequence[State], power: Power, begin: int, end: int) -> Pow
     return Power.of(np.array(rows))
 
 
-def stretches(states: Sequence[State]) -> Iterator[tuple[Power, tuple[int, int]]]:
+def noisy_stretches(states: Sequence[State]) -> Iterator[tuple[Power, tuple[int, int]]]:
     """The likeliest change that lasts, and the likeliest stretch: the power of the axes beside it, and its ends."""
     first = Power.of(np.array([state.whitened for state in states]))
     for ends in first.best():
@@ -242,7 +242,7 @@ def _of_time(state: State, record: Record, begin: int, end: int) -> Level:
         if end < n:
             until = time(present, *likely(power.gain(begin, after)[0], after, wide))
             lasts, sds = until["median"] - found["time_s"]["median"], (until["sd"], found["time_s"]["sd"])
-            found["duration_s"] = interval(lasts, math.hypot(*sds), "s")
+            found["duration_s"] = normal_entry(lasts, math.hypot(*sds), "s")
         sds = ratios * np.sqrt(0.5 * wide * (1.0 / np.maximum(many, 1.0)).sum(axis=0)[0])
         return {**found, "ratio": mixture(weight, ratios, sds, "1")}
 
@@ -269,8 +269,8 @@ def levels(state: State, record: Record) -> Iterator[Level]:
                 "channel": name,
                 "input": by,
                 "form": "static",
-                "coefficient": interval(size, sd, "1" if unit == "1" else f"1/{unit}"),
-                "ratio": interval(ratio, ratio * span * sd, "1"),
+                "coefficient": normal_entry(size, sd, "1" if unit == "1" else f"1/{unit}"),
+                "ratio": normal_entry(ratio, ratio * span * sd, "1"),
             }
 
         return Level(name, values - values.mean(), lambda gain: price, told)

@@ -194,7 +194,7 @@ def meta_place(path: Path) -> Path:
     return path.with_name(path.name + ".meta.json")
 
 
-def content(path: Path) -> bytes:
+def file_content(path: Path) -> bytes:
     """All of a file, in blocks: memory is taken for what is there."""
     blocks, size = [], 0
     with path.open("rb") as stream:

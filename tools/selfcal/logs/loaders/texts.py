@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import BinaryIO, NoReturn, cast
 
-from selfcal.base.errors import UserError, printable, shown
+from selfcal.base.errors import UserError, printable, short_value
 from selfcal.base.limits import MOST_COLUMNS, MOST_META_BYTES, read_text, reading
 from selfcal.logs.loaders import TEXT, ZIP
 from selfcal.logs.loaders.table import Field, Rows, Table, meta_place, parse_meta
@@ -64,7 +64,7 @@ class TextTable(Table):
         columns = [column for column in read if column is not None]
         rows = columns[0].size
         if meta.get("rows", rows + reader.skipped) != rows + reader.skipped:
-            what = f"{rows} rows where {meta_place(path).name} says {shown(meta['rows'])}"
+            what = f"{rows} rows where {meta_place(path).name} says {short_value(meta['rows'])}"
             raise UserError(f"{path}: {what}: it was cut or changed; without that file it is read as it is")
         skipped = "1 line is no row and was skipped"
         if reader.skipped > 1:

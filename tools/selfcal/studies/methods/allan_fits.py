@@ -37,7 +37,7 @@ def slopes(problem: Problem) -> Answer:
     return Answer({"random_walk": {"N": N, "K": K}} if "random_walk" in problem.laws else {"constant": {"N": N}})
 
 
-def fit(problem: Problem) -> Answer:
+def fit_weighted(problem: Problem) -> Answer:
     """Weighted least squares in the logarithm of the Allan variance, each point with its own degrees of freedom. The
     points count as independent, as is the practice. Laws are weighed by AIC of this fit."""
     m, deviation, freedom = curve(problem)

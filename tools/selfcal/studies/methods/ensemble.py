@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.drawn import draw, simulate_bank_samples
+from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
 from selfcal.batch.spread import Row
 from selfcal.model.file import Group, Model, Prior
 from selfcal.model.laws import NAMED
@@ -36,7 +36,7 @@ class Cell:
 def rows_of(model: Model, axis: str, truth_from: str, chosen: Sequence[Rival], cell: Cell) -> list[Row]:
     """A row for each method. The estimates are those of the true law, the weights those of all laws."""
     group = model.group_of(axis)
-    truth = draw(group, cell.law, np.random.default_rng([cell.seed, list(NAMED).index(cell.law)]))
+    truth = draw_parameters(group, cell.law, np.random.default_rng([cell.seed, list(NAMED).index(cell.law)]))
     if truth_from == "middle":
         truth |= {name: group.priors[name].median for name in NAMED[cell.law].parameters}
     y, _ = simulate_bank_samples(cell.law, truth, model.bank_rate_hz, cell.samples, cell.seed)
@@ -63,7 +63,7 @@ def rows_of(model: Model, axis: str, truth_from: str, chosen: Sequence[Rival], c
     return rows
 
 
-def summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
+def ensemble_summary(rows: Sequence[Row], group: Group) -> list[dict[str, Any]]:
     """An entry for each number of samples, law and method.
 
     Of each parameter: the rms error of its logarithm, over the reference's with a 95 % interval; the share of the 90 %

@@ -24,10 +24,10 @@ SHRINK = (3.0 * 0.99 - 1.0) / (2.0 * 0.99)
 
 def particles(problem: Problem) -> Answer:
     """Weighted medians and quantiles of the last particles, laws by their evidence."""
-    return answer(problem, begin, step)
+    return particle_answer(problem, begin, step)
 
 
-def answer(problem: Problem, begin: Begin, step: Step) -> Answer:
+def particle_answer(problem: Problem, begin: Begin, step: Step) -> Answer:
     """What the particles find for each law, each with the same seed."""
     estimates: dict[str, dict[str, Value]] = {}
     ln_evidence: dict[str, float] = {}

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from selfcal.adequacy.allan import LONGEST, Terms, overlapping, terms_of
+from selfcal.adequacy.allan import LONGEST, AllanTerms, allan_terms, overlapping_variance
 from selfcal.bank.axis_result import HALF_90
 from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Group, Prior
@@ -42,10 +42,10 @@ class Problem:
         """The laws with a drift."""
         return tuple(law for law in self.laws if law != "constant")
 
-    def terms(self, law: str, ln_theta: Floats) -> Terms:
+    def terms(self, law: str, ln_theta: Floats) -> AllanTerms:
         """The law at the logarithms of its parameters."""
         theta = dict(zip(NAMED[law].parameters, np.exp(ln_theta).tolist(), strict=True))
-        return terms_of(NAMED[law], theta, self.dt_s)
+        return allan_terms(NAMED[law], theta, self.dt_s)
 
     def step(self, law: str, ln_theta: Floats) -> tuple[Floats, Floats]:
         """What remains of the drift after a sample, and the variance of what is added, at ln parameters [d, ...]."""
@@ -65,7 +65,7 @@ class Problem:
         if law == "constant":
             return [np.log([N])]
         m = max(2, n // 10)
-        long = math.sqrt(max(overlapping(self.y, m)[0] - white**2 / m, 0.01 * white**2))
+        long = math.sqrt(max(overlapping_variance(self.y, m)[0] - white**2 / m, 0.01 * white**2))
         if law == "random_walk":
             return [np.log([N, long * math.sqrt(3.0 / (m * dt))])]
         return [np.log([N, long, 1.0 / (part * n * dt)]) for part in (0.2, 0.03, 0.005)]
@@ -82,7 +82,7 @@ class Problem:
         """Averaging times in readings, an octave apart, and overlapping Allan variances."""
         y = self.y - self.y.mean()
         m = np.exp2(np.arange(max(1, math.floor(math.log2(max(2, y.size // LONGEST))) + 1)))
-        return m, np.array([overlapping(y, int(length))[0] for length in m])
+        return m, np.array([overlapping_variance(y, int(length))[0] for length in m])
 
 
 @dataclass(frozen=True)

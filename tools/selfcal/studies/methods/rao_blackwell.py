@@ -10,13 +10,13 @@ import math
 
 import numpy as np
 
-from selfcal.studies.methods.particles import PARTICLES, answer
+from selfcal.studies.methods.particles import PARTICLES, particle_answer
 from selfcal.studies.methods.problem import Answer, Floats, Problem
 
 
 def rao_blackwell(problem: Problem) -> Answer:
     """Weighted medians and quantiles of the last particles, laws by their evidence."""
-    return answer(problem, begin, step)
+    return particle_answer(problem, begin, step)
 
 
 def begin(problem: Problem, law: str, ln_theta: Floats, _rng: np.random.Generator) -> Floats:

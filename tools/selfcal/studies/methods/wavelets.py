@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from selfcal.adequacy.allan import Terms
+from selfcal.adequacy.allan import AllanTerms
 from selfcal.base.grid import SLOPE_STEP
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, inverse, logarithmic, maximum
@@ -21,7 +21,7 @@ from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, inve
 _SECOND = ((0, 1.0), (1, -2.0), (2, 1.0))
 
 
-def covariance(terms: Terms, m: Floats, n: int) -> Floats:
+def covariance(terms: AllanTerms, m: Floats, n: int) -> Floats:
     """Of the overlapping Allan variances [t, t] at `m` readings of a normal record of `n`: twice the sum of the squared
     covariances of the differences behind them."""
     covariance = np.empty((m.size, m.size))
