@@ -432,7 +432,7 @@ def test_a_large_offset_changes_nothing_but_the_bias() -> None:
 
 
 def test_a_grid_out_of_reach_is_an_error_not_a_hang(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(reference, "_MOST", 100)
+    monkeypatch.setattr(reference, "_NODES_MOST", 100)
     with pytest.raises(UserError, match="more than 100 nodes"):
         reference_axis(a_record(30)[0], DT, group(), {"random_walk": 1.0})
 

@@ -18,7 +18,7 @@ from selfcal.base.errors import UserError
 from selfcal.diagnosis.axis_verdict import coherence, joined_looks, look_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
-from selfcal.diagnosis.record import LEAST, Record
+from selfcal.diagnosis.record import FEWEST, Record
 from selfcal.diagnosis.statistics import Statistic, judged
 from selfcal.likelihood.state import NET_LEAST, Look, State
 from selfcal.likelihood.statemodel import Array
@@ -196,7 +196,7 @@ def test_a_dead_band_is_shown(kind: str, tmp_path: Path) -> None:
                 if abs(y[k] - y[k - 1]) < width:
                     y[k] = y[k - 1]
         log = log_of(tmp_path / "dead.npz", 0.04 * y, 1.0)
-        if kind == "held" and np.count_nonzero(np.diff(y)) < LEAST:
+        if kind == "held" and np.count_nonzero(np.diff(y)) < FEWEST:
             with pytest.raises(UserError, match="of its readings neither stick nor are clipped"):
                 diagnose(log)
             continue

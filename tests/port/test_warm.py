@@ -23,7 +23,7 @@ from warm_start import LAW, PART, both, campaign, diagnosed, law_known
 from selfcal.bank.axis_result import HALF_90
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
-from selfcal.diagnosis.warm import REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load_start, warmed
+from selfcal.diagnosis.warm import PRIOR_REACH, RUN_TO_RUN, RUN_TO_RUN_COEFFICIENT, WIDENED, load_start, warmed
 from selfcal.logs.recording import load as load_recording
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.regressors import columns_of
@@ -63,7 +63,7 @@ def test_the_prior_is_the_posterior_widened(files: Files) -> None:
             sd = math.hypot(math.log(told["q95"] / told["q05"]) / (2.0 * HALF_90), RUN_TO_RUN[name])
             assert measured
             assert (low, high) == pytest.approx(
-                (math.log(told["median"]) - REACH * sd, math.log(told["median"]) + REACH * sd)
+                (math.log(told["median"]) - PRIOR_REACH * sd, math.log(told["median"]) + PRIOR_REACH * sd)
             )
         assert (h.rho, h.alpha, h.ln_probability) == (cold.rho, cold.alpha, cold.ln_probability)
     one = posterior["regressors"]["temperature"]["coefficients"]["temperature"]

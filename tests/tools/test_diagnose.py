@@ -27,7 +27,7 @@ from selfcal.diagnosis.cause import Looks
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import _looked
 from selfcal.diagnosis.record import Record as OfAxes
-from selfcal.diagnosis.swing import MOST as BANDS_MOST
+from selfcal.diagnosis.swing import SWINGS_MOST as BANDS_MOST
 from selfcal.likelihood.fit import (
     COLUMNS_MOST,
     Series,

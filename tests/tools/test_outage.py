@@ -30,7 +30,7 @@ from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import (
     GPS_S,
-    LONGEST_S,
+    LONGEST_OUTAGE_S,
     RATE_HZ,
     FilterNoise,
     Filters,
@@ -41,7 +41,7 @@ from selfcal.studies.outage import COORDINATES, OUTAGES_S, KnownAxis, flights, w
 from selfcal.verbs.diagnose import diagnose, show
 from selfcal.verbs.simulate import simulate
 
-STEPS = (GPS_S + LONGEST_S) * RATE_HZ
+STEPS = (GPS_S + LONGEST_OUTAGE_S) * RATE_HZ
 SHEET = [{"N": SHEET_N[unit]} for unit in AXES.values()]
 
 

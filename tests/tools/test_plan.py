@@ -19,7 +19,7 @@ from test_cases_priors import at_rest, write
 
 from selfcal.base.errors import UserError
 from selfcal.batch.design import Experiment, drawn_rows
-from selfcal.batch.plan import LEAST, Wish, _half_interval, coefficient_rows, rows_of, steady_level
+from selfcal.batch.plan import LENGTH_LEAST, Wish, _half_interval, coefficient_rows, rows_of, steady_level
 from selfcal.model.file import DEFAULT, Model
 from selfcal.verbs.part import part as part_of_log
 from selfcal.verbs.plan import plan
@@ -86,7 +86,7 @@ def test_the_planned_length_suffices(tmp_path: Path, name: str) -> None:
         reached = share(wish, samples)
         print(f"{name}, {text}: {entry['duration_s']:.0f} s, reached by {reached:.3f}")
         assert reached >= 0.9 - off[0], (text, reached)
-        if reached > 0.9 + off[1] and samples > LEAST:
+        if reached > 0.9 + off[1] and samples > LENGTH_LEAST:
             assert share(wish, math.floor(0.97 * samples)) <= 0.9 + off[1], (text, reached)
     assert document["duration_s"] == max(one["duration_s"] for one in document["wishes"])
 

@@ -31,11 +31,11 @@ from selfcal.model.tables import Tables
 _Floats = NDArray[np.float64]
 
 #: Least length of a record over its longest averaging time: fewer windows say little.
-LONGEST = 5
+AVERAGES_LEAST = 5
 #: Least share of a variance S that S - V keeps: nearly equal numbers have a small difference.
 LEFT_LEAST = 0.2
 #: Number of draws of a posterior.
-DRAWS = 256
+CURVE_DRAWS = 256
 #: Averaging times of a curve in an octave.
 PER_OCTAVE = 4
 
@@ -206,7 +206,7 @@ def fit_of(
 
 def lengths(n: int, per_octave: int = 1) -> NDArray[np.int64]:
     """2 readings, twice as many and so on to a fifth of `n`, and with `per_octave` some between."""
-    octaves = math.log2(n / (2 * LONGEST)) if n > 2 * LONGEST else -1.0
+    octaves = math.log2(n / (2 * AVERAGES_LEAST)) if n > 2 * AVERAGES_LEAST else -1.0
     return np.unique(
         np.rint(2.0 ** (1.0 + np.arange(math.floor(octaves * per_octave) + 1) / per_octave)).astype(np.int64)
     )
@@ -269,7 +269,7 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     if 0 < memory < y.size:
         y, shared = y[-memory:], 1.0 - 2.0 * math.exp(-2.0)
     n = int(np.isfinite(y).sum())
-    if n < 2 * LONGEST:
+    if n < 2 * AVERAGES_LEAST:
         return None
     y = y - float(np.nanmean(y))
     rows = [(int(m), *overlapping_variance(y, int(m))) for m in lengths(n, PER_OCTAVE)]
@@ -298,14 +298,14 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
 
 
 def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats) -> dict[str, _Floats]:
-    """Values [DRAWS] of each parameter of a law: its own median and quantiles, and between parameters the correlation
-    of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive recurrence:
-    Roberts 2018), so that quantiles of functions of them are smooth."""
+    """Values [CURVE_DRAWS] of each parameter of a law: its own median and quantiles, and between parameters the
+    correlation of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive
+    recurrence: Roberts 2018), so that quantiles of functions of them are smooth."""
     chosen = list(estimates.values())
     sd = np.sqrt(np.diag(covariance))
     d = len(chosen)
     root, _ = bisected(lambda x: x ** (d + 1) >= x + 1.0, 1.0, 2.0)
-    even = (0.5 + np.outer(np.arange(1, DRAWS + 1), root ** -np.arange(1.0, d + 1))) % 1.0
+    even = (0.5 + np.outer(np.arange(1, CURVE_DRAWS + 1), root ** -np.arange(1.0, d + 1))) % 1.0
     z = ndtri(even) @ np.linalg.cholesky(covariance / np.outer(sd, sd)).T
     middle = np.log([e.median for e in chosen])
     up = (np.log([e.q95 for e in chosen]) - middle) / HALF_90

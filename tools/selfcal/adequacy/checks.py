@@ -13,12 +13,12 @@ from scipy.special import ndtr, ndtri
 
 from selfcal.adequacy.allan import LEFT_LEAST, AllanCurve, allan_terms, curve_of, ratio_at
 from selfcal.bank.axis_result import AxisResult, Estimate
-from selfcal.bank.blocks import FEWEST, MOST_DENSE, Blocks
+from selfcal.bank.blocks import BLOCKS_LEAST, MOST_DENSE, Blocks
 from selfcal.bank.priors import rounded
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
 from selfcal.logs.recording import Recording
-from selfcal.logs.sampling import CHANGE
+from selfcal.logs.sampling import RATE_CHANGE_LEAST
 from selfcal.model.file import Group, Prior
 from selfcal.model.tables import Tables
 from selfcal.readings.budget import CHECK_LIMIT, FALSE_ALARM
@@ -31,7 +31,7 @@ BATCH_LIMIT = -float(ndtri(0.25 * FALSE_ALARM))
 #: 0.9, where a faster drift heaps up: of 32 records each 32 of 3 N fail, 26 of 2.5 N, 6 of 2.2 N and none of 1.9 N.
 HIDDEN_MOST = 0.84
 #: Length of an average over a filter's time constant: it shows N before a first-order filter to 5 %.
-CORNERS = 10.0
+CORNER_LENGTH = 10.0
 #: Largest spacing of float32 in the noise of a reading: beyond it N is 0.4 % too large.
 SPACING_MOST = 0.3
 
@@ -61,7 +61,7 @@ def judge_record(
     sound = all(math.isfinite(estimate.median) for estimate in result.parameters[result.best].values())
     if blocks.mean.size > MOST_DENSE or not sound:
         return Judged({}, None)
-    if int(np.isfinite(blocks.mean).sum()) < FEWEST + len(used):
+    if int(np.isfinite(blocks.mean).sum()) < BLOCKS_LEAST + len(used):
         return Judged({}, None)
     left = blocks
     if used:
@@ -117,8 +117,8 @@ def with_rate(
     if white > walk:
         alike_hz = rate_hz * math.sqrt(max(walk, 0.0) / white)
         rates["decimate_hz"] = rounded(min(rate_hz, max(2.0 / tables.dt_s, alike_hz)))
-    elif alpha is not None and values.size * alpha.median > FEWEST * CORNERS * rate_hz:
-        rates["decimate_hz"] = rounded(alpha.median / CORNERS)
+    elif alpha is not None and values.size * alpha.median > BLOCKS_LEAST * CORNER_LENGTH * rate_hz:
+        rates["decimate_hz"] = rounded(alpha.median / CORNER_LENGTH)
     return replace(judged, checks={**judged.checks, "drift_in_average": {**judged.checks["drift_in_average"], **rates}})
 
 
@@ -190,7 +190,7 @@ def with_readings(
     if as_fed:
         if readings.changes:
             ratio = max((change.after_hz / change.before_hz - 1.0 for change in readings.changes), key=abs)
-            checks["rate_change"] = {"value": ratio, "limit": CHANGE, "passed": False}
+            checks["rate_change"] = {"value": ratio, "limit": RATE_CHANGE_LEAST, "passed": False}
         if readings.coarse > SPACING_MOST:
             checks["float_spacing"] = {"value": readings.coarse, "limit": SPACING_MOST, "passed": False}
     return replace(judged, checks={**judged.checks, **checks})

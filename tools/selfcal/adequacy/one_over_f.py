@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.allan import LONGEST, allan_terms, fit_of, posterior_draws
+from selfcal.adequacy.allan import AVERAGES_LEAST, allan_terms, fit_of, posterior_draws
 from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.priors import MOST_INTERVALS, NARROW
 from selfcal.base.errors import UserError
@@ -31,11 +31,11 @@ _Floats = NDArray[np.float64]
 FLICKER = "flicker"
 #: Least probability of 1/f noise that is called sure. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
 #: root of a second, 5 reach 0.9 and none 0.97.
-SURE = 0.98
+SURE_PROBABILITY = 0.98
 #: Frequency at which the white noise is the rest of the spectrum, radians a bank interval.
 _OMEGA = 2.0 * math.pi / 3.0
 #: Least share of the law's own white noise that is left.
-_LEAST = 1e-3
+_WHITE_LEAST = 1e-3
 #: Nodes of rho and of alpha.
 _NODES = (24, 20)
 
@@ -59,7 +59,7 @@ def white_beside(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floa
     """N [k] next to 1/f noise, of draws [k] of the parameters of the law `flicker`."""
     square = draws["N"] ** 2
     left = square - density_above(draws["alpha"], dt_s, block) * draws["B"] ** 2
-    return np.asarray(np.sqrt(np.maximum(left, _LEAST**2 * square)))
+    return np.asarray(np.sqrt(np.maximum(left, _WHITE_LEAST**2 * square)))
 
 
 def beside_its_law(parameters: Mapping[str, float], dt_s: float, block: int) -> float:
@@ -73,13 +73,13 @@ def with_white(result: AxisResult, group: Group, dt_s: float, n: int, block: int
     record is too short for it."""
     estimates = result.parameters.get(FLICKER, {})
     medians = {name: estimate.median for name, estimate in estimates.items()}
-    if not estimates or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
+    if not estimates or n < 2 * AVERAGES_LEAST or not all(math.isfinite(value) for value in medians.values()):
         return result
     fit = fit_of(FLICKER, medians, group, dt_s, n, np.ones(1), block=block)
     draws = posterior_draws(estimates, fit.covariance)
     white = white_beside(draws, dt_s, block)
     low, middle, high = np.quantile(white, (0.05, 0.5, 0.95)).tolist()
-    identified = estimates["N"].identified and low > 2.0 * _LEAST * medians["N"]
+    identified = estimates["N"].identified and low > 2.0 * _WHITE_LEAST * medians["N"]
     own = Estimate(float(white.mean()), middle, float(white.std()), low, high, identified, estimates["N"].off_grid)
     return replace(result, parameters={**result.parameters, FLICKER: {**estimates, "N": own}})
 
@@ -99,7 +99,7 @@ class AddedLaw:
 
     def laws(self, probability: Mapping[str, float]) -> dict[str, float]:
         """The probabilities of all laws where this one is sure; else none."""
-        if self.probability < SURE:
+        if self.probability < SURE_PROBABILITY:
             return {}
         return {**{law: (1.0 - self.probability) * p for law, p in probability.items()}, self.law: self.probability}
 

@@ -27,7 +27,7 @@ from selfcal.base.units import SENSORS, factor, parameter_unit
 from selfcal.logs.recording import Recording, check_column
 from selfcal.model.file import DEFAULT, LONGEST_TEXT, Model, Prior
 from selfcal.readings.lattice import step_of
-from selfcal.readings.readings import ROUNDED, Readings, look
+from selfcal.readings.readings import RANGE_ROUNDED, Readings, look
 from selfcal.readings.rest import rest_of
 
 #: Keys of a data sheet for a group or an axis, and for the part. `density` is one-sided, as data sheets have
@@ -36,7 +36,7 @@ STATED, OF_PART = ("N", "density", "K", "B", "bias", "range", "lsb"), ("rate",)
 #: Kinds of axes by a unit of each: their group's name, and its unit where the recording does not decide it.
 KINDS = {"rad/s": "gyro", "m/s^2": "accel", "T": "field", "Pa": "pressure", "degC": "temperature", "V": "voltage"}
 #: Largest ratio of a recording's rate to its sensor's.
-FASTER = 1.01
+FASTER_MOST = 1.01
 #: Least sd of the bias prior over N, of an axis of another kind, 1/sqrt(s).
 LEAST_BIAS = 1000.0
 
@@ -151,8 +151,8 @@ def put_read_out(tree: dict[str, Any], model: Model, readings: Mapping[str, Read
     the readings do not contradict: those of a log that averages its sensor do not show the sensor's.
     """
     sensor, rate_hz = tree["sensor"], max(axis.recording.rate_hz for axis in readings.values())
-    averaged = stated and sensor["rate_hz"] > FASTER * rate_hz
-    if not stated or rate_hz > FASTER * sensor["rate_hz"]:
+    averaged = stated and sensor["rate_hz"] > FASTER_MOST * rate_hz
+    if not stated or rate_hz > FASTER_MOST * sensor["rate_hz"]:
         sensor |= {"rate_hz": float(f"{rate_hz:.6g}"), "filter_taps": 1}
     said = [f"{sensor['rate_hz']:g} Hz"]
     for group in model.groups:
@@ -191,7 +191,7 @@ def _inside(readings: Readings, limit: float) -> bool:
     """Whether a range of both signs keeps no reading of an axis out; where it clips, its level alone counts."""
     values = _known(readings)
     largest = np.abs(values).max() if readings.clipped is None else abs(np.median(values))
-    return bool(largest <= limit * (1.0 + ROUNDED))
+    return bool(largest <= limit * (1.0 + RANGE_ROUNDED))
 
 
 def _known(readings: Readings) -> NDArray[np.float64]:

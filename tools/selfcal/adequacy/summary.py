@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.adequacy.allan import DRAWS, LONGEST, PER_OCTAVE, AllanTerms, fit_of, posterior_draws
-from selfcal.adequacy.one_over_f import FLICKER, SURE, AddedLaw, white_beside
+from selfcal.adequacy.allan import AVERAGES_LEAST, CURVE_DRAWS, PER_OCTAVE, AllanTerms, fit_of, posterior_draws
+from selfcal.adequacy.one_over_f import FLICKER, SURE_PROBABILITY, AddedLaw, white_beside
 from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
@@ -35,7 +35,7 @@ COLOURED = "spectral_ratio"
 #: Largest factor that is stated: of a rest to the record, of a unit's quantity to the batch's median.
 MOST_TIMES = 1000.0
 #: Least probability of a law that counts.
-_LEAST = 1e-3
+_LAW_LEAST = 1e-3
 #: Least ratio of an axis' N to its siblings' or its data sheet's that a line names.
 NOISIER = 2.0
 #: Least share of the posterior with a walk, or a minimum, that identifies the number.
@@ -70,18 +70,18 @@ def summarize(
     the group's unit: of `n` readings every `dt_s`, gaps among them, each the mean of `block` samples. Empty where the
     record is too short for an Allan deviation. `beside`: 1/f noise, added to the laws of the result. `counted`:
     likewise white noise with quantization noise (counted.py)."""
-    if n < 2 * LONGEST:
+    if n < 2 * AVERAGES_LEAST:
         return {}
     more = 0.0 if beside is None else beside.probability
     left = 1.0 if counted is None else 1.0 - counted.probability
     laws = [
         AddedLaw(probability * (1.0 - more) * left, result.parameters[law], group, dt_s, n, block, law)
         for law, probability in result.probability.items()
-        if probability >= _LEAST  # of the model's, whatever is added to them
+        if probability >= _LAW_LEAST  # of the model's, whatever is added to them
     ]
     of_model = len(laws)
     others = ((beside, more * left), (counted, 1.0 - left))
-    laws += [replace(law, probability=share) for law, share in others if law is not None and share >= _LEAST]
+    laws += [replace(law, probability=share) for law, share in others if law is not None and share >= _LAW_LEAST]
     sound = [
         (law, k < of_model)
         for k, law in enumerate(laws)
@@ -92,7 +92,7 @@ def summarize(
     white, walk, q, floor, side = (
         np.concatenate(rows) for rows in zip(*(_draws(law) for law, _ in sound), strict=True)
     )
-    w, own = np.repeat([[law.probability, float(mine)] for law, mine in sound], DRAWS, axis=0).T
+    w, own = np.repeat([[law.probability, float(mine)] for law, mine in sound], CURVE_DRAWS, axis=0).T
     w = w / w.sum()
     w_walk = w * own / max(float(w @ own), 1e-300) if (w * own).any() else w
     numbers = {
@@ -114,7 +114,7 @@ def summarize(
         return sum(share for share, sure in own if not sure) > 0.5 * sum(share for share, _ in own)
 
     rrw, why = numbers["rrw"].estimate, ""
-    if more >= SURE:
+    if more >= SURE_PROBABILITY:
         why = ONE_OVER_F
     elif float(w_walk[walk > 0.0].sum()) < _SURE:
         why = NO_WALK if max(result.probability.values()) >= _SURE else NOT_DECIDED
@@ -194,7 +194,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     estimates = result.parameters[law]
     open_ = [name for name, estimate in estimates.items() if not estimate.identified]
     medians = {name: estimate.median for name, estimate in estimates.items()}
-    if not open_ or n < 2 * LONGEST or not all(math.isfinite(value) for value in medians.values()):
+    if not open_ or n < 2 * AVERAGES_LEAST or not all(math.isfinite(value) for value in medians.values()):
         return {}
 
     def variance(times: float) -> dict[str, float]:

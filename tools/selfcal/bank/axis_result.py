@@ -18,7 +18,7 @@ from selfcal.model.laws import RATIOS
 #: Standard deviations from the middle of a normal to either end of its 90 % interval.
 HALF_90 = NormalDist().inv_cdf(0.95)
 #: Least probability of a law that a table, a picture or a prior takes into account.
-FAINT = 0.01
+LAW_LEAST = 0.01
 
 
 def likeliest(probability: Mapping[str, float]) -> str:

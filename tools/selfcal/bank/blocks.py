@@ -20,7 +20,7 @@ from selfcal.readings.readings import mostly_beyond
 #: Intervals of an even grid, gaps included, that are computed one by one.
 MOST_DENSE = 10_000_000
 #: Fewest bank samples that are checked.
-FEWEST = 20
+BLOCKS_LEAST = 20
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def usable_blocks(
         more = alone if tables.block > 1 and each >= needed else ""
         raise UserError(f"too short: {averages}, {needed} are needed (samples kept out: {kept}){more}")
     # Other averages have lost most of their samples.
-    if present.size < FEWEST and whole < 0.25 * each:
+    if present.size < BLOCKS_LEAST and whole < 0.25 * each:
         raise UserError(f"too few whole averages: {averages} hold {whole:.0f} of the {each} readings{alone}")
     if not present.std() > 0.0:
         equal = f"all {present.size} averages are equal ({present[0]:g} {group.unit})"

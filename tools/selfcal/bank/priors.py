@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from selfcal.bank.axis_result import FAINT, AxisResult
+from selfcal.bank.axis_result import LAW_LEAST, AxisResult
 from selfcal.base.errors import UserError
 from selfcal.base.grid import MEDIAN_SD
 from selfcal.logs.recording import Recording, as_float
@@ -26,8 +26,8 @@ from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
 from selfcal.model.laws import RATIOS
 from selfcal.model.tables import bank_block, make_tables
 from selfcal.readings.budget import CHECK_LIMIT, CLEARLY
-from selfcal.readings.lattice import ROUNDED
-from selfcal.readings.rest import FEWEST, rest_of
+from selfcal.readings.lattice import SAME_VALUE_SHARE
+from selfcal.readings.rest import PIECES_LEAST, rest_of
 
 #: Factor of the own prior of N to each side of the record's N.
 DECADES = 100.0
@@ -161,8 +161,8 @@ def seen_of(recording: Recording, name: str, model: Model) -> Seen | None:
             mean = total[whole] / size[whole]
             level = level if rows else float(np.median(mean))
             step = np.diff(mean)[np.diff(interval[whole]) == 1]
-            step[np.abs(step) < ROUNDED * np.abs(mean).max()] = 0.0
-            if step.size < (24 if rows else FEWEST):  # of a drift, more
+            step[np.abs(step) < SAME_VALUE_SHARE * np.abs(mean).max()] = 0.0
+            if step.size < (24 if rows else PIECES_LEAST):  # of a drift, more
                 break
             square = step * step
             typical, all_of_them = float(np.median(square)) / MEDIAN_SD**2, float(square.mean())
@@ -295,7 +295,7 @@ def _gains(first: AxisResult, second: AxisResult, moved: Collection[str]) -> boo
     gain = {law: second.log_evidence[law] - before for law, before in first.log_evidence.items()}
     whole = [float(np.logaddexp.reduce(list(result.log_evidence.values()))) for result in (first, second)]
     return whole[1] > whole[0] + CLEARLY or any(
-        gain[law] > CLEARLY and second.probability[law] > FAINT
+        gain[law] > CLEARLY and second.probability[law] > LAW_LEAST
         for law, estimates in second.parameters.items()
         if not estimates.keys().isdisjoint(moved) and not {"alpha"} & estimates.keys() & set(moved)
     )

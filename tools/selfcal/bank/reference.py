@@ -33,7 +33,7 @@ _STEP = 0.75
 #: Fewest steps of a direction between its limits.
 _FEWEST = 24
 #: Most nodes of a hypothesis, and of a direction: a larger posterior is out of this engine's reach.
-_MOST = 2**20
+_NODES_MOST = 2**20
 #: Gregory's weights of the nodes nearest an end, from differences up to the fourth: error of order h^6.
 _GREGORY = np.array([95 / 288, 317 / 240, 23 / 30, 793 / 720, 157 / 160])
 
@@ -73,7 +73,7 @@ def reference_axis(
     white noise variance of each (None: 1). `hypotheses`: prior probability by name. `z` float64[n, p] are the columns
     of the regressors in use, less their references, with the prior `coefficient_sd` of each. `y` are means of `block`
     samples. The bias is at `ahead_s` after the last of them. Raises UserError without a sample, and when a
-    posterior would take more than `_MOST` nodes.
+    posterior would take more than `_NODES_MOST` nodes.
     Source: Stepanov & Motorin (2017), equations (11) to (14).
     """
     n = int(np.isfinite(y).sum())
@@ -264,7 +264,7 @@ class _Lattice:
     ) -> None:
         self.filtered, self.low, self.high = filtered, low, high
         steps = np.maximum(np.ceil((high - low) / (_STEP * widths)), _FEWEST)
-        self.count: _Indices = (2 * np.ceil(np.minimum(steps, _MOST) / 2)).astype(np.int64)
+        self.count: _Indices = (2 * np.ceil(np.minimum(steps, _NODES_MOST) / 2)).astype(np.int64)
         self.index: _Indices = np.empty((0, len(low)), np.int64)
         self.value = np.empty(0)
         self.mean, self.var = np.empty((0, moments)), np.empty((0, moments))
@@ -308,7 +308,7 @@ class _Lattice:
                 # ln evidence may change by 4e-4, which moves a probability by 1e-4, and a moment by 5e-3 posterior sd.
                 excess.append(max(abs(half[0] - full[0]) / 4e-4, float(moments.max()) / 5e-3))
             worst = int(np.argmax(excess))
-            if excess[worst] <= 1.0 or self.count[worst] >= _MOST:
+            if excess[worst] <= 1.0 or self.count[worst] >= _NODES_MOST:
                 return
             self.index[:, worst] *= 2
             self.count[worst] *= 2
@@ -351,9 +351,9 @@ class _Lattice:
         return np.concatenate([[math.log(total)], mean, np.sqrt(mass @ (x - mean) ** 2 / total)])
 
     def _add(self, index: _Indices) -> None:
-        if len(self.index) + len(index) > _MOST:
+        if len(self.index) + len(index) > _NODES_MOST:
             raise UserError(
-                f"the reference engine needs more than {_MOST} nodes for this record; take --engine library"
+                f"the reference engine needs more than {_NODES_MOST} nodes for this record; take --engine library"
             )
         new = self.filtered(self.x(index))
         self.index = np.concatenate([self.index, index])

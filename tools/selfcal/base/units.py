@@ -99,7 +99,7 @@ class Unit:
 
 _FACTOR = re.compile(r"(?:sqrt\((?P<root>\w+)\)|(?P<atom>\w+)(?:\^(?P<power>-?\d(?:\.\d{1,2})?))?)\Z", re.ASCII)
 #: Longest name of a unit, and its sizes in SI: all that means something, and no power of it overflows.
-_LONGEST, _LEAST, _MOST = 60, 1e-30, 1e30
+_NAME_MOST, _SIZE_LEAST, _SIZE_MOST = 60, 1e-30, 1e30
 #: Signs of data sheets, and their spelling here.
 _SIGNS = str.maketrans(
     {"°": "deg", "º": "deg", "℃": "degC", "℉": "degF", "²": "^2", "³": "^3", "µ": "u", "μ": "u", "⁻": "-", "¹": "1",
@@ -150,7 +150,7 @@ def plain(name: str) -> str:
     """`name` in this module's spelling: `°/s` -> `deg/s`, `m/s²`, `m s^-2`, `m/s2` -> `m/s^2`;
     `√Hz` -> `sqrt(Hz)`; other texts stay."""
     spelled = _ROOT.sub(r"sqrt(\1)", name.strip().replace("°s", "deg s").translate(_SIGNS))
-    if spelled == LSB or len(spelled) > _LONGEST or known(spelled):
+    if spelled == LSB or len(spelled) > _NAME_MOST or known(spelled):
         return spelled
     usual = _SPELLED.sub(lambda prefix: "u" if prefix[1].lower() == "micro" else prefix[1][0].lower(), spelled)
     usual = _SQUARED.sub("^2", _PER.sub("/", usual))
@@ -189,7 +189,7 @@ def parse(name: str) -> Unit:
     """The unit called `name`. Raises UserError for an unknown unit."""
     dimension, size = _NONE, 1.0
     unknown = UserError(f"unknown unit '{short(name)}' (known: {', '.join(RECORDING_UNITS)})")
-    if len(name) > _LONGEST:
+    if len(name) > _NAME_MOST:
         raise unknown
     for sign, part in re.findall(r"(\A|[*/])([^*/]*)", name):
         match = _FACTOR.match(part)
@@ -202,7 +202,7 @@ def parse(name: str) -> Unit:
         kind, scale = atom
         dimension = tuple(have + power * more for have, more in zip(dimension, kind, strict=True))
         size *= scale ** float(power)
-        if not _LEAST < size < _MOST:
+        if not _SIZE_LEAST < size < _SIZE_MOST:
             raise unknown
     return Unit(name, dimension, size, _ZERO.get(name, 0.0))
 

@@ -15,10 +15,10 @@ from selfcal.base import units as unit_module
 from selfcal.base.errors import MOST_NAMED, UserError, few
 from selfcal.batch.drift import Drift, DriftSeries, drifts_of
 from selfcal.batch.population import (
-    FEWEST,
-    FEWEST_OF_GROUP,
+    GROUP_UNITS_LEAST,
     MOST_ODD,
     TWO_GROUPS,
+    UNITS_LEAST,
     Apart,
     Grouping,
     Interval,
@@ -282,8 +282,8 @@ def _measured(
             }
             own = {device: of if name != "bias" else of[-1:] for device, of in own.items() if of}
             identified = sum(any(record.identified for record in of) for of in own.values())
-            if identified < max(FEWEST, 0.5 * len(of_axis)):
-                unidentified |= {f"{axis}.{name}": (identified, len(of_axis))} if len(of_axis) >= FEWEST else {}
+            if identified < max(UNITS_LEAST, 0.5 * len(of_axis)):
+                unidentified |= {f"{axis}.{name}": (identified, len(of_axis))} if len(of_axis) >= UNITS_LEAST else {}
                 continue
             y, s = np.array([_joined(of) for of in own.values()], np.float64).T
             devices = np.array([index[device] for device in own], np.intp)
@@ -326,7 +326,7 @@ def _marked(
     known = {(cause.kind, cause.name, cause.cause) for cause in shared}
     for axis in axes_of(devices):
         sound = sound_of(devices, axis)
-        if len(sound) < FEWEST:
+        if len(sound) < UNITS_LEAST:
             continue
         lattice = [axes[-1]["lattice"] for axes in sound.values() if "lattice" in axes[-1]]
         step = float(np.median(lattice)) if len(lattice) >= 0.5 * len(sound) else math.nan
@@ -365,7 +365,7 @@ def _shared(devices: Mapping[str, Sequence[BatchUnit]], groupings: Sequence[Grou
         for kind, names in groupings
         for group in dict.fromkeys(names)
         for cause in named
-        if group and FEWEST_OF_GROUP <= names.count(group) < len(names)
+        if group and GROUP_UNITS_LEAST <= names.count(group) < len(names)
     ]
     shared = []
     for kind, group, names, cause in tests:

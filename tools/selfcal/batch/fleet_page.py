@@ -14,7 +14,7 @@ from selfcal.base import units as unit_module
 from selfcal.base.grid import Array
 from selfcal.batch.batch_summary import Batch, group_lines, plain_interval, seen_from_words, unidentified_lines
 from selfcal.batch.population import Population
-from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, draw
+from selfcal.show.chart import POINTS_MOST, Band, Curve, Figure, Panel, draw
 from selfcal.show.page_template import render
 
 #: Most of what the page shows: lines of a list, those not folded, units of the matrix, pictures.
@@ -111,9 +111,9 @@ def _individuals(name: str, unit: str, y: Array) -> list[Figure]:
     ranges: Array = np.concatenate([np.full(1, np.nan), np.abs(np.diff(y))])
     mean, mean_range = float(y.mean()), float(np.nanmean(ranges))
     far, wide = np.abs(y - mean) > INDIVIDUALS * mean_range, ranges > RANGES * mean_range
-    every = max(1, math.ceil(y.size / POINTS))
+    every = max(1, math.ceil(y.size / POINTS_MOST))
     shown = np.arange(0, y.size, every)
-    shown = np.union1d(shown, np.flatnonzero(far | wide)[:POINTS])
+    shown = np.union1d(shown, np.flatnonzero(far | wide)[:POINTS_MOST])
     x = np.asarray(shown + 1.0, np.float64)
     whole: Array = np.ones(shown.size)
     low, high = mean - INDIVIDUALS * mean_range, mean + INDIVIDUALS * mean_range

@@ -44,12 +44,12 @@ from selfcal.show.plot import COLORS
 
 SCHEMA = "selfcal.plan/1"
 #: Bank samples of the shortest record, and of the longest.
-LEAST, MOST = 64, 200_000
+LENGTH_LEAST, LENGTH_MOST = 64, 200_000
 #: Ratio of the rates of banks that a line compares, and largest ratio of the lengths that is worth a line: a slower
 #: bank may lengthen the record by the inverse.
-FASTER, WORTH = 10.0, 0.8
+RATE_RATIO, WORTH = 10.0, 0.8
 #: Largest ratio of two lengths, or of a bias' interval at half the length to the whole, that counts as 1.
-ALIKE = 1.1
+LENGTHS_ALIKE = 1.1
 #: Forms whose column is in proportion to the channel.
 LINEAR = ("static", "lag", "rate")
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE][-+]?\d+)?)"
@@ -121,13 +121,13 @@ def column_of(regressor: Regressor, channel: Array, rate_hz: float) -> Array:
 
 def bracket(lacks: Callable[[int], bool], least: int) -> tuple[int, int | None]:
     """The bank samples of the longest record tried that lacks something, 0 for none, and of a shortest one that has it:
-    longer by ALIKE at most, None beyond MOST."""
+    longer by LENGTHS_ALIKE at most, None beyond LENGTH_MOST."""
     low, high = 0, least
     while lacks(high):
         low, high = high, 2 * high
-        if high > MOST:
+        if high > LENGTH_MOST:
             return low, None
-    while low and high > ALIKE * low:
+    while low and high > LENGTHS_ALIKE * low:
         middle = int(math.sqrt(low * high))
         low, high = (middle, high) if lacks(middle) else (low, middle)
     return low, high
@@ -178,8 +178,8 @@ class PlannedRecords:
         return math.log(max(float(np.quantile(metric, SHARE)), 1e-12) / self.wishes[k].most)
 
     def length(self, k: int) -> int | None:
-        """Bank samples at which the wish is reached; None beyond MOST."""
-        low, high = bracket(lambda samples: self.reached(k, samples) > 0.0, LEAST)
+        """Bank samples at which the wish is reached; None beyond LENGTH_MOST."""
+        low, high = bracket(lambda samples: self.reached(k, samples) > 0.0, LENGTH_LEAST)
         if high is None or not low:
             return high
         above, below = self.reached(k, low), self.reached(k, high)
@@ -317,7 +317,7 @@ def _times(half: Callable[[float, float], float], own_hz: float, rate_hz: float,
 def _half_interval(law: Law, truth: Mapping[str, float], parameter: str, rate_hz: float, duration_s: float) -> float:
     """Half of the 90 % interval of ln of a parameter, by the Fisher information; infinite where the record has none."""
     n = duration_s * rate_hz
-    if n < LEAST:
+    if n < LENGTH_LEAST:
         return math.inf
     try:
         covariance = np.linalg.inv(information_of(law, truth, 1.0 / rate_hz, n))
@@ -358,10 +358,10 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
 
 
 def steady_level(curve: Sequence[Mapping[str, float]]) -> float | None:
-    """What nine records of ten keep at the longest length, if half of that length has it too, but for ALIKE."""
+    """What nine records of ten keep at the longest length, if half of that length has it too, but for LENGTHS_ALIKE."""
     longest = curve[-1]
     half = [point for point in curve if point["duration_s"] <= 0.5 * longest["duration_s"]]
-    return longest["q90"] if half and half[-1]["q90"] < ALIKE * longest["q90"] else None
+    return longest["q90"] if half and half[-1]["q90"] < LENGTHS_ALIKE * longest["q90"] else None
 
 
 def _swings(wish: Mapping[str, Any]) -> str:
@@ -385,9 +385,9 @@ def _lines(document: Mapping[str, Any]) -> list[str]:
         for rate in document["rates"]:
             times = math.nan if there is None or rate["wish"] != wish["wish"] else rate["duration_s"] / there
             factor = rate["rate_hz"] / document["rate_hz"]
-            if math.isclose(factor, FASTER) and times < WORTH:
+            if math.isclose(factor, RATE_RATIO) and times < WORTH:
                 lines.append(f"  by means at {rate['rate_hz']:g} Hz: {duration_words(rate['duration_s'])}")
-            if math.isclose(factor * FASTER, 1.0) and times < 1.0 / WORTH:
+            if math.isclose(factor * RATE_RATIO, 1.0) and times < 1.0 / WORTH:
                 lines.append(f"  means at {rate['rate_hz']:g} Hz suffice: {duration_words(rate['duration_s'])}")
     if document["duration_s"] is not None:
         lines.append(

@@ -17,7 +17,7 @@ from selfcal.base.grid import Array, Mask, slices
 from selfcal.calibration.earth import Place
 from selfcal.calibration.noise import drift
 from selfcal.calibration.tumble_fit import Problem, TumbleFit, fit_tumble
-from selfcal.calibration.tumble_rests import ACCEL, REST_S, Tumble
+from selfcal.calibration.tumble_rests import ACCEL, REST_LEAST_S, Tumble
 from selfcal.readings.budget import FALSE_ALARM
 
 #: Stated priors, sd, of lib/tumble.h: bias, m/s^2 (100 mg); scale; angle, rad; square of the scale, s^2/m.
@@ -123,7 +123,7 @@ def calibrate(tumble: Tumble, place: Place) -> Accelerometer:
     """The accelerometers by all rests. Raises UserError for fewer rests than biases."""
     if len(tumble.rests) < len(ACCEL):
         raise UserError(
-            f"{len(tumble.rests)} rests found, {len(ACCEL)} are needed: rest the part {REST_S:g} s or longer in "
+            f"{len(tumble.rests)} rests found, {len(ACCEL)} are needed: rest the part {REST_LEAST_S:g} s or longer in "
             "each of six positions or more"
         )
     mean, prior = _prior(tumble, place)

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import hyp1f1
 
 from selfcal.adequacy.identify import identify_axis
-from selfcal.bank.blocks import FEWEST
+from selfcal.bank.blocks import BLOCKS_LEAST
 from selfcal.bank.priors import laid, noise_is_known
 from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
@@ -145,7 +145,7 @@ def measured_noise(pieces: Sequence[Array], piece_s: float) -> float | None:
     """N^2 by the differences of neighbouring means of `piece_s` s within rests [k] each; None of too few."""
     steps = np.concatenate([np.diff(piece) for piece in pieces]) if pieces else np.zeros(0)
     steps = steps[np.isfinite(steps)]
-    return float(np.mean(steps**2)) * 0.5 * piece_s if steps.size >= FEWEST else None
+    return float(np.mean(steps**2)) * 0.5 * piece_s if steps.size >= BLOCKS_LEAST else None
 
 
 def rounding_variance(step: float, noise: float) -> float:

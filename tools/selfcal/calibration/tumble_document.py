@@ -14,7 +14,7 @@ from selfcal.base.grid import Array
 from selfcal.calibration import accelerometer, gyroscope
 from selfcal.calibration.accelerometer import Accelerometer
 from selfcal.calibration.gyroscope import Gyroscope
-from selfcal.calibration.tumble_fit import IDENTIFIED, TumbleFit
+from selfcal.calibration.tumble_fit import VARIANCE_LEFT_MOST, TumbleFit
 from selfcal.calibration.tumble_plan import EDGES, FLATS, OPPOSITE
 from selfcal.calibration.tumble_rests import ACCEL, GYRO, Tumble
 from selfcal.logs.recording import Recording
@@ -159,7 +159,7 @@ def _positions(accel: Accelerometer) -> list[str]:
     sides = [np.array(up) / np.linalg.norm(up) for up in FLATS + EDGES + OPPOSITE]
     for _ in range(4):
         best, gained = None, 0.0
-        weak = np.diag(covariance)[own] > IDENTIFIED * np.diag(fit.prior)[own]
+        weak = np.diag(covariance)[own] > VARIANCE_LEFT_MOST * np.diag(fit.prior)[own]
         for up in sides:
             reading = inverse @ (up * place.gravity) + fit.theta[accelerometer.BIAS]
             row = up @ accelerometer.forces(fit.theta, reading[None], np.zeros(1))[1][0]
@@ -174,7 +174,7 @@ def _positions(accel: Accelerometer) -> list[str]:
         named.append(f"{side_up(best)} up")
         row, moved = update
         covariance -= np.outer(moved, moved) / (float(row @ moved) + noise)
-        if (np.diag(covariance)[own] <= IDENTIFIED * np.diag(fit.prior)[own]).all():
+        if (np.diag(covariance)[own] <= VARIANCE_LEFT_MOST * np.diag(fit.prior)[own]).all():
             break
     return named
 

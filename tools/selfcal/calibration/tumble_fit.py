@@ -20,12 +20,12 @@ Problem = Callable[[Array], tuple[Array, Array, Array]]
 
 #: Most iterations, and most halvings of a step. A step below 0.3 posterior sd is taken as it is. The last step is below
 #: 1e-4 posterior sd.
-ITERATIONS, HALVINGS = 50, 8
+ITERATIONS_MOST, HALVINGS = 50, 8
 UNSETTLED = "the fit does not settle: are the logs of one part, and its axes in the units of their headings?"
 NO_NOISE = "the readings at rest have no noise, not even a lattice: they are not of a sensor"
 #: Largest share of its prior variance that the data leave an identified parameter, and the factor by which priors are
 #: wider then.
-IDENTIFIED: float = _library32.TUMBLE_LEFT
+VARIANCE_LEFT_MOST: float = _library32.TUMBLE_LEFT
 WIDER: float = _library32.TUMBLE_WIDER
 
 
@@ -75,7 +75,7 @@ class TumbleFit:
     @property
     def identified(self) -> Mask:
         """Whether the data alone leave a small share of each prior variance [n]."""
-        return np.asarray(np.diag(self.widened()) <= IDENTIFIED * np.diag(self.prior))
+        return np.asarray(np.diag(self.widened()) <= VARIANCE_LEFT_MOST * np.diag(self.prior))
 
     @property
     def free(self) -> float:
@@ -142,7 +142,7 @@ def fit_tumble(problem: Problem, start: Array, mean: Array, prior: Array, held: 
     stay at their mean, as if their prior variance were 0. A step that makes the sum of squares larger is halved.
     Raises UserError where none settles."""
     current = linearized(problem, start if held is None else np.where(held, mean, start), mean, prior, held)
-    for _ in range(ITERATIONS):
+    for _ in range(ITERATIONS_MOST):
         step, sd = current.step, np.sqrt(np.diag(current.covariance))
         far = float(np.max(np.abs(step[sd > 0.0]) / sd[sd > 0.0]))
         following = linearized(problem, current.theta + step, mean, prior, held)

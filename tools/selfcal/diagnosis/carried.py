@@ -33,9 +33,9 @@ from selfcal.model.tables import make_tables
 from selfcal.readings.readings import Readings, look
 
 #: Pieces of the second recording whose scatter gives the uncertainty.
-PIECES = 12
+SECOND_PIECES = 12
 #: Bank samples of the second recording at least: the bank reports on five and more, and each piece has as many.
-LEAST = 5 * PIECES
+SECOND_LEAST = 5 * SECOND_PIECES
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ def _evidence(
     readings: Readings,
     terms: Sequence[BankTerm],
 ) -> Array:
-    """Bank samples and ln evidence [2, PIECES] after each piece of the second recording, with `terms` in the model."""
+    """Bank samples and ln evidence [2, SECOND_PIECES] after each piece of the second recording, with `terms`."""
     own = with_terms(model, record, found, name, terms, [column for t in terms if t.anew for column in t.columns])
     regressors = offered(own, name)
     recording = readings.recording
@@ -146,9 +146,9 @@ def _evidence(
     bank = Bank(tables)
     prior = {hypothesis.name: hypothesis.ln_probability for hypothesis in tables.hypotheses}
     rows, columns = as_float(values)[:, None], as_float(columns_of(regressors, recording))
-    if values.size < LEAST:
-        raise UserError(f"the second recording is too short: {values.size} bank samples, and {LEAST} are needed")
-    cuts = np.linspace(0, values.size, PIECES + 1).astype(int)
+    if values.size < SECOND_LEAST:
+        raise UserError(f"the second recording is too short: {values.size} bank samples, and {SECOND_LEAST} are needed")
+    cuts = np.linspace(0, values.size, SECOND_PIECES + 1).astype(int)
     after = []
     for first, last in pairwise(cuts):
         piece = slice(first, last)

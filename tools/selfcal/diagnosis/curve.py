@@ -25,7 +25,7 @@ from selfcal.likelihood.statemodel import Array
 #: Knots of the splines, even over the channel's range.
 KNOTS = (6, 12, 36)
 #: Places of a hinge or a jump, even over the range; numbers of all their columns at most; terms of a curve at most.
-PLACES, NUMBERS_MOST, TERMS_MOST = 300, 20_000_000, 40
+HINGE_PLACES, NUMBERS_MOST, TERMS_MOST = 300, 20_000_000, 40
 #: Half the width of a jump, of the distance between places.
 JUMP = 0.05
 #: The form's name in the model file.
@@ -61,7 +61,7 @@ def best(state: State, found: Tried, means: Array) -> Tried:
 
 def _chosen(state: State, found: Tried, means: Array) -> Tried | None:
     """The curve of hinges and jumps."""
-    count = min(PLACES, NUMBERS_MOST // (2 * means.size))
+    count = min(HINGE_PLACES, NUMBERS_MOST // (2 * means.size))
     if count < KNOTS[0]:
         return None
     places = np.linspace(means.min(), means.max(), count + 1)[:-1]

@@ -36,7 +36,7 @@ OF_COUNTER = "its readings are increments of a counter, coarse against their noi
 #: The first look is at means at this rate, Hz. A recording of fewer samples, or slower than LEAST_HZ, needs none.
 FIRST_HZ, FIRST_FROM, LEAST_HZ = 1.0, 20_000, 4.0
 #: How long the work of an axis may go on after a signal, s: it ends at its next pass of the filter.
-PATIENCE_S = 0.3
+ENDS_WITHIN_S = 0.3
 
 
 def add_carried(
@@ -83,7 +83,7 @@ def looked_at(
         while not future.done() and not ending.asked:
             wait([future], timeout=0.1)
             doing.tick()
-        wait([future], timeout=PATIENCE_S if ending.asked else None)
+        wait([future], timeout=ENDS_WITHIN_S if ending.asked else None)
         if future.done():
             with suppress(Stopped):
                 future.result()

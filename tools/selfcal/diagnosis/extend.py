@@ -26,15 +26,15 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import fit_at
 from selfcal.likelihood.state import FittedColumn as Column
-from selfcal.model.file import LONGEST_TEXT, MOST_COLUMNS, MOST_STATED, SMALLEST, Model
+from selfcal.model.file import LONGEST_TEXT, MOST_BANK_COLUMNS, MOST_STATED, SMALLEST, Model
 from selfcal.model.forms import NUMBER, curved, formed
 from selfcal.model.laws import averaged
 from selfcal.model.regressors import trailing_mean
 
 #: Prior sd of a coefficient over its size: wide, since the size is known from this record alone.
-WIDE = 5.0
+WIDE_PRIOR = 5.0
 #: Why a module leaves a finding out.
-NO_ROOM = f"a bank has {MOST_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
+NO_ROOM = f"a bank has {MOST_BANK_COLUMNS} columns, and more evidence fills them: `diagnose` alone takes the others"
 #: Begins each file that is written here.
 HEAD = "# Written by `selfcal diagnose`"
 
@@ -117,7 +117,7 @@ def _fitting(model: Model, found: Mapping[str, Diagnosed]) -> tuple[list[str], l
     of_bank, of_file = len(stated), len(stated | beyond)
     for _, name, finding, keys in sorted(offered, key=lambda axis: -axis[0]):
         more = {key: count for key, count in keys.items() if key not in kept}
-        fits = of_bank + sum(more.values()) <= MOST_COLUMNS
+        fits = of_bank + sum(more.values()) <= MOST_BANK_COLUMNS
         of_bank += fits * sum(more.values())
         if finding is not None and not fits and all(finding is not each for _, each in out):
             out.append((name, finding))
@@ -164,7 +164,7 @@ def _regressors(model: Model, record: Record, found: Mapping[str, Diagnosed]) ->
             ):
                 smoothed.add(key)
             c, sd = float(axis.state.best.c[1 + k]), float(axis.state.best.sd[1 + k])
-            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE * (abs(c) + 2.0 * sd), 3))
+            entry["sd"][group] = max(float(entry["sd"].get(group, 0.0)), digits(WIDE_PRIOR * (abs(c) + 2.0 * sd), 3))
     for key in smoothed:
         _smooth(entries[key], key, found)
     return [entries[key] for key in kept]

@@ -21,7 +21,7 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.likelihood.columns import LN_EITHER
 from selfcal.likelihood.edges import steady
 from selfcal.likelihood.fit import best
-from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, PIECES, error_entry, in_sd, score_entry, sd_of_mean
+from selfcal.likelihood.heldout import HARM_SD, HORIZONS_S, SCORE_PIECES, error_entry, in_sd, score_entry, sd_of_mean
 from selfcal.likelihood.joint import (
     LEAST_AXES,
     LINE,
@@ -221,7 +221,7 @@ def held_out(hidden: Hidden, name: str, unit: str, factor: float) -> dict[str, A
     axis, half = hidden.names.index(name), hidden.y.shape[1] // 2
     scores = np.array([course.scores()[half:, axis] for _, course in (before, after)])
     scores = scores[:, np.isfinite(scores).all(axis=0)]
-    sd = sd_of_mean(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]))
+    sd = sd_of_mean(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], SCORE_PIECES)]))
     factor *= float(hidden.scale[axis])
     rmse: dict[str, dict[str, float]] = {}
     for horizon in HORIZONS_S:
@@ -302,7 +302,7 @@ def carried(hidden: Hidden, states: Mapping[str, State], events: Mapping[str, Ar
     scores = [np.nansum(side.scores(), axis=1) for side in before_after]
     more = before_after[1].ln_likelihood - before_after[0].ln_likelihood
     n = float(np.isfinite(y).any(axis=0).sum())
-    sd = sd_of_mean(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], PIECES)]))
+    sd = sd_of_mean(np.array([part.mean() for part in np.array_split(scores[1] - scores[0], SCORE_PIECES)]))
     before = float(scores[0].mean())
     return score_entry(before, before + more / n, sd, n)
 

@@ -44,7 +44,7 @@ HOLDS = 2
 #: Noise of a fit over that of the first one, below which it has none: of readings that are equal it explains them all.
 NO_NOISE = 1e-6
 #: Number of the first loud stretch of several axes, beyond those of events and lines.
-FIRST_LOUD = 1 + module.MOST + module.FAST_LINES
+FIRST_LOUD = 1 + module.EVENTS_MOST + module.FAST_LINES
 #: From this finding on, a cause waits that was worth less than another one when it was last looked at.
 BUSY = 3
 
@@ -159,7 +159,7 @@ def _weed(found: Mapping[str, Diagnosed]) -> None:
         ]
         most = [gain > 0.5 * finding.look.gain for gain, (_, finding) in zip(gains, parts, strict=True)]
         kept = [gain for gain, own in zip(gains, most, strict=True) if own]
-        least = NET_LEAST if len(kept) == 1 < len(parts) else module.NAMED
+        least = NET_LEAST if len(kept) == 1 < len(parts) else module.NAMED_NATS
         stays = sum(kept) - price >= least
         for (axis, finding), state, own in zip(parts, less, most, strict=True):
             if stays and own:
@@ -295,7 +295,7 @@ def _give(
     looks = {name: CAUSES[event.cause].located(state, record, event.theta) for name, state in own.items()}
     # An axis whose model has the column already has no look.
     looks = {name: look for name, look in looks.items() if look.shape is None or look.shape.regressors}
-    if sum(look.gain for look in looks.values()) < module.NAMED:  # what the axes know by now explains it
+    if sum(look.gain for look in looks.values()) < module.NAMED_NATS:  # what the axes know by now explains it
         return False
     findings = {}
     for name, look in looks.items():
@@ -325,7 +325,7 @@ def _between(state: State, passing: Sequence[tuple[int, int]], span: float) -> S
 def _fast(record: Record, found: Mapping[str, Diagnosed]) -> Record:
     """What acts on several axes faster than means show."""
     states = dict(record.axes)
-    for number, line in enumerate(module.fast_lines(states), 1 + module.MOST):
+    for number, line in enumerate(module.fast_lines(states), 1 + module.EVENTS_MOST):
         _give(record, found, states, line, number, SLOW_S)
     return _with(record, found, states)
 

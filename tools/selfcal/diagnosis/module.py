@@ -31,7 +31,7 @@ from selfcal.likelihood.columns import FITTED, LN_EITHER, LN_SLOW
 from selfcal.likelihood.edges import EDGE, peaks, scan, white_of
 from selfcal.likelihood.joint import (
     CLEAR_LINE,
-    WIDTHS,
+    SIZE_WIDTHS,
     Act,
     Course,
     Joint,
@@ -51,9 +51,9 @@ from selfcal.likelihood.statemodel import Array, Mask
 #: False-alarm rate of the joint search at T nats, over e^-T: modules on which nothing acts (`make module-null`).
 NULL = 0.05
 #: Evidence of a candidate that is named, nats.
-NAMED = math.log(NULL) + EVIDENT
+NAMED_NATS = math.log(NULL) + EVIDENT
 #: Means that the joint model takes at least, and the share of them that an axis may lack.
-LEAST, GAPS = 600, 0.3
+JOINT_MEANS_LEAST, GAPS = 600, 0.3
 #: Evidence of an event that is beyond doubt, nats: before the quantity is weighed its wandering looks like events.
 CERTAIN = 25.0
 #: A mean so many deviations of the noise off the median of this many is left out: a spike is no event that lasts.
@@ -61,11 +61,11 @@ SPIKE, SPIKE_OF = 7.0, 5
 #: Means on either side of a jump that may be on neither level; the levels are those of twice as many farther off.
 PASSING = 6
 #: Events of a module at most, those of one axis among them.
-MOST = 16
+EVENTS_MOST = 16
 #: Places beside the best one that share its evidence.
-NEAR = 30
+PLACES_NEAR = 30
 #: Places of a search that are weighed over the sets of axes: the best ones of all axes, and of each.
-PLACES = 4
+WEIGHED = 4
 #: Lines above the means' band that are looked at.
 FAST_LINES = 6
 #: A line is fitted with the drifts so often at most, or until it moves by less than this many turns in the record.
@@ -75,15 +75,15 @@ MULTIPLES = 5
 #: Jumps of all levels, the largest ones, of which each two may be the ends of a pulse.
 PAIRED = 30
 #: Samples of a pulse at least.
-SHORTEST = 4
+PULSE_LEAST = 4
 #: Share of the information of a step far from the ends, from which on two of them are taken as there.
-WHOLE = 0.95
+WHOLE_INFORMATION = 0.95
 #: Durations of a pulse, a factor apart, and its places in one duration.
-LONGER, PLACES_IN = 1.15, 16
+DURATION_RATIO, PLACES_IN = 1.15, 16
 #: Bins about a frequency that tell its noise.
-BESIDE = 50
+BINS_OF_NOISE = 50
 #: A jump that one size of the quantity explains to this share is the quantity's own.
-PATTERN = 0.7
+OWN_SHARE_LEAST = 0.7
 #: Causes of those jumps.
 JUMPS = ("step", "pulse")
 #: Causes that the quantity may be, with that pattern: its course has any shape.
@@ -212,13 +212,13 @@ def sizes(score: Array, known: Array) -> Array:
 def _best(gain: Array, score: Array, known: Array, apart: int) -> list[int]:
     """The best places of scores [n, m]: of all axes together, by their `gain` [n], and of each alone."""
     alone = 0.5 * score**2 / np.maximum(np.diagonal(known, axis1=-2, axis2=-1), 1e-300)
-    found = [peaks(gain, PLACES, apart), *(peaks(row, 1, apart) for row in alone.T)]
+    found = [peaks(gain, WEIGHED, apart), *(peaks(row, 1, apart) for row in alone.T)]
     return list(dict.fromkeys(at for each in found for at in each))
 
 
 def _shared(gain: Array, at: int) -> float:
     """ln of the number of places about the best one that share its evidence, by their gains [n]."""
-    near = gain[max(0, at - NEAR) : at + NEAR + 1] - gain[at]
+    near = gain[max(0, at - PLACES_NEAR) : at + PLACES_NEAR + 1] - gain[at]
     return float(logsumexp(np.minimum(near, 0.0)))
 
 
@@ -235,12 +235,12 @@ def steps(seen: SeenAxes) -> Iterator[Candidate]:
 
 def pulses(seen: SeenAxes) -> Iterator[Candidate]:
     """Two jumps of one size, there and back. A first search takes their information as it is far from the ends."""
-    count = max(1, int(math.log(seen.n / 3.0 / SHORTEST) / math.log(LONGER)))
-    lengths = np.unique((SHORTEST * LONGER ** np.arange(count)).astype(int))
+    count = max(1, int(math.log(seen.n / 3.0 / PULSE_LEAST) / math.log(DURATION_RATIO)))
+    lengths = np.unique((PULSE_LEAST * DURATION_RATIO ** np.arange(count)).astype(int))
     shock = seen.course.shock
-    octaves = math.log(seen.n / 3.0 / SHORTEST)
+    octaves = math.log(seen.n / 3.0 / PULSE_LEAST)
     every = np.diagonal(seen.course.known, axis1=1, axis2=2)
-    near_end = np.any(every < WHOLE * np.diag(seen.cross[0]), axis=1)
+    near_end = np.any(every < WHOLE_INFORMATION * np.diag(seen.cross[0]), axis=1)
     best: list[tuple[float, int, int]] = []
     for length in map(int, lengths):
         score = shock[:-length] - shock[length:]
@@ -259,8 +259,8 @@ def pulses(seen: SeenAxes) -> Iterator[Candidate]:
     cross = seen.cross[0] - seen.cross[last - first]
     gain = full(shock[first] - shock[last], cross + np.swapaxes(cross, 1, 2))
     paired = [*zip(gain.tolist(), first.tolist(), last.tolist(), strict=True)]
-    places = [_moved(seen, *pair[1:]) for each in (best, paired) for pair in sorted(each, reverse=True)[:PLACES]]
-    places = [place for place in dict.fromkeys(places) if place[1] - place[0] >= SHORTEST]
+    places = [_moved(seen, *pair[1:]) for each in (best, paired) for pair in sorted(each, reverse=True)[:WEIGHED]]
+    places = [place for place in dict.fromkeys(places) if place[1] - place[0] >= PULSE_LEAST]
     t = np.arange(seen.n)
     columns = np.array([(t >= begin) & (t < end) for begin, end, _ in places], dtype=np.float64).reshape(-1, seen.n)
     for (begin, end, alike), column, known in zip(
@@ -281,7 +281,7 @@ def _moved(seen: SeenAxes, begin: int, end: int) -> tuple[int, int, float]:
             at = begin if first else end
             low, high = max(seen.edge, at - reach), min(seen.n - seen.edge, at + reach + 1)
             places = np.arange(low, high)
-            places = places[places < end - SHORTEST] if first else places[places > begin + SHORTEST]
+            places = places[places < end - PULSE_LEAST] if first else places[places > begin + PULSE_LEAST]
             if not places.size:
                 continue
             other = end if first else begin
@@ -301,7 +301,7 @@ def lines(seen: SeenAxes) -> Iterator[Candidate]:
     turn = 2.0 * math.pi * np.maximum(np.arange(U.shape[0]), 1) / n
     level = seen.model.precision(turn) * (2.0 - 2.0 * np.cos(turn))[:, None, None]
     ratio = np.abs(U) ** 2 / n / np.maximum(np.diagonal(level, axis1=1, axis2=2), 1e-300)
-    own = np.sqrt(_level(ratio, max(4, min(BESIDE, U.shape[0] // 8)), 0))
+    own = np.sqrt(_level(ratio, max(4, min(BINS_OF_NOISE, U.shape[0] // 8)), 0))
     known = 0.5 * n * level * own[:, :, None] * own[:, None, :]
     low = max(1, math.ceil(TURNS_LEAST))
     hz = np.arange(U.shape[0])
@@ -406,7 +406,7 @@ def fast_lines(states: Mapping[str, State]) -> list[JointEvent]:
     inverse = np.linalg.inv(np.corrcoef(w))
     padded = 2 * next_fast_len(n, real=True)
     power = rfft(w, padded, axis=1).astype(np.complex64)
-    own = _level(np.abs(power) ** 2 / n, 2 * BESIDE, 1)
+    own = _level(np.abs(power) ** 2 / n, 2 * BINS_OF_NOISE, 1)
     power /= np.sqrt(own)
     gain = (power.conj() * (inverse.astype(np.float32) @ power)).sum(axis=0).real / n
     gain[(np.abs(power) ** 2).max(axis=0) > CLEAR_LINE * n] = 0.0
@@ -441,7 +441,7 @@ def louder(states: Mapping[str, State]) -> JointEvent | None:
     for power, (begin, end) in noisy_stretches(of):
         level, n = (rows[:, :, 0] for rows in power.levels(begin, end))
         wide = power.wide(of, begin, end)
-        gain, widths = power.gain(begin, end) / wide[:, None], np.array(WIDTHS)
+        gain, widths = power.gain(begin, end) / wide[:, None], np.array(SIZE_WIDTHS)
         sd = np.sqrt(2.0 * wide * (1.0 / np.maximum(n, 1.0)).sum(axis=0))
         ln_bf = gain - gain / (1.0 + widths**2) - 0.5 * np.log1p(widths**2)
         acts = act_apart(ln_bf, np.log(level[0] / level[1]), sd)
@@ -566,7 +566,7 @@ def _alone(row: bytes, dt: float) -> State:
 def apart(seen: SeenAxes, candidate: Candidate) -> Candidate:
     """A slow candidate over the drifts of each axis that its record leaves possible."""
     states = [_alone(row.tobytes(), seen.dt) for row in seen.y]
-    each = [state.bayes(candidate.columns[0], np.array(WIDTHS)) for state in states]
+    each = [state.bayes(candidate.columns[0], np.array(SIZE_WIDTHS)) for state in states]
     return replace(candidate, act=act_apart(*map(np.array, zip(*each, strict=True))), more=0.0)
 
 
@@ -711,7 +711,7 @@ class Search:
         one's own."""
         vain: list[Candidate] = []
         firm: list[Candidate] = []
-        turns = MOST - len(self.several) - len(self.single)
+        turns = EVENTS_MOST - len(self.several) - len(self.single)
         while turns > 0:
             left = {
                 name: [candidate for candidate in each if not any(candidate is other for other in vain)]
@@ -756,7 +756,7 @@ class Search:
 
     def _is_own(self, candidate: Candidate) -> bool:
         """Whether it has the pattern of the quantity in the model, in time and over the axes."""
-        if candidate.share_of(self.model.loading) <= PATTERN:
+        if candidate.share_of(self.model.loading) <= OWN_SHARE_LEAST:
             return False
         if candidate.cause not in self.channels:
             return candidate.cause in OF_TIME
@@ -766,7 +766,7 @@ class Search:
     def weigh(self, model: Joint) -> None:
         """Take a model with the quantity. What goes like it over the axes is its own, or a channel that is looked for
         again beside it: its wandering may go like a channel for a while."""
-        alike = [candidate for candidate in self.several if candidate.share_of(model.loading) > PATTERN]
+        alike = [candidate for candidate in self.several if candidate.share_of(model.loading) > OWN_SHARE_LEAST]
         self.rest = self.rest + sum(candidate.effect for candidate in alike)
         self.several = [candidate for candidate in self.several if not any(candidate is each for each in alike)]
         self.model = refitted(model, self.rest, self.dt) if alike else model
@@ -789,7 +789,7 @@ def together(
     rest = calmed({name: state for name, state in states.items() if not state.below_lattice}, apart)
     found = {name: half_means(values, block)[0] for name, values in rest.items()}
     found = {name: y for name, y in found.items() if np.isfinite(y).mean() > 1.0 - GAPS}
-    if len(found) < 2 or min(y.size for y in found.values()) < LEAST:
+    if len(found) < 2 or min(y.size for y in found.values()) < JOINT_MEANS_LEAST:
         return None
     y, kept_out, scale = in_means(np.array(list(found.values())))
     span = block * dt
@@ -800,7 +800,7 @@ def together(
     model = weighed(search.model, search.rest, span)
     if model is not None:
         search.weigh(model)
-    search.go(NAMED)
+    search.go(NAMED_NATS)
     of = None
     if model is not None:  # what one axis does alone is its drift's: without it the quantity would be too sure
         y = np.where(np.isfinite(search.rest), y, np.nan) - sum(candidate.effect for candidate in search.several)

@@ -35,7 +35,7 @@ from selfcal.readings.readings import (
 )
 
 #: Samples that a diagnosis needs at least.
-LEAST = 200
+FEWEST = 200
 #: Largest reading over the sensor's range: beyond, the unit is wrong, or the file.
 BEYOND = 100.0
 #: Samples in a cell of the grid, on average, without which an axis is too slow for it.
@@ -174,8 +174,8 @@ def _grid_of(recording: Recording, decimate: float | None, axes: Sequence[str]) 
     base = min(clocks, key=lambda clock: clock.rate_hz, default=recording.clock)
     block = 1 if decimate is None else max(1, round(base.rate_hz / decimate))
     n = int(base.place[-1] - float(base.place[0]) + 1) // block
-    if n < LEAST:
-        raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {LEAST} or more")
+    if n < FEWEST:
+        raise UserError(f"{recording.path}: too short: {n} samples at this rate, a diagnosis needs {FEWEST} or more")
     if n > MOST_DENSE:
         raise UserError(
             f"{recording.path}: {n:,} samples at this rate with the gaps, more than {MOST_DENSE:,}: "
@@ -281,8 +281,8 @@ def _axis_of(
         return found[there[np.maximum(0, np.searchsorted(there, np.arange(found.size), side="right") - 1)]]
 
     y, r = grid.means(clock, spread(readings.values if each == 1 else readings.drawn))
-    if (usable := int(np.isfinite(y).sum())) < LEAST:
-        return f"{usable} of its readings neither stick nor are clipped, a diagnosis needs {LEAST} or more"
+    if (usable := int(np.isfinite(y).sum())) < FEWEST:
+        return f"{usable} of its readings neither stick nor are clipped, a diagnosis needs {FEWEST} or more"
     moving = np.zeros(grid.n, bool)
     if readings.moving.any():
         # A mean of which one sample moved is left out: the next ones may ring on below what is loud.

@@ -36,7 +36,7 @@ SAMPLES_MOST, REFUSED_FROM = 20_000, 300_000
 #: Records that the answer makes. Of 20 records the next one is within their range with 90 %.
 RECORDS = 20
 #: Rounds in which each of several inputs is searched beside the others.
-ROUNDS = 2
+INPUT_ROUNDS = 2
 #: Quantiles of an interval.
 ENDS = tuple(0.5 + end * PROBABILITY / 2.0 for end in (-1.0, 0.0, 1.0))
 #: How the readings of a held input were taken.
@@ -110,7 +110,7 @@ def answers_of(state: State, inputs: Mapping[str, Sequence[Input]]) -> dict[str,
         added = [FittedColumn(f"{other}_{k}", "input", column, "1", {}) for k, (other, column) in enumerate(columns)]
         return state.refit(regressors=(*state.regressors, *added)) if added else state
 
-    for _ in range(ROUNDS if len(inputs) > 1 else 0):
+    for _ in range(INPUT_ROUNDS if len(inputs) > 1 else 0):
         for name in order:
             more[name], columns = _best(beside_others(name), inputs[name])
             known[name] = columns if more[name] > 0.0 else columns[:0]

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from selfcal.diagnosis.record import LEAST, Record
+from selfcal.diagnosis.record import FEWEST, Record
 from selfcal.diagnosis.statistics import states_of
 from selfcal.likelihood.columns import Shape, possible
 from selfcal.likelihood.fit import Fit, Series, ln_likelihood, run
@@ -28,11 +28,11 @@ from selfcal.model.forms import NUMBER, curved, formed, slope
 #: Evidence that the next record shall have for the rival that is true, nats, in which share of so many drawn records.
 NATS, SHARE, DRAWN = 10.0, 0.9, 40
 #: Sizes of the drift over the one that is fitted without either rival: e to these.
-SIZES = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
+RIVAL_DRIFTS = (-3.0, -2.0, -1.0, 0.0, 1.0, 2.0)
 #: Samples in the time of the first record, and the length of the longest planned one over it.
-SAMPLES, LONGEST = 128, 4
+RECORD_SAMPLES, PLANNED_RATIO_MOST = 128, 4
 #: Places of a rival's numbers, about.
-NODES = 9
+RIVAL_PLACES = 9
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ def _nested(a: Shape, b: Shape) -> bool:
 def _known(shape: Shape, state: State) -> RivalShape:
     """A shape by the first record."""
     points, _ = possible(state, shape)
-    shapes = shape.near(np.exp(points[:: 1 + len(points) // NODES])) if shape.numbers else [shape]
+    shapes = shape.near(np.exp(points[:: 1 + len(points) // RIVAL_PLACES])) if shape.numbers else [shape]
     blocks = [np.array([column.values for column in shape.regressors]) for shape in shapes]
-    drifts = [state.best.shrunk(-size) for size in SIZES]
+    drifts = [state.best.shrunk(-size) for size in RIVAL_DRIFTS]
     sums = [list(state.beside(drift.terms, drift.theta, blocks)) for drift in drifts]
     mean = np.array([[sums_of.coefficients()[0] for sums_of in each] for each in sums])
     G = np.array([[sums_of.G[1:, 1:] * sums_of.n / sums_of.coefficients()[2] for sums_of in each] for each in sums])
@@ -118,11 +118,11 @@ def _shortest(a: RivalShape, b: RivalShape, state: State, record: Record) -> dic
             white, ln_variance = _drawn(a, b, state, record, drive, swing, period_s)
             for share in (1, 2, 3, 4, 6, 8, 12, 16, 24, 32):
                 duration_s = share * (period_s if drive else span / 8.0)
-                if duration_s * record.rate_hz < LEAST:
+                if duration_s * record.rate_hz < FEWEST:
                     continue
-                if duration_s > LONGEST * span or duration_s >= (plan["duration_s"] or math.inf):
+                if duration_s > PLANNED_RATIO_MOST * span or duration_s >= (plan["duration_s"] or math.inf):
                     break
-                samples = round(SAMPLES * duration_s / span)
+                samples = round(RECORD_SAMPLES * duration_s / span)
                 nats = _differences(a, b, white[:, :samples], ln_variance[:, :samples])
                 least = float(nats.mean(axis=1).min())
                 if np.mean(nats >= NATS, axis=1).min() < SHARE:
@@ -145,8 +145,8 @@ def _drawn(
     columns of both rivals, and readings drawn under each, behind the filter of every drift; ln of their variances [d,
     n]. The part stays switched on after the first record."""
     span = record.present.size / record.rate_hz
-    dt = span / SAMPLES
-    n = LONGEST * SAMPLES
+    dt = span / RECORD_SAMPLES
+    n = PLANNED_RATIO_MOST * RECORD_SAMPLES
     passed = (np.arange(n) + 0.5) * dt
     random = np.random.default_rng(1)
     held = {name: record.channels[cause] for cause, name in record.channel_names.items()}
@@ -161,7 +161,7 @@ def _drawn(
         np.array([[_column(regressor, values, t, dt) for regressor in each] for each in rival.columns])
         for rival in (a, b)
     ]
-    drifts = [_drift(state.best.shrunk(-size), dt) for size in SIZES]
+    drifts = [_drift(state.best.shrunk(-size), dt) for size in RIVAL_DRIFTS]
     readings = []
     for rival, columns in zip((a, b), rows, strict=True):
         p = rival.probability

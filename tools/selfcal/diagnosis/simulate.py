@@ -21,7 +21,7 @@ from selfcal.model.file import Group, Model
 from selfcal.model.laws import NAMED, PARAMETERS, PLACES, Law
 
 #: Streams of random numbers from here on draw what the model file leaves open; those below are the simulator's.
-DRAWS = 2**32
+SEEDS = 2**32
 
 
 def added_by(
@@ -154,7 +154,7 @@ def truth_of(model: Model, seed: int) -> dict[str, dict[str, Any]]:
         where = f"axes.{name}"
         fields = model.simulate["axes"].get(name, {})
         # All are drawn, in one order, so that stating one leaves the others as they were.
-        random = _reference.Random(seed, DRAWS + number)
+        random = _reference.Random(seed, SEEDS + number)
         priors = model.group_of(name).priors
         law = _pick(model.hypotheses, random.uniform())
         drawn = {"bias": priors["bias"].sd * random.normal()}

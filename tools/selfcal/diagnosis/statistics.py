@@ -23,19 +23,19 @@ from selfcal.readings.lattice import WHITE_REMAINDERS
 Indices = NDArray[np.int64]
 
 #: Simulated records a band rests on.
-ENSEMBLE = 48
+BAND_RECORDS = 48
 #: Fewest simulated records that have a statistic.
-FEWEST = 8
+RECORDS_LEAST = 8
 #: Spread at least of a statistic with few possible values: an ensemble may show one value alone.
 LEAST_SPREAD = {"longest_repeat": 0.25, "repeated_readings": 1.0, "commonest_reading": 1.0}
 #: Times at least that the drift forgets in a record in which jumps are looked for.
-TURNS_LEAST = 50.0
+FORGETS_LEAST = 50.0
 #: Name of the statistic of a model that does not describe the readings at all.
 SPREAD = "innovation_spread"
 #: Samples of the blocks whose sums show slow correlation.
-BLOCKS = (4, 16, 64, 256)
+BLOCK_SIZES = (4, 16, 64, 256)
 #: The longest averaging time of an Allan deviation is this part of a record.
-LONGEST = 8
+ALLAN_PART = 8
 #: Share of simulated records beyond which the tail of the most striking statistic is fitted.
 TAIL = 1.0 / 3.0
 #: Lags of the correlation, roughly a factor 1.6 apart.
@@ -97,13 +97,13 @@ def _of_memory(filled: Array, present: Mask, n: int, lagged: Array) -> Iterator[
         if lag < min(lagged.size, n // 8):
             yield f"innovation_lag{lag}", float(lagged[lag])
     yield "innovation_correlation_to_lag_20", _root(float((lagged[1:21] ** 2).sum()), min(20, lagged.size - 1))
-    for size in BLOCKS:
+    for size in BLOCK_SIZES:
         if n >= 60 * size:
             sums = np.add.reduceat(filled, np.arange(0, filled.size - size + 1, size))
             scale = math.sqrt(sums.size) * float(sums.var())
             for lag in (1, 2, 3, 5):
                 yield f"innovation_lag{lag}_of_{size}_samples", float(sums[lag:] @ sums[:-lag]) / scale
-    sizes = 2 ** np.arange(max(1, int(math.log2(n / LONGEST)) + 1))
+    sizes = 2 ** np.arange(max(1, int(math.log2(n / ALLAN_PART)) + 1))
     for m, deviation in zip(sizes, allan_deviation(np.where(present, filled, np.nan), sizes), strict=True):
         if math.isfinite(deviation):
             yield f"allan_of_{m}_samples", _root(n * float(deviation) ** 2, n / float(m))
@@ -233,7 +233,7 @@ def jumps_of(answer: Array) -> Callable[[Array], float] | None:
     count = answer.size // block
     g = answer[: count * block].reshape(count, block).sum(axis=1)
     forgets = count * (1.0 - float(g[1:] @ g[:-1]) / max(float(g @ g), 1e-300))
-    if forgets < TURNS_LEAST:
+    if forgets < FORGETS_LEAST:
         return None
     padded = 2 * next_fast_len(count)
     spectrum, size = np.conj(rfft(g, padded)), np.sqrt(np.cumsum(g**2)[::-1])
@@ -379,7 +379,7 @@ def _drawn(state: State, random: np.random.Generator, count: int) -> Iterator[tu
         yield w, w
 
 
-def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> JudgedStatistics:
+def judged(state: State, seed: int = 0, count: int = BAND_RECORDS) -> JudgedStatistics:
     """Every statistic of the state against `count` records of its model."""
     jumps = jumps_of(_step_response(state.series, state.best))
     measured = all_statistics(state.whitened, None if state.redrawn else state.y, state.lsb, jumps)
@@ -390,7 +390,7 @@ def judged(state: State, seed: int = 0, count: int = ENSEMBLE) -> JudgedStatisti
         found = all_statistics(w, None if state.redrawn else y, state.lsb, jumps)
         rows.append([found.get(name, math.nan) for name in measured])
     sample = np.array(rows).reshape(count, len(measured))
-    usual = np.isfinite(sample).sum(axis=0) >= FEWEST
+    usual = np.isfinite(sample).sum(axis=0) >= RECORDS_LEAST
     names = [name for name, kept in zip(measured, usual, strict=True) if kept]
     if not names:
         return JudgedStatistics([], 1.0)

@@ -11,7 +11,7 @@ import yaml
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.adequacy.identify_document import identify_document
-from selfcal.bank.blocks import FEWEST
+from selfcal.bank.blocks import BLOCKS_LEAST
 from selfcal.bank.priors import MOST_INTERVALS, add_sources, for_record
 from selfcal.base.errors import UserError
 from selfcal.diagnosis.finding import UNEXPLAINED
@@ -98,7 +98,7 @@ def _whole_means(recording: Recording, bank_rate_hz: float) -> Recording:
     place = recording.clock.place
     cell = (place - place[0]) // block
     whole = np.bincount(cell) == block
-    if np.count_nonzero(whole) < FEWEST:
+    if np.count_nonzero(whole) < BLOCKS_LEAST:
         raise UserError("too few bank intervals have all of their readings")
     return recording.with_rows(whole[cell])
 

@@ -43,9 +43,9 @@ LN_CHOICE = 1.0
 #: ln of the number of independent looks: the structures and their numbers.
 LN_STRUCTURES = math.log(42.0)
 #: Structures within so many nats of the best are scored beside a drift of two terms.
-NEAR = 10.0
+NEAR_NATS = 10.0
 #: Tapers of the empirical spectra, their half bandwidth in bins, and the bands of a decade.
-TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
+SPECTRUM_TAPERS, HALF_WIDTH, BANDS_OF_A_DECADE = 3, 2.5, 8
 #: Both columns lose their slow power below this bin first: a spectrum as steep as a temperature's would fill the bands
 #: beside its own. The ratio stays.
 CORNER = 20.0
@@ -330,7 +330,7 @@ def beside_two_terms(state: State, found: Sequence[Trial]) -> list[Trial]:
         return fit if clearly else trial.fit, fit.ln_likelihood - base - trial.gain
 
     of_best = refitted(best)[1]
-    near = [refitted(trial) if trial.score > best.score - NEAR else (trial.fit, of_best) for trial in found]
+    near = [refitted(trial) if trial.score > best.score - NEAR_NATS else (trial.fit, of_best) for trial in found]
     return [replace(trial, score=trial.score + more, fit=fit) for trial, (fit, more) in zip(found, near, strict=True)]
 
 
@@ -480,7 +480,7 @@ class Empirical:
 
 def empirical(u: Array, y: Array, dt: float) -> Empirical:
     """The empirical transfer function of an input u [n] and an output y [n] without missing samples."""
-    tapers = windows.dpss(u.size, HALF_WIDTH, TAPERS)
+    tapers = windows.dpss(u.size, HALF_WIDTH, SPECTRUM_TAPERS)
     pole = math.exp(-2.0 * math.pi * CORNER / u.size)
     U, Y = (np.fft.rfft(tapers * lfilter([1.0, -1.0], [1.0, -pole], detrend(signal))) for signal in (u, y))
     low, high = math.ceil(HALF_WIDTH), U.shape[1] - 1
@@ -490,7 +490,7 @@ def empirical(u: Array, y: Array, dt: float) -> Empirical:
     # reduceat's last band runs on to the end.
     width = np.diff(np.append(edges[:-1], U.shape[1]))
     # Neighbouring bins share their tapers' band.
-    freedom = np.maximum(TAPERS, TAPERS * width / (2.0 * HALF_WIDTH) + (TAPERS - 1) / 2.0)
+    freedom = np.maximum(SPECTRUM_TAPERS, SPECTRUM_TAPERS * width / (2.0 * HALF_WIDTH) + (SPECTRUM_TAPERS - 1) / 2.0)
     ratio: Complex = np.asarray(Suy / Suu, np.complex128)
     coherence = np.clip(np.abs(Suy) ** 2 / (Suu * Syy), 0.0, 1.0)
     sd = np.sqrt((1.0 - coherence) * Syy / Suu / (2.0 * (freedom - 1.0)))

@@ -42,14 +42,14 @@ LN_EITHER = math.log(2.0)
 SMALLER = (1.5, 3.0)
 #: Forms of a family, or events of a search, that are fitted: those that rank best. After the first one only forms whose
 #: score is within so many nats, and this share of the best, of what a form needs to be taken, or to be as likely.
-FITTED, FIT_ADDS, COARSE = 3, 3.0, 0.05
+FITTED, FIT_ADDS, FIT_SHARE = 3, 3.0, 0.05
 #: Numbers between those of the grid: steps of their logarithms, the first and the last.
 STEP_FIRST, STEP_LAST = 0.35, 0.005
 #: Worth from which on a shape may be named, or be as likely as the one that is, nats.
 NEARLY = NET_LEAST - ALIKE
 #: A number's posterior is on a lattice of such steps, standard deviations, as far as ln likelihood is this much lower,
 #: with so many nodes at most. How far off the standard deviation is looked for first, and how often.
-NODE, POSSIBLE, NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
+NODE, POSSIBLE_NATS, NUMBER_NODES_MOST, REACH_FIRST, REACHES = 0.5, 7.0, 500, 0.01, 10
 
 
 @dataclass(frozen=True)
@@ -173,7 +173,7 @@ def tried(state: State, shapes: Sequence[Shape], *, slow: bool, least: float = N
             break
         k = max(left, key=lambda k: shapes[k].worth(gains[k]))
         most = max((trial.net for trial in done.values()), default=-math.inf)
-        if done and shapes[k].worth(gains[k]) < max(most - ALIKE, NET_LEAST) - FIT_ADDS - COARSE * most:
+        if done and shapes[k].worth(gains[k]) < max(most - ALIKE, NET_LEAST) - FIT_ADDS - FIT_SHARE * most:
             break
         best = fitted(state, shapes[k])
         gains = np.maximum(gains, state.scores(blocks, best.fit))
@@ -332,13 +332,13 @@ def number_nodes(scores: Callable[[Array], Array], start: Sequence[float], limit
         reach = np.where(flat, 1.6 * reach, reach)
     found: dict[tuple[int, ...], Array] = {}
     seen = waiting = {(0,) * m}
-    while waiting and len(found) < NODES_MOST:
+    while waiting and len(found) < NUMBER_NODES_MOST:
         inside = [at for at in waiting if np.all(np.abs(np.clip(x := middle + steps @ at, *limits.T) - x) < 1e-9)]
         if not inside:
             break
         values = scores(np.exp([middle + steps @ at for at in inside])).T
         best = np.maximum(best, values.max(axis=0))
-        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > best - POSSIBLE)}
+        near = {at: value for at, value in zip(inside, values, strict=True) if np.any(value > best - POSSIBLE_NATS)}
         found |= near
         moves = [(j, way) for j in range(m) for way in (1, -1)]
         waiting = {tuple(x + way * (i == j) for i, x in enumerate(at)) for at in near for j, way in moves} - seen

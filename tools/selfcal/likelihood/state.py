@@ -28,7 +28,7 @@ NET_LEAST = -math.log(P_LOOK)
 #: at most (Markov's inequality).
 EVIDENT = -math.log(OF_MODULES["together"])
 #: A drift whose fit is so far below the best one, nats, is not tried with a candidate; with a finding it is again.
-FAR = 40.0
+HOPELESS_NATS = 40.0
 #: Two causes whose worth differs by less than this, nats, cannot be told apart.
 ALIKE = 3.0
 #: Score gains below this are not worth a refit: the refit gains about as much.
@@ -128,7 +128,7 @@ class State:
 
     def near(self) -> tuple[Terms, ...]:
         """Those that a candidate may make the best."""
-        least = self.best.ln_likelihood - FAR
+        least = self.best.ln_likelihood - HOPELESS_NATS
         far = {drift.terms for drift in self.fits if drift.ln_likelihood < least}
         return tuple(terms for terms in self.bases() if terms not in far)
 

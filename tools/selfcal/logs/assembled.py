@@ -26,7 +26,7 @@ from selfcal.logs.recorded import SIDE_UNITS, Column, Recording, bridged, bridge
 from selfcal.logs.timebase import Clock, clock_of, clock_of_rows, has_own_clock, remarks
 
 #: Readings of a side channel for each one of a run of wild ones.
-WILD = 1000
+READINGS_PER_WILD = 1000
 
 Floats = NDArray[np.float64]
 Places = NDArray[np.int64]
@@ -83,7 +83,7 @@ def _tame(column: Column, header: Header) -> Column:
     gaps = np.flatnonzero((near[:-1] > 0.0) & (near[1:] > 3.0 * near[:-1]))
     if not gaps.size:
         return column
-    wild = [known[a:b] for a, b in runs(off > near[gaps[0]]) if b - a <= max(1, known.size // WILD)]
+    wild = [known[a:b] for a, b in runs(off > near[gaps[0]]) if b - a <= max(1, known.size // READINGS_PER_WILD)]
     if not wild:
         return column
     rows = np.concatenate(wild)

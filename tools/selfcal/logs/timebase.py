@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
-from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_RATE_HZ
+from selfcal.base.limits import LEAST_RATE_HZ, LONGEST_S, LONGEST_SAMPLES, MOST_RATE_HZ
 from selfcal.logs.order import broken, mends
 from selfcal.logs.sampling import (
     ONE_INSTANT,
-    SAME,
+    SAME_INTERVAL,
     Ambiguous,
     common_step,
     in_pattern,
@@ -98,7 +98,7 @@ class Clock:
     def alike(self, other: Clock) -> bool:
         """Whether both are one clock."""
         return (
-            abs(self.rate_hz / other.rate_hz - 1.0) < SAME
+            abs(self.rate_hz / other.rate_hz - 1.0) < SAME_INTERVAL
             and abs(self.start_s - other.start_s) * self.rate_hz < ONE_INSTANT
             and np.array_equal(self.missing_before, other.missing_before)
         )
@@ -131,7 +131,7 @@ def clock_of(path: object, time: NDArray[np.float64], noise_s: float, rate: floa
     if not LEAST_RATE_HZ <= rate <= MOST_RATE_HZ:
         what = f"not {LEAST_RATE_HZ:g} to {MOST_RATE_HZ:g}: is the unit of t right?"
         raise UserError(f"{path}: column 't': a sampling rate of {rate:g} Hz, {what}")
-    if time[-1] * rate >= LONGEST:
+    if time[-1] * rate >= LONGEST_SAMPLES:
         _too_long(time, fail)
     grid = Clock(rate, missing, start_s=-missing[0] / rate).time_s
     off_grid = np.subtract(time, grid, out=grid)
@@ -183,7 +183,7 @@ def remarks(clock: Clock) -> list[str]:
         return [words + (f": a slower sensor's stamps are alike: --rate {other:g} states that" if alike else "")]
     if gaps.size:
         return []
-    if 0.0 < lattice * rate < 1.0 - SAME and steps.min() > 0.5 * lattice:
+    if 0.0 < lattice * rate < 1.0 - SAME_INTERVAL and steps.min() > 0.5 * lattice:
         turns = np.rint(steps / lattice)
         if turns.min() == 1.0 and (lattice * rate > 1.0 - _AGREES or in_pattern(turns)):
             other = float(f"{1.0 / lattice:.6g}")
@@ -210,5 +210,5 @@ def _ways(time: NDArray[np.float64]) -> str:
 def _too_long(time: NDArray[np.float64], fail: Fail) -> NoReturn:
     steps = np.diff(time, prepend=0.0)
     row = int(np.argmax(steps))
-    what = f"a recording spans at most {LONGEST_S:g} s, and {LONGEST:.2g} samples: leave the row out"
+    what = f"a recording spans at most {LONGEST_S:g} s, and {LONGEST_SAMPLES:.2g} samples: leave the row out"
     fail(row, f"the time stamp is {steps[row]:.3g} s after the one before: {what}")

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError, cell
 from selfcal.base.grid import Array, Rows
-from selfcal.base.limits import LEAST_RATE_HZ, LONGEST, LONGEST_S, MOST_COLUMNS, MOST_RATE_HZ
+from selfcal.base.limits import LEAST_RATE_HZ, LONGEST_S, LONGEST_SAMPLES, MOST_COLUMNS, MOST_RATE_HZ
 from selfcal.base.output import together, whole
 from selfcal.logs.loaders import WRITTEN
 from selfcal.logs.loaders.table import heading, meta_place
@@ -133,7 +133,7 @@ def clocks_of(
                 float(entry["start_s"]),
             )
             sound = LEAST_RATE_HZ <= rate <= MOST_RATE_HZ and abs(start) < LONGEST_S and rows.size > 1
-            sound &= bool(on_grid[0] >= 0 and on_grid[-1] < min(LONGEST, LONGEST_S * rate))
+            sound &= bool(on_grid[0] >= 0 and on_grid[-1] < min(LONGEST_SAMPLES, LONGEST_S * rate))
             sound &= bool((on_grid == np.rint(on_grid)).all())
             sound &= bool((np.diff(on_grid) > 0).all() and np.isfinite(stamps).all())
             stamped = bool(entry["stamped"])

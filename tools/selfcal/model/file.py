@@ -38,7 +38,7 @@ from selfcal.model.laws import (
 SCHEMA = "selfcal.model/1"
 DEFAULT = Path(__file__).parent / "models" / "default.yaml"
 #: Model files of common parts, one a part; the default model is that of the ADIS16405.
-PARTS = DEFAULT.parent / "parts"
+PARTS_FOLDER = DEFAULT.parent / "parts"
 DEFAULT_PART = "adis16405"
 
 #: Prior limits of parameters that no law of the file has: as in the default model at 1 Hz; and whether they multiply
@@ -75,7 +75,7 @@ REGRESSORS: dict[str, tuple[str, ...]] = {
 #: Most hypotheses of one model, in the host's library and on the wire.
 MOST_HYPOTHESES: int = _library32.HYPOTHESES_MAX
 #: Most columns of a bank's regressors together, and most that a model file may state.
-MOST_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
+MOST_BANK_COLUMNS, MOST_STATED = _library32.REGRESSORS_MAX, 36
 
 
 @dataclass(frozen=True)
@@ -284,7 +284,7 @@ class Model:
     def left_out(self) -> list[str]:
         """What a bank leaves out, in words."""
         names = ", ".join(regressor.name for regressor in self.beyond)
-        said = f"a bank has {MOST_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
+        said = f"a bank has {MOST_BANK_COLUMNS} columns, and leaves out {names}: `diagnose` alone takes them"
         beyond = [f"{self.path}: {said}"] if names else []
         if self.hidden_input is None:
             return beyond
@@ -316,14 +316,14 @@ def with_room(regressors: Sequence[Regressor]) -> tuple[Regressor, ...]:
     """Regressors that a bank has columns for: in their order, each whole or not at all."""
     kept: list[Regressor] = []
     for regressor in regressors:
-        if sum(len(other.columns) for other in (*kept, regressor)) <= MOST_COLUMNS:
+        if sum(len(other.columns) for other in (*kept, regressor)) <= MOST_BANK_COLUMNS:
             kept.append(regressor)
     return tuple(kept)
 
 
 def parts() -> dict[str, Path]:
     """Model files of the parts that the package has, by name."""
-    return dict(sorted({DEFAULT_PART: DEFAULT, **{path.stem: path for path in PARTS.glob("*.yaml")}}.items()))
+    return dict(sorted({DEFAULT_PART: DEFAULT, **{path.stem: path for path in PARTS_FOLDER.glob("*.yaml")}}.items()))
 
 
 def file_of(model: Path | str | None) -> Path:

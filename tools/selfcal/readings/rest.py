@@ -20,9 +20,9 @@ from selfcal.readings.lattice import step_of
 from selfcal.readings.moves import PUSH
 
 #: Length of a piece, s, and its samples at least.
-PIECE_S, PIECE_LEAST = 1.0, 4
+LEVEL_PIECE_S, PIECE_LEAST = 1.0, 4
 #: Fewest pieces, or differences of neighbouring means, that show a deviation.
-FEWEST = 8
+PIECES_LEAST = 8
 #: Share of the quietest pieces that rest is known from: a recording may move for most of its time.
 QUIET_SHARE = 0.2
 #: Probability that a piece of normal noise is called motion, and a factor for noise that is not normal.
@@ -45,10 +45,10 @@ class RestStretches:
 def rest_of(recording: Recording, axes: Sequence[str]) -> RestStretches:
     """When the sensor moved, by the scatter within pieces of 1 s and the jumps between their means, each against those
     of the recording's quietest fifth. An axis alone counts. A change by one step of its lattice is no motion."""
-    piece = max(PIECE_LEAST, round(PIECE_S * recording.rate_hz))
+    piece = max(PIECE_LEAST, round(LEVEL_PIECE_S * recording.rate_hz))
     place = recording.clock.place - recording.clock.place[0]
     index, count = place // piece, int(place[-1] + 1) // piece  # of whole pieces
-    if not FEWEST <= count <= recording.samples:
+    if not PIECES_LEAST <= count <= recording.samples:
         return RestStretches((), ())
     kept = index < count
     used = np.bincount(index[kept], minlength=count)

@@ -23,9 +23,9 @@ LEFT, RIGHT, TOP, BOTTOM = 54, 12, 26, 42
 #: Size of a picture of strips, room for their names, and the height of each.
 STRIP_WIDTH, STRIP_LEFT, STRIP = 900, 96, 52
 #: Most points of a curve.
-POINTS = 400
+POINTS_MOST = 400
 #: Most rows of a table behind a picture.
-ROWS = 25
+TABLE_ROWS_MOST = 25
 #: Approximate number of ticks of an axis.
 TICKS = 5
 
@@ -112,7 +112,7 @@ class Panel:
             else:
                 same[1].extend(columns)
         for x, columns in groups:
-            every = max(1, math.ceil(x.size / ROWS))
+            every = max(1, math.ceil(x.size / TABLE_ROWS_MOST))
             thinned = "" if every == 1 else f" One point in {every} of {x.size}."
             heads = [self.x_label, *(label for label, _ in columns)]
             rows = (

@@ -19,7 +19,7 @@ from selfcal.diagnosis.events import parted
 from selfcal.show.identification import recording_heading
 
 #: Width of a line without a terminal, characters.
-WIDTH = 114
+LINE_CHARACTERS = 114
 
 
 def show(
@@ -29,7 +29,7 @@ def show(
     if console is None:
         console = console_of(to_stderr=to_stderr)
         if not console.is_terminal:  # its cells wrap and lose nothing
-            console.width = WIDTH
+            console.width = LINE_CHARACTERS
 
     say = partial(print_line, console)
     say(recording_heading(document["recording"]))

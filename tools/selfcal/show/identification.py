@@ -13,7 +13,7 @@ from rich.table import Table
 
 from selfcal.adequacy.identify_document import as_typed
 from selfcal.adequacy.summary import MOST_TIMES, noisier
-from selfcal.bank.axis_result import FAINT, likeliest
+from selfcal.bank.axis_result import LAW_LEAST, likeliest
 from selfcal.bank.priors import OF_RECORD
 from selfcal.base import units
 from selfcal.base.errors import called, few, printable
@@ -248,7 +248,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         coarse = [
             law
             for law, parameters in axis["parameters"].items()
-            if axis["hypotheses"][law] >= FAINT and any(e["off_grid"] for e in parameters.values())
+            if axis["hypotheses"][law] >= LAW_LEAST and any(e["off_grid"] for e in parameters.values())
         ]
         if coarse:
             failed.append(f"grid of nodes too coarse: {name}: {', '.join(coarse)}")
@@ -260,7 +260,7 @@ def _notes(document: Mapping[str, Any], axes: Mapping[str, Any]) -> list[str]:
         of = _by_reason((named(why), name) for name, why in suspicions.items() if ("added_law" in axes[name]) is chosen)
         failed += [f"{said}: {'; '.join(f'{names}: {cause}' for cause, names in of.items())}"] if of else []
     more = _by_reason(
-        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > FAINT), name)
+        (", ".join(f"{law} {P:.2g}" for law, P in sorted(more.items(), key=lambda law: -law[1]) if P > LAW_LEAST), name)
         for name, more in ((name, axis["more_laws"]) for name, axis in axes.items() if "more_laws" in axis)
     )
     failed += [f"with the laws of sums.yaml: {names}: {laws}" for laws, names in more.items()]

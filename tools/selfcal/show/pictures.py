@@ -20,10 +20,10 @@ from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
-from selfcal.show.chart import POINTS, Band, Curve, Figure, Panel, envelope, means_of
+from selfcal.show.chart import POINTS_MOST, Band, Curve, Figure, Panel, envelope, means_of
 
 #: Lags of the correlation, pieces of the noise level, bins of a histogram, frequencies on each side of a line.
-LAGS, PIECES, BINS, BESIDE = 30, 60, 61, 60
+LAGS_SHOWN, PIECES_SHOWN, HISTOGRAM_BINS, BINS_SHOWN = 30, 60, 61, 60
 
 Summary = Callable[[Array, Array], Array]
 
@@ -207,7 +207,7 @@ def _line(finding: Finding, factor: float, unit: str) -> BeforeAfter:
     f = float(finding.look.estimate["frequency_hz"]["median"])
     frequency = rfftfreq(state.y.size, state.dt)
     nearest = int(np.argmin(np.abs(frequency - f)))
-    low, high = max(1, nearest - BESIDE), min(frequency.size, nearest + BESIDE + 1)
+    low, high = max(1, nearest - BINS_SHOWN), min(frequency.size, nearest + BINS_SHOWN + 1)
 
     def removed(state: State) -> Summary:
         effect = _effect(finding) if state is finding.after else np.zeros(state.y.size)
@@ -227,7 +227,7 @@ def _line(finding: Finding, factor: float, unit: str) -> BeforeAfter:
 
 
 def _correlation(before: State, after: State, magnitude: bool = False) -> BeforeAfter:
-    lags = min(LAGS, before.y.size // 4)
+    lags = min(LAGS_SHOWN, before.y.size // 4)
 
     def summary(y: Array, w: Array) -> Array:
         x = np.minimum(np.abs(w), 3.5) if magnitude else w
@@ -256,7 +256,7 @@ def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
 
 
 def _level(
-    finding: Finding, record: Record, means: bool = False, marked: bool = False, pieces: int = PIECES
+    finding: Finding, record: Record, means: bool = False, marked: bool = False, pieces: int = PIECES_SHOWN
 ) -> BeforeAfter:
     edges, middle = _pieces(record, pieces)
     size = np.sqrt(np.diff(edges))
@@ -278,7 +278,7 @@ def _level(
 
 
 def _largest(finding: Finding, record: Record) -> BeforeAfter:
-    edges, middle = _pieces(record, POINTS // 2)
+    edges, middle = _pieces(record, POINTS_MOST // 2)
 
     def summary(y: Array, w: Array) -> Array:
         largest = np.maximum.reduceat(np.where(np.isfinite(w), np.abs(w), -1.0), edges[:-1])
@@ -296,7 +296,7 @@ def _largest(finding: Finding, record: Record) -> BeforeAfter:
 
 
 def _histogram(before: State, after: State) -> BeforeAfter:
-    edges = np.linspace(-8.0, 8.0, BINS + 1)
+    edges = np.linspace(-8.0, 8.0, HISTOGRAM_BINS + 1)
 
     def summary(y: Array, w: Array) -> Array:
         counts = np.histogram(np.clip(w[np.isfinite(w)], -7.999, 7.999), edges)[0]
@@ -337,19 +337,19 @@ def _histogram_of_readings(
     y = before.y[np.isfinite(before.y)]
     sigma, lsb = before.best.sigma, max(before.lsb, lattice)
     low, high = float(y.min()), float(y.max())
-    if high - low > 0.5 * BINS * max(lsb, 0.2 * sigma):
+    if high - low > 0.5 * HISTOGRAM_BINS * max(lsb, 0.2 * sigma):
         low, high = (float(value) for value in np.quantile(y, [0.001, 0.999]))
     if math.isfinite(edge):
         low, high = min(low, edge), max(high, edge)
     low, high = low - 0.5 * sigma - lsb, high + 0.5 * sigma + lsb
     if lsb > 0.0:
         # Whole codes a bin, about each code; four bins a code show that the readings lie on the codes alone.
-        codes = max(1, math.ceil((high - low) / lsb / (2 * BINS)))
+        codes = max(1, math.ceil((high - low) / lsb / (2 * HISTOGRAM_BINS)))
         width = codes * lsb / (4 if lattice > 0.0 and codes == 1 else 1)
         first = math.floor((low + before.level) / lsb) * lsb - before.level
         edges = first + (np.arange(math.ceil((high - first) / width) + 1) - 0.5) * width
     else:
-        edges = np.linspace(low, high, BINS + 1)
+        edges = np.linspace(low, high, HISTOGRAM_BINS + 1)
 
     def counted(limit: float) -> Summary:
         def summary(y: Array, w: Array) -> Array:
@@ -394,7 +394,7 @@ def _together(finding: Finding) -> Iterator[Figure]:
 
 def _missing(finding: Finding, record: Record) -> Figure:
     """Gaps in the stamps, and rows that the logger held."""
-    edges, middle = _pieces(record, POINTS // 2)
+    edges, middle = _pieces(record, POINTS_MOST // 2)
     before, after = finding.before.y, finding.after.y
     held = np.append(False, np.diff(before) == 0.0) & ~np.isfinite(after)
     gone = held | ~record.present.astype(bool)
@@ -422,7 +422,7 @@ def _sides(diagnosed: Diagnosed, record: Record, factor: float, unit: str) -> Fi
     y = simulated(diagnosed.state, np.random.default_rng(20))
     panels = []
     for title, values in (("Measured", diagnosed.first.y), ("Simulated", y)):
-        x, mean, low, high = envelope(record.time_s, values, POINTS)
+        x, mean, low, high = envelope(record.time_s, values, POINTS_MOST)
         panels.append(
             Panel(
                 title,
@@ -453,8 +453,8 @@ def _series(finding: Finding, record: Record, factor: float, unit: str) -> Figur
         ("Readings and fitted effect", y, effect),
         ("Readings less the effect", y - effect + middle, np.full(y.size, middle)),
     ):
-        x, mean, _, _ = envelope(record.time_s, values, POINTS)
-        _, fitted, _, _ = envelope(record.time_s, line, POINTS)
+        x, mean, _, _ = envelope(record.time_s, values, POINTS_MOST)
+        _, fitted, _, _ = envelope(record.time_s, line, POINTS_MOST)
         shift = float(np.nanmean(mean)) - float(np.nanmean(fitted))
         panels.append(
             Panel(
@@ -479,7 +479,7 @@ def _evidence(finding: Finding, record: Record) -> Iterator[BeforeAfter]:
     if not np.ptp(effect) > 0.0:
         return
     count = 1 + len(finding.before.regressors)
-    marks = np.unique(np.linspace(0, effect.size - 1, min(effect.size, POINTS // 2)).astype(int))
+    marks = np.unique(np.linspace(0, effect.size - 1, min(effect.size, POINTS_MOST // 2)).astype(int))
 
     def path(state: State) -> Summary:
         series = replace(state.series, columns=state.series.columns[:count]).beside(effect)
@@ -511,7 +511,7 @@ _PICTURES: Mapping[str, Callable[[Finding, Record, float, str], Iterable[BeforeA
     "line": lambda finding, record, factor, unit: [_line(finding, factor, unit)],
     "allan": lambda finding, record, factor, unit: [_allan(finding.before, finding.after, factor, unit)],
     "marked_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True)],
-    "fine_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True, pieces=POINTS // 2)],
+    "fine_level": lambda finding, record, factor, unit: [_level(finding, record, marked=True, pieces=POINTS_MOST // 2)],
     "largest": lambda finding, record, factor, unit: [_largest(finding, record)],
     "histogram": lambda finding, record, factor, unit: [_histogram(finding.before, finding.after)],
     "lattice": lambda finding, record, factor, unit: [_lattice(finding, factor, unit)],

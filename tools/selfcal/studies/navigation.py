@@ -32,7 +32,7 @@ from selfcal.calibration.gyroscope import cross
 from selfcal.model.simulated_parts import AXES, TRUTHS, TURN_ON, Floats, generator, simulate_axis
 
 #: Lengths of the rest, and of the flight with GPS and after its outage, s; the longest outage that is flown.
-REST_S, GPS_S, OUTAGE_S, LONGEST_S = 1800, 300, 60, 300
+REST_S, GPS_S, OUTAGE_S, LONGEST_OUTAGE_S = 1800, 300, 60, 300
 #: Readings per s in flight.
 RATE_HZ = 10
 #: Latency of a position, and the sd of its error by part, s; a position's own sd by axis, m.
@@ -96,7 +96,7 @@ class Flight:
 def flight() -> Flight:
     """Take-off, then figures of eight at a changing speed in coordinated turns, which let the biases be seen."""
     dt = 1.0 / RATE_HZ
-    t = np.arange((GPS_S + LONGEST_S) * RATE_HZ + 1) * dt
+    t = np.arange((GPS_S + LONGEST_OUTAGE_S) * RATE_HZ + 1) * dt
     after = np.maximum(t - TAKE_OFF_S, 0.0)
     start = 0.5 * (1.0 - np.cos(np.pi * np.minimum(t / TAKE_OFF_S, 1.0)))
     speed = 20.0 * start + 4.0 * np.sin(2.0 * np.pi * after / 47.0)

@@ -37,7 +37,7 @@ from selfcal.readings.readings import look
 from selfcal.studies.navigate import bank_noise
 from selfcal.studies.navigation import (
     GPS_S,
-    LONGEST_S,
+    LONGEST_OUTAGE_S,
     OUTAGE_S,
     RATE_HZ,
     REST_S,
@@ -49,7 +49,7 @@ from selfcal.studies.navigation import (
 )
 
 #: Outages after which the position is judged, s; the one of the sentence is OUTAGE_S.
-OUTAGES_S = (10, OUTAGE_S, LONGEST_S)
+OUTAGES_S = (10, OUTAGE_S, LONGEST_OUTAGE_S)
 #: Flights, evenly spread; coordinates of a position.
 FLIGHTS, COORDINATES = 50, 3
 #: Assumptions behind the numbers.
@@ -199,9 +199,9 @@ def flights(known: Mapping[str, KnownAxis]) -> dict[str, dict[str, Any]]:
     """By outage, s: rms error of the position, m, mean of its NEES and the 95 % band of it, in FLIGHTS of the second
     half. Raises UserError of errors that are too short."""
     seconds = min(axis.errors.size for axis in known.values())
-    first, last = seconds // 2, seconds - GPS_S - LONGEST_S
+    first, last = seconds // 2, seconds - GPS_S - LONGEST_OUTAGE_S
     if last < first:
-        raise UserError(f"flights need a recording of {2 * (GPS_S + LONGEST_S)} s or more")
+        raise UserError(f"flights need a recording of {2 * (GPS_S + LONGEST_OUTAGE_S)} s or more")
     white = _white(seconds)
     own, noise = [], []
     for name, unit in AXES.items():
@@ -212,7 +212,7 @@ def flights(known: Mapping[str, KnownAxis]) -> dict[str, dict[str, Any]]:
         noise.append(axis.noise)
     errors = np.stack(own, axis=1) * SCALE
     starts = np.linspace(first, last, FLIGHTS).astype(int)
-    flown = np.arange(GPS_S + LONGEST_S)
+    flown = np.arange(GPS_S + LONGEST_OUTAGE_S)
     rest = np.arange(-min(REST_S, first), 0)
     part = Part.of_errors(errors[starts[:, None] + rest], np.repeat(errors[starts[:, None] + flown], RATE_HZ, axis=1))
     filters = Filters(FilterNoise.of([noise] * FLIGHTS), part)

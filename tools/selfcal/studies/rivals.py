@@ -44,7 +44,7 @@ ENSEMBLE_SCHEMA = "selfcal.rivals_ensemble/1"
 ENSEMBLE = DEFAULT.with_name("ensemble.yaml")
 SAMPLES = (150, 600)
 #: Bank samples that every method can work with: five points of an Allan curve.
-FEWEST = 50
+RIVAL_SAMPLES_LEAST = 50
 
 
 def of_recording(
@@ -102,8 +102,8 @@ class Ensemble:
         seeds = record_seeds(self.records, self.seed)
         if self.truth not in ("middle", "prior"):
             raise UserError(f"--truth is middle or prior, not '{self.truth}'")
-        if not all(FEWEST <= n <= MOST_DENSE for n in self.samples):
-            raise UserError(f"--samples must be {FEWEST} to {MOST_DENSE}")
+        if not all(RIVAL_SAMPLES_LEAST <= n <= MOST_DENSE for n in self.samples):
+            raise UserError(f"--samples must be {RIVAL_SAMPLES_LEAST} to {MOST_DENSE}")
         if not set(self.model.hypotheses) <= set(PLAIN):
             raise UserError(f"{self.model.path}: rivals knows the laws {', '.join(PLAIN)} alone: leave the others out")
         given = {"axis": self.axis, "truth": self.truth, "seed": self.seed}
@@ -144,10 +144,10 @@ def problem_of(recording: Recording, name: str, model: Model, decimate: float | 
         raise UserError(f"{model.path}: rivals knows the laws {', '.join(PLAIN)}: the model has none of them")
     mean, dt_s = bank_means(recording, model, name, decimate)
     y = longest_stretch(mean)
-    if y.size < FEWEST:
+    if y.size < RIVAL_SAMPLES_LEAST:
         raise UserError(
             f"{recording.path}: {name}: {y.size} averages of {dt_s:g} s without a gap are too few, "
-            f"{FEWEST} are needed: record longer, or give --decimate HZ"
+            f"{RIVAL_SAMPLES_LEAST} are needed: record longer, or give --decimate HZ"
         )
     alone = replace(model.group_of(name), axes=(name,))
     return Problem(y, dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size

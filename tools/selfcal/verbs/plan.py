@@ -73,7 +73,7 @@ def plan(
     prior's sd.
     With `response`: the shortest record in which SHARE of the parts have a gain and a lag as wanted, its input switched
     between the `levels`. The document has `bit_s`, `duration_s` and `set_points` then.
-    Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond MOST bank samples, and the `curve`; the
+    Returns the document `selfcal.plan/1`: by wish the `duration_s`, null beyond LENGTH_MOST, and the `curve`; the
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
@@ -191,7 +191,7 @@ def _response(
 ) -> dict[str, Any]:  # fmt: skip
     """The document of an input for `response`."""
     from selfcal.base.output import check_writable, write_json, write_text
-    from selfcal.batch.design import DRAWN, Experiment, designed
+    from selfcal.batch.design import TRIED_RECORDS, Experiment, designed
     from selfcal.batch.plan import SCHEMA, Wish
     from selfcal.batch.spread import record_seeds
     from selfcal.diagnosis.separate import SHARE
@@ -212,7 +212,7 @@ def _response(
     for wish in wishes:
         if wish.parameter not in sizes or not wish.text.endswith("%"):
             raise UserError(f"--want '{wish.text}': with --response takes 'gain within 5 %' and 'lag within 20 %'")
-    design = designed(model, axis, experiment, wishes, record_seeds(min(records, DRAWN), seed), scheduler)
+    design = designed(model, axis, experiment, wishes, record_seeds(min(records, TRIED_RECORDS), seed), scheduler)
     document: dict[str, Any] = {
         "schema": SCHEMA,
         "model": str(model.path),

@@ -51,7 +51,7 @@ def simulate(
     from selfcal.base.output import check_place
     from selfcal.batch.spread import checked_seed
     from selfcal.diagnosis.causes import CAUSES
-    from selfcal.diagnosis.simulate import DRAWS, added_by, applied_to, axis_of, put_faults, scene_of, slowed, truth_of
+    from selfcal.diagnosis.simulate import SEEDS, added_by, applied_to, axis_of, put_faults, scene_of, slowed, truth_of
     from selfcal.logs import recording
     from selfcal.model.file import Model
     from selfcal.model.tables import bank_block
@@ -74,7 +74,7 @@ def simulate(
     with Console(stderr=True).status(f"simulating {scene.samples:,} samples of {len(axes)} axes"):
         added = added_by(applied, model, scene.rate_hz, seed)
         values, temperature, supply, present, bias_now = _reference.simulate(scene, axes, added)
-        changed = put_faults(applied, model, axes, values, scene.rate_hz, _reference.Random(seed, DRAWS + len(axes)))
+        changed = put_faults(applied, model, axes, values, scene.rate_hz, _reference.Random(seed, SEEDS + len(axes)))
     for name, axis, now in zip(model.axes, axes, bias_now, strict=True):
         truth[name] |= {
             "bias_now": now,

@@ -56,14 +56,14 @@ def tumble(
     from selfcal.calibration.earth import place
     from selfcal.calibration.tumble_document import tumble_document
     from selfcal.calibration.tumble_export import FORMS, write_calibration
-    from selfcal.calibration.tumble_rests import MOST, tumble_of
+    from selfcal.calibration.tumble_rests import RESTS_MOST, tumble_of
     from selfcal.calibration.tumble_show import plot as picture
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
 
     each = list(logs) if isinstance(logs, Sequence) and not isinstance(logs, str) else [logs]
-    if not 1 <= len(each) <= MOST:
-        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {MOST} at most")
+    if not 1 <= len(each) <= RESTS_MOST:
+        raise UserError(f"{len(each)} logs: give one with turns, or a log a position, {RESTS_MOST} at most")
     files = [path for log in each for path in list_of(log)]
     check_writable(json, plot, output, None if export is None else export[1], inputs=(*files, model))
     check_picture(plot)

@@ -22,7 +22,7 @@ from selfcal.wire.frames import AxisReport, wire_names
 #: Time from a report to the middle of the readings that test it, and their length, s: white noise averages out.
 AHEAD_S, MEAN_S = 300.0, 60.0
 #: Fewest reports of a figure.
-LEAST = 3
+REPORTS_LEAST = 3
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def error_ahead(recording: Recording, model: Model, name: str, reports: Sequence
             continue
         change = columns[then].mean(axis=0) - columns[now[-1]]
         errors.append(float(np.nanmean(readings[then])) - report.bias - float(report.coefficients @ change))
-    if len(errors) < LEAST or not all(map(math.isfinite, errors)):
+    if len(errors) < REPORTS_LEAST or not all(map(math.isfinite, errors)):
         return None
     rmse = math.sqrt(float(np.mean(np.square(errors)))) * factor(group.unit, unit)
     return {"horizon_s": AHEAD_S, "mean_s": MEAN_S, "rmse": rmse, "reports": len(errors), "unit": unit}

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple, cast
 from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError, remark
 from selfcal.base.units import SENSOR_UNITS, parameter_unit
-from selfcal.model.file import MOST_COLUMNS, MOST_HYPOTHESES
+from selfcal.model.file import MOST_BANK_COLUMNS, MOST_HYPOTHESES
 
 if TYPE_CHECKING:
     from cantools.database.can import Database
@@ -35,7 +35,7 @@ PLACE_NAMES = ("N", "p1", "p2")
 #: Signal of an axis's judgement whose words are those of every `reason_gx` to `reason_az`, too.
 REASON = "reason"
 #: Most letters of a name in a DBC file.
-LONGEST = 32
+LETTERS_MOST = 32
 
 
 class DbcMessage(NamedTuple):
@@ -70,7 +70,7 @@ class Names:
 BY_PLACE = Names(
     tuple(f"h{k}" for k in range(MOST_HYPOTHESES)),
     (PLACE_NAMES,) * MOST_HYPOTHESES,
-    tuple((f"c{column}", "") for column in range(MOST_COLUMNS)),
+    tuple((f"c{column}", "") for column in range(MOST_BANK_COLUMNS)),
 )
 
 
@@ -143,7 +143,7 @@ def _coefficients(names: Names, reading: str) -> Callable[[Signal], Signal | Non
 def symbol(name: str) -> str:
     """A name as a DBC file may have it: letters, digits and underscores, none too long, a letter first."""
     plain = re.sub(r"\W", "_", name, flags=re.ASCII)
-    return (plain if plain[:1].isalpha() else f"_{plain}")[: LONGEST - len("_probability")]
+    return (plain if plain[:1].isalpha() else f"_{plain}")[: LETTERS_MOST - len("_probability")]
 
 
 def _different(names: Iterable[str]) -> list[str]:

@@ -17,7 +17,7 @@ from jinja2 import Template
 from selfcal.base.code_template import of_code
 from selfcal.base.errors import UserError
 from selfcal.logs.framelog import LONGEST_FRAME
-from selfcal.model.file import MOST_COLUMNS, MOST_HYPOTHESES
+from selfcal.model.file import MOST_BANK_COLUMNS, MOST_HYPOTHESES
 from selfcal.wire.dbc_file import COMMON, NODE_IDS, NODES, PLACE_NAMES, REASON, VALUE_BITS, dbc_text
 from selfcal.wire.frames import ANSWER, AXES, COMMAND, CORRECTED, ROOT, STATISTICS, STATUS, TUMBLE, load_dbc
 
@@ -94,7 +94,7 @@ def header(database: Database) -> str:
     """The text of lib/selfcal_frames.h. Raises UserError for a DBC that the C code cannot pack: messages of other axes
     and hypotheses are made from the first one's (dbc_file.py)."""
     columns = [_item(signal) for signal in fields(_first(database, "_COEFFICIENTS"))]
-    if columns != list(range(3 * MOST_COLUMNS)):
+    if columns != list(range(3 * MOST_BANK_COLUMNS)):
         raise UserError("selfcal.dbc: GX_COEFFICIENTS: each column must have three items, in order")
     status, corrected, command, answer, tumble = map(
         database.get_message_by_name, (STATUS, CORRECTED, COMMAND, ANSWER, TUMBLE)

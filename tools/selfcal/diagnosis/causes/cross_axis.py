@@ -16,7 +16,7 @@ from selfcal.diagnosis.channel_looks import Channel, form_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
-from selfcal.likelihood.joint import WIDTHS, act_apart
+from selfcal.likelihood.joint import SIZE_WIDTHS, act_apart
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, State
 from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
@@ -139,7 +139,7 @@ def _arms(record: Record, found: Mapping[str, Diagnosed]) -> None:
     if len(free) < 2 or gains[source] < NET_LEAST:
         return
     columns = {name: record.other_axes(name)[source] for name in free}
-    each = [free[name].bayes(columns[name], np.array(WIDTHS)) for name in free]
+    each = [free[name].bayes(columns[name], np.array(SIZE_WIDTHS)) for name in free]
     star = act_apart(*map(np.array, zip(*each, strict=True)))
     names = [[*free][k] for k in star.axes]
     if len(names) < 2 or star.evidence - math.log(len(gains)) < EVIDENT:

@@ -18,7 +18,7 @@ from selfcal.likelihood.statemodel import Array
 #: most of them: 5 instead of 1350 / e gained 2.5 nats.
 LN_LOOKS = -1.5
 #: Outliers are exceptions: a look that takes more of the samples for them has another cause.
-MOST = 0.05
+OUTLIERS_MOST = 0.05
 #: Readings on no lattice that repeat the one before more often than this share are no noise with exceptions.
 REPEATS_MOST = 0.5
 #: Standard deviations of a sample beyond which a module keeps it out: of normal noise one in 5e8.
@@ -27,7 +27,7 @@ KEPT_OUT_SD = 6.0
 
 def looks(state: State, record: Record) -> list[Look]:
     """Isolated wild samples. They are exceptions: a mixture with many of them has another cause."""
-    return [look for look in mixed(state, record) if look.estimate["fraction"]["median"] <= MOST]
+    return [look for look in mixed(state, record) if look.estimate["fraction"]["median"] <= OUTLIERS_MOST]
 
 
 def mixed(state: State, record: Record) -> list[Look]:

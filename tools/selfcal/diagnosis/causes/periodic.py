@@ -25,7 +25,7 @@ TURNS_LEAST = 1.5
 #: A line of fewer turns is as slow as a drift: its gain must hold over all possible drifts, and its search costs more.
 SLOW_TURNS = 30.0
 #: Two axes know the frequency of one line to so many turns in the record: nearer ones share a column.
-SAME = 0.25
+SAME_TURNS = 0.25
 #: A band wider than this share of a line's frequency lies at one of its multiples by chance.
 HARMONIC_MOST = 0.1
 #: Lines whose frequencies, or multiples of them, differ by less than this share are one event.
@@ -42,7 +42,7 @@ def looks(state: State, record: Record) -> list[Look]:
 
 def _band(state: State) -> list[Look]:
     """A fast swing that noise drives (swing.py). Slow ones are the bias's own (oscillation.py)."""
-    found = swing.found(state, slow=False) if len(state.extras.bands) < swing.MOST else None
+    found = swing.found(state, slow=False) if len(state.extras.bands) < swing.SWINGS_MOST else None
     if found is None or found.keeps_phase:
         return []
     (period, damping, ln_size), fit = found.numbers, found.fit
@@ -174,7 +174,7 @@ def _settle(record: Record, found: Mapping[str, Diagnosed]) -> None:
     first: list[tuple[str, float]] = []
     for name, finding in sorted(lines, key=lambda line: -line[1].look.gain):
         diagnosed, hz = found[name], _hz(finding.look)
-        common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME), hz)
+        common = next((f for axis, f in first if axis != name and abs(hz - f) * record.time_s[-1] < SAME_TURNS), hz)
         if common == hz:
             first.append((name, hz))
             continue

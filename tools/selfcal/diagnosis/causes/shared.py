@@ -27,13 +27,13 @@ from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, ne
 from selfcal.likelihood.statemodel import Array
 
 #: Bands are thirds of an octave, of so many bins of the spectrum at least.
-PARTS, BINS_LEAST = 3, 16
+OCTAVE_PARTS, BINS_LEAST = 3, 16
 #: An innovation counts as so many standard deviations at most: an event on both axes is no noise.
 CLIP = 4.0
 #: Bins so far above the largest of noise, in units of their band's power, hold a line. Neighbours are left out too.
 LINE_LEAST, LINE_HALF = 4.0, 2
 #: Pieces of the record at most, over which the correlation must be steady.
-PIECES = 64
+STEADY_PIECES_MOST = 64
 #: A band of noise has half a width of this share of its frequency at least, and of so many bins of the spectrum. A
 #: narrower one is a disturbance of that frequency.
 BROAD, BROAD_BINS = 0.02, 4.0
@@ -88,7 +88,7 @@ class Pair:
         """First bins of the bands, from the slowest to the fastest, and the end of the last."""
         edges = [self.u.size // 2 + 1]
         while edges[-1] > BINS_LEAST:
-            low = min(int(edges[-1] / 2.0 ** (1.0 / PARTS)), edges[-1] - BINS_LEAST)
+            low = min(int(edges[-1] / 2.0 ** (1.0 / OCTAVE_PARTS)), edges[-1] - BINS_LEAST)
             edges.append(low if low > BINS_LEAST else 1)
         return np.array(edges[::-1], np.int64)
 
@@ -178,7 +178,7 @@ def _steadiness(pair: Pair, found: Common) -> float:
     inside[first:end] = True
     turn = found.coherence / max(abs(found.coherence), 1e-300)
     u, v = (irfft(np.where(inside, spectrum, 0.0), pair.u.size) for spectrum in (U, V * turn))
-    count = min(PIECES, int(found.bins))
+    count = min(STEADY_PIECES_MOST, int(found.bins))
     parts = np.array([float(part.sum()) for part in np.array_split(u * v, count)])
     scatter = max(float(parts.std(ddof=1)) * math.sqrt(count), 1e-300)
     return 0.5 * (float(parts.sum()) / scatter) ** 2

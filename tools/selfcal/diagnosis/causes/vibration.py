@@ -21,13 +21,13 @@ from selfcal.model.forms import variance_of
 #: Widths of the means of a variance, s.
 WIDTHS_S = (1.0, 3.0, 10.0, 30.0, 90.0)
 #: Differences that a variance is taken from at least: one alone scatters by 1.7 times itself.
-LEAST = 8
+ENOUGH = 8
 
 
 def looks(state: State, record: Record) -> list[Look]:
     """One look for every other axis whose variance is known."""
     others = {name: values for name, values in record.variances(state.axis).items() if np.ptp(values) > 0.0}
-    widths = tuple(width for width in WIDTHS_S if width * record.recorded_hz >= LEAST) or WIDTHS_S[-1:]
+    widths = tuple(width for width in WIDTHS_S if width * record.recorded_hz >= ENOUGH) or WIDTHS_S[-1:]
     return channel_looks.look(
         state,
         [
@@ -52,7 +52,7 @@ def looks(state: State, record: Record) -> list[Look]:
 def _add(keys: Mapping[str, Any], channels: Channels) -> Array:
     """The variance of 1 s of the other axis, about its mean."""
     interval_s = float(channels.time_s[1] - channels.time_s[0])
-    variance = smoothed(bridged(variance_of(channels.axes[str(keys["other"])])), max(LEAST, round(1.0 / interval_s)))
+    variance = smoothed(bridged(variance_of(channels.axes[str(keys["other"])])), max(ENOUGH, round(1.0 / interval_s)))
     about: Array = variance - variance.mean()
     return float(keys["coefficient"]) * about + channel_looks.added(keys, channels, about)
 

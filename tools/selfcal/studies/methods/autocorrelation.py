@@ -10,7 +10,7 @@ from scipy import fft, optimize
 from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, root
 
 #: Lags of the fit, as a part of the record: beyond it the estimate is noise.
-PART = 0.1
+LAGS_SHARE = 0.1
 
 
 def covariances(y: Floats, u: Floats, lags: int) -> Floats:
@@ -31,7 +31,7 @@ def autocorrelation(problem: Problem) -> Answer:
         white, walk = -step[1], step[0] + 2.0 * step[1]
         by_law["random_walk"] = {"N": root(white * dt), "K": root(walk / dt)}
     if "gauss_markov" in problem.laws:
-        c = covariances(problem.y, problem.y, max(4, round(PART * problem.y.size)))
+        c = covariances(problem.y, problem.y, max(4, round(LAGS_SHARE * problem.y.size)))
         lag = np.arange(1, c.size) * dt
 
         def distance(theta: Floats) -> Floats:

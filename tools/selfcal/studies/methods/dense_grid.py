@@ -18,7 +18,7 @@ from selfcal.studies.methods.problem import Answer, Floats, Problem, Value, prob
 #: Nodes of the ratio and of alpha, and of the white noise within its likelihood's width.
 MARKOV, NOISE = (110, 40), 41
 #: Width of the grid of white noise, in standard deviations of ln sigma_v.
-REACH = 7.0
+WHITE_REACH = 7.0
 
 
 def grid(problem: Problem) -> Answer:
@@ -61,14 +61,14 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     A, B, C, D = _sums(problem.y - problem.y[0], phi, step, start)
     n, origin = problem.y.size, float(problem.y[0])
     mode = 0.5 * np.log((C - B**2 / A) / n)
-    ln_sigma = mode[:, None] + np.linspace(-REACH, REACH, NOISE) / math.sqrt(2.0 * n)
+    ln_sigma = mode[:, None] + np.linspace(-WHITE_REACH, WHITE_REACH, NOISE) / math.sqrt(2.0 * n)
     variance, P0 = np.exp(2.0 * ln_sigma), priors["bias"].sd ** 2
     a = A[:, None] / variance + 1.0 / P0
     b = B[:, None] / variance - origin / P0  # the prior's mean is 0, that is -origin in these readings
     value = -n * ln_sigma - 0.5 * D[:, None] - 0.5 * (C[:, None] / variance + origin**2 / P0 - b**2 / a)
     value -= 0.5 * np.log(a * P0)
     ln_N = ln_sigma + 0.5 * math.log(dt)
-    value += ln_density(priors["N"], ln_N) + math.log(2.0 * REACH / math.sqrt(2.0 * n) / (NOISE - 1))
+    value += ln_density(priors["N"], ln_N) + math.log(2.0 * WHITE_REACH / math.sqrt(2.0 * n) / (NOISE - 1))
     rows = [ln_N]
     if law != "constant":
         ln_drift = ln_N + np.repeat(ln_ratio, ln_alpha.size)[:, None]

@@ -13,7 +13,7 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value, ln_moments, logarithmic
+from selfcal.studies.methods.problem import FIRST_LEVEL_SD, Answer, Floats, Problem, Value, ln_moments, logarithmic
 
 
 def ekf(problem: Problem) -> Answer:
@@ -31,7 +31,7 @@ def _run(problem: Problem, law: str, *, unscented: bool) -> dict[str, Value]:
     prior = [ln_moments(problem.group.priors[name]) for name in NAMED[law].parameters]
     mean = np.array([0.0, 0.0, *(m for m, _ in prior)])
     start = {"random_walk": 0.0, "gauss_markov": math.exp(prior[1][0])}[law]
-    sd = np.array([LEVEL_SD * float(y.std()), start, *(s for _, s in prior)])
+    sd = np.array([FIRST_LEVEL_SD * float(y.std()), start, *(s for _, s in prior)])
     d = mean.size
 
     def phi(x: Floats) -> float:

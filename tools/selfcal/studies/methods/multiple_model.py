@@ -14,12 +14,12 @@ from filterpy.kalman import KalmanFilter, MMAEFilterBank
 
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods.dense_grid import ln_density, ln_limits
-from selfcal.studies.methods.problem import LEVEL_SD, Answer, Floats, Problem, Value
+from selfcal.studies.methods.problem import FIRST_LEVEL_SD, Answer, Floats, Problem, Value
 
 #: Nodes of the drift's parameter and of alpha, each in the middle of a cell of the prior's range.
 NODES: dict[str, tuple[int, ...]] = {"constant": (), "random_walk": (12,), "gauss_markov": (6, 6)}
 #: The least white noise of a node, as a part of the variance of the differences.
-LEAST = 1e-4
+WHITE_SHARE_LEAST = 1e-4
 
 
 def mmae(problem: Problem) -> Answer:
@@ -57,7 +57,7 @@ def nodes(problem: Problem, law: str) -> tuple[Floats, Floats]:
     elif law == "gauss_markov":
         drift = -2.0 * np.exp(2.0 * ln[0]) * np.expm1(-np.exp(ln[1]) * problem.dt_s)
     total = float((np.diff(problem.y) ** 2).mean())
-    white = np.sqrt(0.5 * problem.dt_s * np.maximum(total - drift, LEAST * total))
+    white = np.sqrt(0.5 * problem.dt_s * np.maximum(total - drift, WHITE_SHARE_LEAST * total))
     return np.concatenate([white[None], np.exp(ln)]), mass / mass.sum()
 
 
@@ -66,7 +66,7 @@ def kalman_filter(problem: Problem, law: str, theta: Floats) -> KalmanFilter:
     kalman = KalmanFilter(dim_x=2, dim_z=1)
     kalman.H = np.ones((1, 2))
     kalman.R = np.array([[theta[0] ** 2 / problem.dt_s]])
-    kalman.P = np.diag([(LEVEL_SD * float(problem.y.std())) ** 2, 0.0])
+    kalman.P = np.diag([(FIRST_LEVEL_SD * float(problem.y.std())) ** 2, 0.0])
     phi, variance = problem.step(law, np.log(theta))
     kalman.F, kalman.Q = np.diag([1.0, float(phi)]), np.diag([0.0, float(variance)])
     if law == "gauss_markov":

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize
 
-from selfcal.adequacy.allan import LONGEST, AllanTerms, allan_terms, overlapping_variance
+from selfcal.adequacy.allan import AVERAGES_LEAST, AllanTerms, allan_terms, overlapping_variance
 from selfcal.bank.axis_result import HALF_90
 from selfcal.base.grid import weighted_quantiles
 from selfcal.model.file import Group, Prior
@@ -20,11 +20,11 @@ from selfcal.model.laws import NAMED
 Floats = NDArray[np.float64]
 
 #: The search leaves no start by more than this factor: beyond it the likelihood is flat or overflows.
-REACH = 1e5
+START_REACH = 1e5
 #: Step in the ln of a parameter for a curvature: a smaller one shows the rounding of an Allan variance.
 STEP = 0.01
 #: Sd of the first level of a Kalman filter, in sd of the record; the level begins at the first reading.
-LEVEL_SD = 10.0
+FIRST_LEVEL_SD = 10.0
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Problem:
     def octaves(self) -> tuple[Floats, Floats]:
         """Averaging times in readings, an octave apart, and overlapping Allan variances."""
         y = self.y - self.y.mean()
-        m = np.exp2(np.arange(max(1, math.floor(math.log2(max(2, y.size // LONGEST))) + 1)))
+        m = np.exp2(np.arange(max(1, math.floor(math.log2(max(2, y.size // AVERAGES_LEAST))) + 1)))
         return m, np.array([overlapping_variance(y, int(length))[0] for length in m])
 
 
@@ -154,7 +154,7 @@ def root(square: float) -> Value:
 def maximum(objective: Callable[[Floats], float], starts: Sequence[Floats]) -> Peak:
     """The highest of the local maxima that the search finds from `starts`, by L-BFGS with numerical derivatives."""
     best: tuple[float, Floats] | None = None
-    reach = math.log(REACH)
+    reach = math.log(START_REACH)
     for start in starts:
         bounds = [(value - reach, value + reach) for value in start]
         with np.errstate(all="ignore"):

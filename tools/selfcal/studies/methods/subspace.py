@@ -11,11 +11,11 @@ import numpy as np
 from scipy import linalg
 from statsmodels.tsa.stattools import levinson_durbin
 
-from selfcal.studies.methods.autocorrelation import PART
+from selfcal.studies.methods.autocorrelation import LAGS_SHARE
 from selfcal.studies.methods.problem import Answer, Floats, Problem, of_coefficients
 
-#: Lags at most; of a short record PART: as many parameters take ten samples each.
-MOST = 60
+#: Lags at most; of a short record LAGS_SHARE: as many parameters take ten samples each.
+LAGS_MOST = 60
 
 
 def subspace(problem: Problem) -> Answer:
@@ -31,7 +31,7 @@ def subspace(problem: Problem) -> Answer:
 
 def lags(y: Floats) -> int:
     """Twice the order of an autoregression by AIC (Bauer, Econometric Theory 21, 2005)."""
-    most = max(2, min(MOST, round(PART * y.size)))
+    most = max(2, min(LAGS_MOST, round(LAGS_SHARE * y.size)))
     partial = levinson_durbin(y, most)[2][1:]
     criterion = y.size * np.cumsum(np.log1p(-(partial**2))) + 2.0 * np.arange(1, most + 1)
     return min(2 * (int(np.argmin(criterion)) + 1), most)
