@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array
 from selfcal.logs.recording import save
 from selfcal.readings.budget import nats_of
 from selfcal.readings.codes import UNEVEN, codes_of

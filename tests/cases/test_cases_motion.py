@@ -17,13 +17,12 @@ from scipy.stats import binom
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means
+from selfcal.base.grid import Array, block_means
 from selfcal.diagnosis import words
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import record_from
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Column, Recording, save
 from selfcal.model.file import Model
 from selfcal.readings.changed_words import spans_of

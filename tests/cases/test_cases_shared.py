@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from scipy.stats import binom, poisson
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis import score
 from selfcal.diagnosis.causes import shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record, record_from
 from selfcal.likelihood.state import NET_LEAST, P_LOOK, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import Model
 from selfcal.verbs.diagnose import diagnose
 

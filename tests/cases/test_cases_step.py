@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.causes import periodic, step, variance_change
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import edges
 from selfcal.likelihood.fit import Series, fit_at, run
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array, Terms
+from selfcal.likelihood.statemodel import Terms
 from selfcal.verbs.diagnose import diagnose
 
 from conftest import case_records, shared_case

@@ -15,13 +15,13 @@ from scipy.stats import binom, kurtosistest, norm
 
 from selfcal.adequacy.checks import against, kurtosis_at
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.axis_verdict import coherence, joined_looks, look_of
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import FEWEST, Record
 from selfcal.diagnosis.statistics import Statistic, judged
 from selfcal.likelihood.state import NET_LEAST, Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import LARGEST, SMALLEST, Model
 from selfcal.readings.budget import CHECK_LIMIT, OF_MODULES, SHARES
 from selfcal.show import pictures

@@ -10,10 +10,10 @@ import numpy as np
 from drifts import LAWS, noise, recorded
 from scipy.signal import lfilter
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import fit_at
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 
 #: Steps of the difference equation: in a period, and between two readings.
 IN_PERIOD, IN_READING = 400, 4

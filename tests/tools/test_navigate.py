@@ -15,9 +15,10 @@ import pytest
 from scipy import stats
 
 from selfcal.bank.library import Bank
+from selfcal.base.grid import Array
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.model.file import Model
-from selfcal.model.simulated_parts import AXES, LAWS, Floats
+from selfcal.model.simulated_parts import AXES, LAWS
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigate import FIGURES, HORIZONS_S, TIMES, TITLES, identified_noise, matched, sheet_noise, show
 from selfcal.studies.navigation import (
@@ -38,7 +39,7 @@ from selfcal.verbs.navigate import navigate
 
 from conftest import run
 
-Judged = list[tuple[Floats, Floats]]
+Judged = list[tuple[Array, Array]]
 
 
 def flown(part: Part, noise: FilterNoise) -> Judged:
@@ -87,7 +88,7 @@ def test_consistent_with_the_true_noise_alone() -> None:
     chi-squared. The parts' drifts are larger than the data sheet's, ten times its noise is larger than theirs."""
     seeds, mean = range(1, 51), {}
     for name in ("true", "sheet", "inflated"):
-        found: list[list[Floats]] = []
+        found: list[list[Array]] = []
         for law in LAWS if name == "true" else ("random_walk",):
             noise = {"true": true_noise(law), "sheet": sheet_noise(), "inflated": sheet_noise(10.0)}[name]
             judged = flown(Part.of(law, seeds), FilterNoise.of([noise] * len(seeds)))

@@ -19,6 +19,7 @@ from outage_truth import COEFFICIENT, N, part, stated
 
 from selfcal.bank.library import Bank
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.units import STANDARD_GRAVITY
 from selfcal.diagnosis import words
 from selfcal.diagnosis.carried import BankTerm, with_terms
@@ -26,7 +27,7 @@ from selfcal.diagnosis.finding import Finding
 from selfcal.likelihood.state import Look
 from selfcal.model.file import DEFAULT, Model
 from selfcal.model.regressors import offered
-from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import (
     GPS_S,
@@ -45,7 +46,7 @@ STEPS = (GPS_S + LONGEST_OUTAGE_S) * RATE_HZ
 SHEET = [{"N": SHEET_N[unit]} for unit in AXES.values()]
 
 
-def off(rest: Floats, errors: Floats, tilt: float = 0.0) -> list[Floats]:
+def off(rest: Array, errors: Array, tilt: float = 0.0) -> list[Array]:
     """Errors of the position [3] after each outage, of a flight with these errors of the readings and another tilt."""
     own = Part.of_errors(rest[None], errors[None])
     own = replace(own, start_attitude=own.start_attitude + np.array([tilt, 0.0, 0.0]))

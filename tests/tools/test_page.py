@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.output import write_text
 from selfcal.diagnosis import integrity
 from selfcal.diagnosis.causes import colored_noise, periodic, ramp, step, variance_change
@@ -34,7 +35,6 @@ from selfcal.diagnosis.loop import diagnose_record
 from selfcal.diagnosis.record import Missing, Record, record_from
 from selfcal.diagnosis.words import named
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import load
 from selfcal.model.file import Model
 from selfcal.show import chart, pictures

@@ -17,18 +17,15 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import fft
 from scipy.special import gammaincinv, ndtri
 
 from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.blocks import Blocks
-from selfcal.base.grid import SLOPE_STEP, bisected
+from selfcal.base.grid import SLOPE_STEP, Array, Mask, Rows, bisected
 from selfcal.model.file import Group
 from selfcal.model.laws import FORGOTTEN, KINDS, Law, named_law
 from selfcal.model.tables import Tables
-
-_Floats = NDArray[np.float64]
 
 #: Least length of a record over its longest averaging time: fewer windows say little.
 AVERAGES_LEAST = 5
@@ -53,7 +50,7 @@ class AllanTerms:
     markov: tuple[tuple[complex, complex], ...] = ()
     lacking: float = 0.0
 
-    def sums(self, j: _Floats) -> _Floats:
+    def sums(self, j: Array) -> Array:
         """G at the distances `j`, whole or not."""
         j = np.abs(j)
         total = -0.5 * (self.variance - self.lacking) * j + self.step / 12.0 * (j**3 - j)
@@ -64,11 +61,11 @@ class AllanTerms:
             total = total - (variance / left * (phi / left * np.expm1(-alpha * j) + 0.5 * (1.0 + phi) * j)).real
         return np.asarray(total)
 
-    def allan_variance(self, m: _Floats) -> _Floats:
+    def allan_variance(self, m: Array) -> Array:
         """Allan variance at `m` readings."""
         return np.asarray((3.0 * self.sums(0.0 * m) - 4.0 * self.sums(m) + self.sums(2.0 * m)) / m**2)
 
-    def covariance(self, m: int, lags: int) -> _Floats:
+    def covariance(self, m: int, lags: int) -> Array:
         """Cov(u_k, u_(k+j)) for j = 0 to `lags` - 1."""
         near = np.arange(min(lags, 2 * m + 2), dtype=float)
         weights = {0: 6.0, m: -4.0, -m: -4.0, 2 * m: 1.0, -2 * m: 1.0}
@@ -80,7 +77,7 @@ class AllanTerms:
             far -= (scale * np.exp(-alpha * (j - 2 * m))).real
         return np.concatenate([nearby, far])
 
-    def spectrum(self, omega: _Floats) -> _Floats:
+    def spectrum(self, omega: Array) -> Array:
         """Power of the readings at `omega` rad a reading; white noise of variance 1 has 1."""
         step = 4.0 * np.sin(0.5 * omega) ** 2  # |1 - e^(i omega)|^2
         power = self.variance * (1.0 + self.lag1 * (2.0 - step)) - self.lacking + self.step / step
@@ -103,7 +100,7 @@ def allan_terms(law: Law, parameters: Mapping[str, float], dt_s: float, block: i
     )
 
 
-def overlapping_variance(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
+def overlapping_variance(y: Array, m: int) -> tuple[float, Mask]:
     """Allan variance of readings `y` at `m` of them, over all windows without a missing (NaN) reading; and which
     windows these are [n - 2 m + 1]. NaN without a window."""
     missing = np.isnan(y)
@@ -114,7 +111,7 @@ def overlapping_variance(y: _Floats, m: int) -> tuple[float, NDArray[np.bool_]]:
     return (0.5 * float((u**2).mean()) if u.size else math.nan), whole
 
 
-def relative_variance(terms: AllanTerms, m: int, whole: NDArray[np.bool_]) -> float:
+def relative_variance(terms: AllanTerms, m: int, whole: Mask) -> float:
     """Variance of the overlapping Allan variance over windows `whole`, over its mean squared, under `terms`: normal
     readings have Var = 2 / M^2 sum of Cov(u_k, u_l)^2 / 4."""
     count = int(whole.sum())
@@ -136,21 +133,21 @@ class AllanFit:
     the estimate, the `variance` [t] of its logarithm, and the `covariance` [d, d] of the logarithms of the parameters.
     `terms_at`: the terms at other logarithms of the parameters."""
 
-    terms_at: Callable[[_Floats], AllanTerms]
+    terms_at: Callable[[Array], AllanTerms]
     terms: AllanTerms
-    allan_variance: _Floats
-    variance: _Floats
-    covariance: _Floats
+    allan_variance: Array
+    variance: Array
+    covariance: Array
 
-    def drawn(self, draws: Mapping[str, _Floats]) -> Iterable[AllanTerms]:
+    def drawn(self, draws: Mapping[str, Array]) -> Iterable[AllanTerms]:
         """The terms at each draw [k] of the parameters."""
         return map(self.terms_at, np.log(np.column_stack([*draws.values()])))
 
 
-def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floats], AllanTerms]:
+def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[Array], AllanTerms]:
     """The terms of a law at given ln parameters. `white` multiplies the white noise's variance."""
 
-    def terms_at(ln_theta: _Floats) -> AllanTerms:
+    def terms_at(ln_theta: Array) -> AllanTerms:
         theta = dict(zip(of.parameters, np.exp(ln_theta).tolist(), strict=True))
         terms = allan_terms(of, theta, dt_s, block)
         return replace(terms, variance=terms.variance * white)
@@ -158,9 +155,7 @@ def _terms_at(of: Law, dt_s: float, white: float, block: int) -> Callable[[_Floa
     return terms_at
 
 
-def _slopes(
-    terms_at: Callable[[_Floats], AllanTerms], ln_theta: _Floats, of: Callable[[AllanTerms], _Floats]
-) -> _Floats:
+def _slopes(terms_at: Callable[[Array], AllanTerms], ln_theta: Array, of: Callable[[AllanTerms], Array]) -> Array:
     """Derivatives [d, t] of the logarithm of a curve `of` terms [t] in each ln parameter."""
     steps = np.eye(ln_theta.size) * SLOPE_STEP
     sides = [(of(terms_at(ln_theta + step)), of(terms_at(ln_theta - step))) for step in steps]
@@ -169,7 +164,7 @@ def _slopes(
 
 def information_of(
     of: Law, parameters: Mapping[str, float], dt_s: float, n: float, white: float = 1.0, block: int = 1
-) -> _Floats:
+) -> Array:
     """Information [d, d] of `n` readings every `dt_s` on ln of each parameter.
 
     Whittle's: half of a sum over all frequencies of the squared derivatives of the log spectrum."""
@@ -186,7 +181,7 @@ def fit_of(
     group: Group,
     dt_s: float,
     n: float,
-    m: _Floats,
+    m: Array,
     white: float = 1.0,
     *,
     block: int,
@@ -204,7 +199,7 @@ def fit_of(
     return AllanFit(terms_at, terms, terms.allan_variance(m), variance, np.asarray(covariance, np.float64))
 
 
-def lengths(n: int, per_octave: int = 1) -> NDArray[np.int64]:
+def lengths(n: int, per_octave: int = 1) -> Rows:
     """2 readings, twice as many and so on to a fifth of `n`, and with `per_octave` some between."""
     octaves = math.log2(n / (2 * AVERAGES_LEAST)) if n > 2 * AVERAGES_LEAST else -1.0
     return np.unique(
@@ -236,17 +231,17 @@ class AllanCurve:
     being the variance of the logarithm of their ratio.
     """
 
-    tau_s: _Floats
-    recording: _Floats
-    freedom: _Floats
-    model: _Floats
-    model_q05: _Floats
-    model_q95: _Floats
-    octave: NDArray[np.bool_]
-    deviations: _Floats
-    left: _Floats
+    tau_s: Array
+    recording: Array
+    freedom: Array
+    model: Array
+    model_q05: Array
+    model_q95: Array
+    octave: Mask
+    deviations: Array
+    left: Array
 
-    def within(self, deviations: float) -> _Floats:
+    def within(self, deviations: float) -> Array:
         """The record's Allan deviation [t] if it were so many standard deviations above the model's."""
         return self.model * np.sqrt([ratio_at(deviations, variance) for variance in self.left.tolist()])
 
@@ -297,7 +292,7 @@ def curve_of(blocks: Blocks, tables: Tables, group: Group, result: AxisResult) -
     )
 
 
-def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats) -> dict[str, _Floats]:
+def posterior_draws(estimates: Mapping[str, Estimate], covariance: Array) -> dict[str, Array]:
     """Values [CURVE_DRAWS] of each parameter of a law: its own median and quantiles, and between parameters the
     correlation of `covariance` [d, d], of their logarithms. The draws are evenly spread, not random (an additive
     recurrence: Roberts 2018), so that quantiles of functions of them are smooth."""
@@ -318,19 +313,19 @@ def posterior_draws(estimates: Mapping[str, Estimate], covariance: _Floats) -> d
 class Sampled:
     """Overlapping Allan deviation of a recording's own samples at `tau_s` [t], s, with its 90 % interval."""
 
-    tau_s: _Floats
-    deviation: _Floats
-    q05: _Floats
-    q95: _Floats
+    tau_s: Array
+    deviation: Array
+    q05: Array
+    q95: Array
 
 
-def sample_lengths(n: int, block: int) -> NDArray[np.int64]:
+def sample_lengths(n: int, block: int) -> Rows:
     """1 of `n` samples, 2, 4 ... to two bank intervals of `block` samples, and from there in octaves of these."""
     short = 2 ** np.arange(math.ceil(math.log2(2 * block)), dtype=np.int64)
     return np.concatenate([short, block * lengths(n // block)])
 
 
-def sampled(values: _Floats, missing_before: NDArray[np.int64], rate_hz: float, m: NDArray[np.int64]) -> Sampled:
+def sampled(values: Array, missing_before: Rows, rate_hz: float, m: Rows) -> Sampled:
     """At `m` samples. `values` [n], NaN where a sample is not used, after `missing_before` [n] missing
     ones each.
 

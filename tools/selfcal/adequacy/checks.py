@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtr, ndtri
 
 from selfcal.adequacy.allan import LEFT_LEAST, AllanCurve, allan_terms, curve_of, ratio_at
@@ -17,6 +16,7 @@ from selfcal.bank.blocks import BLOCKS_LEAST, MOST_DENSE, Blocks
 from selfcal.bank.priors import rounded
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
+from selfcal.base.grid import Array, Rows
 from selfcal.logs.recording import Recording
 from selfcal.logs.sampling import RATE_CHANGE_LEAST
 from selfcal.model.file import Group, Prior
@@ -89,8 +89,8 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
 
 def with_rate(
     judged: Judged,
-    values: NDArray[np.float64],
-    missing_before: NDArray[np.int64],
+    values: Array,
+    missing_before: Rows,
     step: float,
     tables: Tables,
     result: AxisResult,
@@ -105,7 +105,7 @@ def with_rate(
     """  # fmt: skip
     near = missing_before[1:] == 0
 
-    def square(differences: NDArray[np.float64]) -> float:
+    def square(differences: Array) -> float:
         pairs = int(np.isfinite(differences).sum())
         return float(np.nansum(differences**2)) / max(1, pairs) - step**2 / 6.0
 
@@ -207,7 +207,7 @@ def against(checks: Mapping[str, Mapping[str, Any]]) -> dict[str, float]:
     return dict(sorted(sure.items(), key=lambda item: -item[1]))
 
 
-def coefficients_of(result: AxisResult) -> NDArray[np.float64]:
+def coefficients_of(result: AxisResult) -> Array:
     """Posterior means [p] of the coefficients of the columns in use, under the most probable law."""
     return np.array([mean for mean, _ in result.coefficients[result.best]])
 

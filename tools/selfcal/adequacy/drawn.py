@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import allan_terms
+from selfcal.base.grid import Array
 from selfcal.model.file import Group
 from selfcal.model.laws import Law, named_law
 from selfcal.model.tables import Tables
@@ -28,7 +28,7 @@ def has_nodes(law: Law, truth: Mapping[str, float], tables: Tables) -> bool:
 
 def simulate_bank_samples(
     law: str | Law, truth: Mapping[str, float], rate_hz: float, samples: int, seed: int, bank_block: int = 1
-) -> tuple[NDArray[np.float64], float]:
+) -> tuple[Array, float]:
     """One simulated axis y [samples] at `rate_hz`, without lattice or range; and x0 + drift at the last sample.
 
     Of `bank_block` samples a bank interval coloured noise is a moving average.

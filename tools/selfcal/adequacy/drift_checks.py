@@ -17,12 +17,11 @@ from scipy.ndimage import uniform_filter1d
 from selfcal.bank.axis_result import AxisResult
 from selfcal.bank.blocks import Blocks
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means, half_means
+from selfcal.base.grid import Array, block_means, half_means
 from selfcal.likelihood import columns, edges
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, Shape
 from selfcal.likelihood.fit import ROUGH_FTOL, fit_at
 from selfcal.likelihood.state import MEANS_MOST, NET_LEAST, SCREEN, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import formed, slope, variance_of
 from selfcal.model.tables import Tables

@@ -20,6 +20,7 @@ from selfcal.bank.axis_result import AxisResult, in_unit
 from selfcal.bank.blocks import MOST_DENSE, Blocks, kept_out, usable_blocks
 from selfcal.bank.subsets import ScoredSubsets, combine
 from selfcal.base.errors import OutsidePriors, UserError
+from selfcal.base.grid import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, as_float, check_column
 from selfcal.model.file import Group, Model, Regressor
 from selfcal.model.regressors import choices_of, columns_of, mask_of, offered
@@ -151,11 +152,11 @@ class Fed:
         return choices_of(self.regressors)
 
     @property
-    def used(self) -> NDArray[np.float64]:
+    def used(self) -> Array:
         """The samples [n], NaN where the engine takes none."""
         return np.where(np.logical_or.reduce(list(kept_out(self.samples, self.group).values())), np.nan, self.samples)
 
-    def curve(self, explained: NDArray[np.float64] | float) -> Sampled:
+    def curve(self, explained: Array | float) -> Sampled:
         """The Allan deviation of the samples less what is `explained` [n] of them."""
         values = self.used
         lengths = sample_lengths(int(np.isfinite(values).sum()), self.tables.block)

@@ -22,11 +22,10 @@ from selfcal.adequacy.allan import AVERAGES_LEAST, allan_terms, fit_of, posterio
 from selfcal.bank.axis_result import AxisResult, Estimate
 from selfcal.bank.priors import MOST_INTERVALS, NARROW
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.model.file import ABOUT_N, MOST_HYPOTHESES, Group, Prior
 from selfcal.model.laws import NAMED
 from selfcal.model.tables import HypothesisTable, Tables, make_grid, priors_of
-
-_Floats = NDArray[np.float64]
 
 FLICKER = "flicker"
 #: Least probability of 1/f noise that is called sure. Of 40 records of an hour of a Gauss-Markov drift of 60 s, 0.3 N a
@@ -40,7 +39,7 @@ _WHITE_LEAST = 1e-3
 _NODES = (24, 20)
 
 
-def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
+def density_above(alpha: Array, dt_s: float, block: int) -> Array:
     """[k], s: what 1/f noise of B = 1 has more than the law `flicker` of B = 1 and `alpha` [k] at a third of the bank's
     rate, in means of `block` readings every `dt_s`. The readings have nothing above half their own rate."""
     image = np.abs(_OMEGA + 2.0 * math.pi * np.arange(-block, block + 1))
@@ -55,7 +54,7 @@ def density_above(alpha: _Floats, dt_s: float, block: int) -> _Floats:
     return np.asarray(dt_s * (whole - np.array(own)))
 
 
-def white_beside(draws: Mapping[str, _Floats], dt_s: float, block: int) -> _Floats:
+def white_beside(draws: Mapping[str, Array], dt_s: float, block: int) -> Array:
     """N [k] next to 1/f noise, of draws [k] of the parameters of the law `flicker`."""
     square = draws["N"] ** 2
     left = square - density_above(draws["alpha"], dt_s, block) * draws["B"] ** 2

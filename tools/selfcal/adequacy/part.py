@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from selfcal.adequacy.identify import identify_axis
 from selfcal.adequacy.summary import NOISIER
@@ -23,6 +22,7 @@ from selfcal.bank.axis_result import in_unit
 from selfcal.bank.priors import DECADES, GATE_NOISE, LEVEL_SD, NARROW, Seen, about, laid, prior_tree, rounded, seen_of
 from selfcal.base import units as unit_module
 from selfcal.base.errors import UserError, note, remark, short
+from selfcal.base.grid import Array
 from selfcal.base.units import SENSORS, factor, parameter_unit
 from selfcal.logs.recording import Recording, check_column
 from selfcal.model.file import DEFAULT, LONGEST_TEXT, Model, Prior
@@ -194,7 +194,7 @@ def _inside(readings: Readings, limit: float) -> bool:
     return bool(largest <= limit * (1.0 + RANGE_ROUNDED))
 
 
-def _known(readings: Readings) -> NDArray[np.float64]:
+def _known(readings: Readings) -> Array:
     return readings.values[np.isfinite(readings.values)]
 
 

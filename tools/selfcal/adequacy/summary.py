@@ -18,17 +18,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.allan import AVERAGES_LEAST, CURVE_DRAWS, PER_OCTAVE, AllanTerms, fit_of, posterior_draws
 from selfcal.adequacy.one_over_f import FLICKER, SURE_PROBABILITY, AddedLaw, white_beside
 from selfcal.bank.axis_result import HALF_90, AxisResult, Estimate
 from selfcal.bank.subsets import LIKELY
 from selfcal.base import units
-from selfcal.base.grid import bisected, weighted_quantiles
+from selfcal.base.grid import Array, bisected, weighted_quantiles
 from selfcal.model.file import Group
-
-_Floats = NDArray[np.float64]
 
 #: The parameter of coloured noise.
 COLOURED = "spectral_ratio"
@@ -143,7 +140,7 @@ def _identified(law: AddedLaw) -> list[str]:
     return [name for name, estimate in law.estimates.items() if estimate.identified]
 
 
-def _draws(beside: AddedLaw) -> tuple[_Floats, _Floats, _Floats, _Floats, _Floats]:
+def _draws(beside: AddedLaw) -> tuple[Array, Array, Array, Array, Array]:
     """Draws of a law's posterior [k] each: white noise, walk (0: none), Q, the first minimum of the Allan deviation,
     and where it is."""
     law, group, dt_s, n, block = beside.law, beside.group, beside.dt_s, beside.n, beside.block
@@ -211,7 +208,7 @@ def halved_after(result: AxisResult, group: Group, dt_s: float, n: int, block: i
     return {name: rest_s(name) for name in open_}
 
 
-def _minimum(terms: AllanTerms, m: _Floats) -> tuple[float, int]:
+def _minimum(terms: AllanTerms, m: Array) -> tuple[float, int]:
     """The first minimum of the Allan deviation at `m` readings, and 0; where none lies inside, the lowest value
     with -1 (it rises from the first on) or 1 (it falls to the last)."""
     variance = terms.allan_variance(m)
@@ -220,7 +217,7 @@ def _minimum(terms: AllanTerms, m: _Floats) -> tuple[float, int]:
     return math.sqrt(max(0.0, float(variance[lowest]))), 0 if inside.size else (-1 if lowest == 0 else 1)
 
 
-def _number(values: _Floats, weight: _Floats) -> SheetNumber:
+def _number(values: Array, weight: Array) -> SheetNumber:
     """Mean, sd and quantiles of weighted draws."""
     order = np.argsort(values, kind="stable")
     values, weight = values[order], weight[order]

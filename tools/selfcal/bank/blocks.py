@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
-from selfcal.base.grid import Array, equal_runs
+from selfcal.base.grid import Array, Mask, Rows, equal_runs
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import Group, Model
 from selfcal.model.tables import Tables, make_tables
@@ -34,17 +34,17 @@ class Blocks:
     worked out.
     """
 
-    mean: NDArray[np.float64]
-    r: NDArray[np.float64]
+    mean: Array
+    r: Array
     kept_out: Mapping[str, int]
-    z: NDArray[np.float64]
+    z: Array
     after: int = 0
     begin: int = 0
 
 
 def usable_blocks(
     samples: NDArray[np.float32],
-    missing_before: NDArray[np.int64],
+    missing_before: Rows,
     tables: Tables,
     group: Group,
     columns: NDArray[np.float32] | None = None,
@@ -84,7 +84,7 @@ def bank_means(recording: Recording, model: Model, name: str, rate_hz: float | N
     return usable_blocks(samples, recording.missing_before, tables, group).mean, tables.dt_s
 
 
-def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDArray[np.bool_]]:
+def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, Mask]:
     """Which of `samples` [n] are not used, by reason."""
     finite = np.isfinite(samples)
     limit = np.float32(group.range) if group.range > 0.0 else np.inf
@@ -100,10 +100,10 @@ def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, NDAr
 
 def blocks_of(
     samples: NDArray[np.floating[Any]],
-    missing_before: NDArray[np.int64],
+    missing_before: Rows,
     block: int,
     group: Group,
-    columns: NDArray[np.float64] | None = None,
+    columns: Array | None = None,
 ) -> Blocks:
     """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out.
     `columns` [n, p] of the regressors are averaged over the same samples."""

@@ -16,11 +16,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.bank.axis_result import LAW_LEAST, AxisResult
 from selfcal.base.errors import UserError
-from selfcal.base.grid import MEDIAN_SD
+from selfcal.base.grid import MEDIAN_SD, Array, Rows
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import LN_LIMIT, WIDEST_BIAS, Group, Model, Prior
 from selfcal.model.laws import RATIOS
@@ -52,9 +51,9 @@ class Seen:
     interval, each from the median of `differences` [k] (all of them, where the median is of no noise)."""
 
     level: float
-    tau_s: NDArray[np.float64]
-    deviation: NDArray[np.float64]
-    differences: NDArray[np.int64]
+    tau_s: Array
+    deviation: Array
+    differences: Rows
 
     @property
     def N(self) -> float:

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.bank.axis_result import HALF_90, AxisResult, of_mixture
+from selfcal.base.grid import Array
 from selfcal.model.regressors import Choice, coefficient_unit, ln_prior
 
 #: Least probability of a law that may be true. The widest of these laws of a subset states the coefficient. If a record
@@ -103,7 +103,7 @@ def normal_coefficient(column: str, unit: str, mean: float, sd: float) -> Coeffi
     return Coefficient(column, unit, mean, sd, mean - HALF_90 * sd, mean, mean + HALF_90 * sd)
 
 
-def _coefficient(column: str, unit: str, parts: NDArray[np.float64]) -> Coefficient:
+def _coefficient(column: str, unit: str, parts: Array) -> Coefficient:
     """A mixture of normals, `parts` [m, 3]: weight, mean, sd of each. Not a number without any weight."""
     mixture = of_mixture(*parts.T) if parts.size else (math.nan,) * 5
     return Coefficient(column, unit, *mixture)

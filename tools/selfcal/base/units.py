@@ -15,10 +15,8 @@ from fractions import Fraction
 from functools import cache, partial
 from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
 from selfcal.base.errors import UserError, short
+from selfcal.base.grid import Array
 
 #: m/s^2 per g (3rd CGPM, 1901: exact by definition).
 STANDARD_GRAVITY = 9.80665
@@ -29,7 +27,7 @@ FLICKER_FLOOR = math.sqrt(2.0 * math.log(2.0) / math.pi)
 #: Counts of the sensor's least significant bit; a scale turns them into a unit.
 LSB = "LSB"
 
-_Value = TypeVar("_Value", float, NDArray[np.float64])
+_Value = TypeVar("_Value", float, Array)
 # Dimensions: exponents of (angle, length, time, temperature, voltage, current, magnetic flux density, pressure).
 _Dimension = tuple[Fraction, ...]
 

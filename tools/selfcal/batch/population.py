@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtri, log_ndtr, logsumexp, ndtri
 
 from selfcal.bank.axis_result import HALF_90, of_mixture
-from selfcal.base.grid import Array, weighted_quantiles
+from selfcal.base.grid import Array, Mask, weighted_quantiles
 from selfcal.readings.budget import FALSE_ALARM
 
 #: Fewest units of a population and of a group.
@@ -109,7 +109,7 @@ def fit_population(y: Array, s: Array) -> PopulationFit:
     return PopulationFit(t, weight, mean[0], variance[0])
 
 
-def _on_grid(y: Array, s: Array, sides: NDArray[np.bool_]) -> tuple[Array, Array, Array, Array]:
+def _on_grid(y: Array, s: Array, sides: Mask) -> tuple[Array, Array, Array, Array]:
     """Spreads [p] and their weights [p], with the mean of each side and its variance [sides, p]. Each unit is on one of
     the `sides` [sides, n], which have one spread."""
     errors = s**2
@@ -172,7 +172,7 @@ class Population:
     measured: Measured
     fit: PopulationFit
     offset: Array
-    kept: NDArray[np.bool_]
+    kept: Mask
     seen_from: float
     apart: tuple[Apart, ...] = ()
     unlike: tuple[Unlike, ...] = field(default=())
@@ -298,7 +298,7 @@ def _seen_from(y: Array, s: Array, limit: float) -> float:
     return float(np.exp(np.interp(-limit, -log_p, np.log(off))))
 
 
-def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
+def _kept(y: Array, s: Array, limit: float) -> Mask:
     """The units [n] that are not odd: `limit` is the ln probability of an odd unit."""
     middle, spread = robust(y, s)
     order = np.argsort(-np.abs(y - middle) / np.hypot(spread, s))
@@ -307,13 +307,13 @@ def _kept(y: Array, s: Array, limit: float) -> NDArray[np.bool_]:
         rest = order[k:]
         others = fit_population(y[rest], s[rest])
         if others.log_p(y[order[k - 1 : k]], s[order[k - 1 : k]])[0] <= limit:
-            kept: NDArray[np.bool_] = others.log_p(y, s) > limit
+            kept: Mask = others.log_p(y, s) > limit
             kept[rest] = True
             return kept
     return np.ones(y.size, np.bool_)
 
 
-def _split(measured: Measured, y: Array, kept: NDArray[np.bool_]) -> Apart | None:
+def _split(measured: Measured, y: Array, kept: Mask) -> Apart | None:
     """The smaller of two groups in which the units lie, if two are better than a single group by _SPLIT.
 
     Each cut of the sorted units gives two normals of one spread. Their likelihood counts each unit's group as drawn."""
@@ -366,7 +366,7 @@ def _most_apart(measured: Measured, y: Array, groups: Groups, limit: float, grou
     return None
 
 
-def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
+def _by_medians(y: Array, s: Array, inside: Mask) -> float:
     """ln of the probability that the medians of two sides differ as they do, by robust spreads of many units."""
     spread = max(robust(y[side], s[side])[1] for side in (inside, ~inside))
     difference = float(np.median(y[inside]) - np.median(y[~inside]))
@@ -375,7 +375,7 @@ def _by_medians(y: Array, s: Array, inside: NDArray[np.bool_]) -> float:
     return math.log(2.0) + float(log_ndtr(-abs(difference) / math.sqrt(sum(variance))))
 
 
-def _difference(y: Array, s: Array, inside: NDArray[np.bool_], limit: float) -> tuple[float, float]:
+def _difference(y: Array, s: Array, inside: Mask, limit: float) -> tuple[float, float]:
     """By how much the units `inside` [n] differ from the others, and ln of the probability that chance does it.
 
     Units that are odd on their own side count on neither."""

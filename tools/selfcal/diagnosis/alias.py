@@ -8,7 +8,7 @@ import numpy as np
 from scipy.fft import rfft
 
 from selfcal.bank.blocks import MOST_DENSE
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array
 from selfcal.logs.recording import Recording, bridged
 
 #: Bins of the spectrum on each side that hold a line, at least; and those beside them that give the noise below it.

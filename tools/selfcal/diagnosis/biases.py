@@ -9,9 +9,9 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.suspicion import rough
 from selfcal.likelihood.joint import Joint, bins_of, fit_joint, last
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.model.file import HiddenInput, Model
 

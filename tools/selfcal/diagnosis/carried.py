@@ -19,13 +19,13 @@ from scipy.special import logsumexp
 from selfcal.bank.library import Bank
 from selfcal.bank.priors import state_own
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Extension
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import regressor_key
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.heldout import HeldOut, score_entry, sd_of_mean
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording, as_float
 from selfcal.model.file import Model, Regressor
 from selfcal.model.regressors import columns_of, mask_of, offered

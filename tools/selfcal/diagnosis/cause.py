@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.model_tree import digits
-from selfcal.likelihood.statemodel import Array
 
 if TYPE_CHECKING:
     from selfcal._reference import Random

@@ -17,6 +17,7 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import chdtrc
 
+from selfcal.base.grid import Array
 from selfcal.base.units import power
 from selfcal.diagnosis import curve
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
@@ -26,7 +27,6 @@ from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, Number, Shape, Tried
 from selfcal.likelihood.fit import left
 from selfcal.likelihood.state import ALIKE, NET_LEAST, FittedColumn, Look, State, ln_looks
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, POWER, curved, formed, slope
 from selfcal.model.regressors import coefficient_unit

@@ -13,6 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood import columns
@@ -20,7 +21,6 @@ from selfcal.likelihood.columns import SMALLER, Shape, Tried
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.fit import left as left_of
 from selfcal.likelihood.state import ABREAST, NET_LEAST, FittedColumn, Look, State, net
-from selfcal.likelihood.statemodel import Array
 
 #: Knots of the splines, even over the channel's range.
 KNOTS = (6, 12, 36)

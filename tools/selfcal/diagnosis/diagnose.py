@@ -17,6 +17,7 @@ from selfcal.adequacy.identify import identify_axis
 from selfcal.adequacy.identify_document import Identified, parameters_entry, recording_entry, regressors_entry
 from selfcal.base.ending import HeldSignals, Stopped, abandon
 from selfcal.base.errors import UserError, note
+from selfcal.base.grid import Array
 from selfcal.base.progress import Doing
 from selfcal.diagnosis import hidden, module
 from selfcal.diagnosis.axis_verdict import of_checks
@@ -26,7 +27,6 @@ from selfcal.diagnosis.finding import ROUNDS, Diagnosed, Finding
 from selfcal.diagnosis.loop import INTERRUPTED, diagnose_record
 from selfcal.diagnosis.record import Record, is_counter
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.model.file import Model
 

@@ -17,10 +17,10 @@ from scipy.linalg import lstsq, qr, svd
 from scipy.optimize import least_squares
 from scipy.signal import fftconvolve, lfilter
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.channel_looks import LONGEST_LAG
 from selfcal.likelihood.fit import Fit, left
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 
 #: Orders of ARX and of a state model at most, and taps of the weighting function.
 ORDERS, TAPS = 4, (1, 2, 4, 8, 16, 32)

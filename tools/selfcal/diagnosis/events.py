@@ -20,6 +20,7 @@ from scipy.special import chdtrc, expit
 from selfcal.adequacy.identify_document import Identified
 from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
+from selfcal.base.grid import Array
 from selfcal.diagnosis import hidden, words
 from selfcal.diagnosis.alias import alias_of
 from selfcal.diagnosis.causes import CAUSES
@@ -29,7 +30,6 @@ from selfcal.diagnosis.score import bias_ahead, numbers
 from selfcal.likelihood import work
 from selfcal.likelihood.heldout import HARM_SD, MATTERS, in_sd
 from selfcal.likelihood.state import State, log_normal, mixture, normal_entry
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import Recording
 from selfcal.readings.moves import joined_intervals
 

@@ -6,12 +6,12 @@ from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 
+from selfcal.base.grid import Array, Mask
 from selfcal.diagnosis.hidden import Hidden
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.statistics import Statistic
 from selfcal.likelihood.heldout import HeldOut
 from selfcal.likelihood.state import FittedColumn, Look, State
-from selfcal.likelihood.statemodel import Array, Mask
 
 #: Rounds at most: a recording that holds more is told as it is then.
 ROUNDS = 12

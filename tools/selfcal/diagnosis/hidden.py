@@ -16,7 +16,7 @@ import numpy as np
 from scipy.special import expit
 
 from selfcal.base import units as unit_module
-from selfcal.base.grid import half_means, regridded
+from selfcal.base.grid import Array, half_means, regridded
 from selfcal.diagnosis.model_tree import digits
 from selfcal.likelihood.columns import LN_EITHER
 from selfcal.likelihood.edges import steady
@@ -38,7 +38,6 @@ from selfcal.likelihood.joint import (
     without_pairs,
 )
 from selfcal.likelihood.state import EVIDENT, NET_LEAST, FittedColumn, State, net, normal_entry
-from selfcal.likelihood.statemodel import Array
 
 #: Name of the quantity in the document.
 ID = "hidden_input"

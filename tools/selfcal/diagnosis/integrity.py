@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from scipy.special import pdtrc
 
+from selfcal.base.grid import Mask
 from selfcal.diagnosis.causes.missing_samples import MISSING_LEAST
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import Look, State, normal_entry
-from selfcal.likelihood.statemodel import Mask
 from selfcal.readings.budget import SHARES
 from selfcal.readings.held import equal_by_chance
 

@@ -19,7 +19,7 @@ from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import logsumexp, softmax
 
-from selfcal.base.grid import half_means
+from selfcal.base.grid import Array, Mask, half_means
 from selfcal.diagnosis.alias import WANDERS
 from selfcal.diagnosis.causes.periodic import SLOW_TURNS, TURNS_LEAST, ln_lines
 from selfcal.diagnosis.causes.turn_on import FASTEST, LN_LOOKS
@@ -46,7 +46,6 @@ from selfcal.likelihood.joint import (
     without_lines,
 )
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, SLOW_S, State
-from selfcal.likelihood.statemodel import Array, Mask
 
 #: False-alarm rate of the joint search at T nats, over e^-T: modules on which nothing acts (`make module-null`).
 NULL = 0.05

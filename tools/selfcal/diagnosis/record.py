@@ -12,9 +12,8 @@ from scipy.ndimage import uniform_filter1d
 from selfcal import _library32
 from selfcal.bank.blocks import MOST_DENSE
 from selfcal.base.errors import UserError
-from selfcal.base.grid import Rows
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.likelihood.state import FittedColumn, State
-from selfcal.likelihood.statemodel import Array, Mask
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.logs.sampling import RateChange
 from selfcal.logs.timebase import Clock

@@ -15,13 +15,13 @@ from scipy.stats import binom
 
 from selfcal.base import units
 from selfcal.base.errors import UserError, printable
+from selfcal.base.grid import Array
 from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import methods_beside
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.transfer import DRAWS, PROBABILITY, STRUCTURES, Draws, Drive, Empirical, Input, Trial
 from selfcal.likelihood.state import ALIKE, NET_LEAST, FittedColumn, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS, Recording, bridged
 from selfcal.model.forms import POWER
 from selfcal.model.regressors import coefficient_unit

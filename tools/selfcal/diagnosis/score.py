@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import gammaln, logsumexp, softmax
 
-from selfcal.base.grid import Rows
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.base.units import FLICKER_FLOOR
 from selfcal.diagnosis.causes import CAUSES
 from selfcal.diagnosis.extend import WIDE_PRIOR
@@ -23,7 +23,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import passed, run
 from selfcal.likelihood.heldout import HORIZONS_S, SCORE_PIECES, HeldOut, error_entry, score_entry, sd_of_mean
 from selfcal.likelihood.state import Look, Sequential, State
-from selfcal.likelihood.statemodel import Array, Mask, matrices
+from selfcal.likelihood.statemodel import matrices
 
 #: Samples to score, and between the first and the last prediction, at least.
 SCORED_LEAST = 30

@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.record import FEWEST, Record
 from selfcal.diagnosis.statistics import states_of
 from selfcal.likelihood.columns import Shape, possible
 from selfcal.likelihood.fit import Fit, Series, ln_likelihood, run
 from selfcal.likelihood.state import FittedColumn, Look, State
-from selfcal.likelihood.statemodel import Array, Terms, matrices
+from selfcal.likelihood.statemodel import Terms, matrices
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.model.forms import NUMBER, curved, formed, slope
 

@@ -11,16 +11,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.fft import irfft, next_fast_len, rfft
 from scipy.special import gammainc, gammaincc, log_ndtr, ndtr, ndtri, stdtr, stdtrit
 
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.likelihood.fit import Fit, Series, run
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array, Mask, Matrices, matrices
+from selfcal.likelihood.statemodel import Matrices, matrices
 from selfcal.readings.lattice import WHITE_REMAINDERS
-
-Indices = NDArray[np.int64]
 
 #: Simulated records a band rests on.
 BAND_RECORDS = 48
@@ -194,7 +192,7 @@ def _of_readings(y: Array, lsb: float) -> dict[str, float]:
     return found
 
 
-def allan_deviation(y: Array, sizes: Indices) -> Array:
+def allan_deviation(y: Array, sizes: Rows) -> Array:
     """Allan deviation of y [n] (NaN: missing) for means of `sizes` samples. A pair of means counts if each has half of
     its samples. Pairs begin an eighth of a mean apart, in long records further."""
     good = np.isfinite(y)

@@ -20,11 +20,12 @@ from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import detrend, lfilter, windows
 from scipy.stats import t
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.channel_looks import LONGEST_LAG, agreement
 from selfcal.likelihood.columns import LN_SLOW, number_nodes, top
 from selfcal.likelihood.fit import Fit, Sums, left, ln_det, ln_likelihood, refit, run
 from selfcal.likelihood.state import ALIKE, NET_LEAST, State, net
-from selfcal.likelihood.statemodel import DRIFT_SIZES, Array
+from selfcal.likelihood.statemodel import DRIFT_SIZES
 from selfcal.model.forms import POWER, played, slope
 
 Complex = NDArray[np.complex128]

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.base.grid import block_means
+from selfcal.base.grid import Array, block_means
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import (
     ALIKE,
@@ -30,7 +30,6 @@ from selfcal.likelihood.state import (
     net,
     normal_entry,
 )
-from selfcal.likelihood.statemodel import Array
 
 #: A drift that is known from few of its own turns leaves slow columns a longer tail. Of 2267 clean axes at 1 and 10 Hz
 #: 7 showed 7 nats of a supply or a temperature and 2 of a ramp at a price of 0.8, where 4 and 2 were due; the tail ran

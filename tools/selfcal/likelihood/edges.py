@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.base.grid import Rows
+from selfcal.base.grid import Array, Mask, Rows
 from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit, Series, ln_det, shifts
 from selfcal.likelihood.state import FittedColumn, State, ln_looks, mixture, net, normal_entry
-from selfcal.likelihood.statemodel import Array, Mask
 
 #: Least share of its information that a step keeps beside the level before it; and the least share of a mid-record
 #: step's information at the last place that is looked at.

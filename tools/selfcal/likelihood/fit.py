@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from selfcal import _likelihood
-from selfcal.base.grid import SLOPE_STEP
+from selfcal.base.grid import SLOPE_STEP, Array, Mask
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Array, Mask, Terms, matrices
+from selfcal.likelihood.statemodel import DRIFT_SIZES, SIZE_LIMITS, Terms, matrices
 
 #: Columns that the compiled filter takes in one pass beside the record.
 COLUMNS_MOST = _likelihood.COLUMNS_MAX - 1

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from selfcal.likelihood.statemodel import Array
+from selfcal.base.grid import Array
 
 #: How far ahead the bias is predicted, s.
 HORIZONS_S = (1.0, 10.0, 60.0, 300.0)

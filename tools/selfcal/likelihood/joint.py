@@ -23,8 +23,9 @@ from scipy.ndimage import median_filter
 from scipy.special import softmax
 
 from selfcal import _joint
+from selfcal.base.grid import Array, Mask
 from selfcal.likelihood import work
-from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS, Array, Mask
+from selfcal.likelihood.statemodel import ALPHA_LIMITS, SIZE_LIMITS
 from selfcal.logs.recording import bridged
 
 #: Axes that a common quantity takes at least: two that go together are noise that they share.

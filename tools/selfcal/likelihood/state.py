@@ -13,9 +13,9 @@ from scipy.special import chdtrc, logsumexp, ndtr, softmax
 
 from selfcal.bank.axis_result import HALF_90, of_mixture
 from selfcal.base.errors import UserError
-from selfcal.base.grid import block_means, half_means
+from selfcal.base.grid import Array, Mask, block_means, half_means
 from selfcal.likelihood.fit import FTOL, Fit, Series, Sums, best, fit, ln_likelihood, moved, nodes, refit, run
-from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Array, Mask, Terms
+from selfcal.likelihood.statemodel import DRIFT_SIZES, PERIOD_LIMITS, Terms
 from selfcal.readings.budget import OF_MODULES, P_LOOK
 from selfcal.readings.lattice import OFF
 

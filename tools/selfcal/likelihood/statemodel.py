@@ -12,13 +12,10 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from selfcal.base.grid import Array
 from selfcal.model.file import ABOUT_N
 from selfcal.model.laws import DAMPING_LIMITS, lost_of, swing
-
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
 #: A Gauss-Markov drift keeps within the default model's correlation rates, 1/s: faster ones are coloured noise.
 ALPHA_LIMITS = ABOUT_N["alpha"][:2]

@@ -28,11 +28,13 @@ from scipy.fft import rfft
 from scipy.ndimage import grey_closing, uniform_filter1d
 from scipy.special import betaln, rel_entr
 
+from selfcal.base.grid import Array, Mask, Rows
+
 #: Rows of the head of a record, which decide on the law.
 _HEAD_ROWS = 4000
 #: Rows that show the phase of the first one.
 _PHASE_ROWS = 512
-#: Places of a histogram in one of its cells.
+#: Rows of a histogram in one of its cells.
 _CELL_PLACES = 5
 #: Lattice from which on stamps are coarse, in mean steps.
 _COARSE_FROM = 0.25
@@ -107,9 +109,6 @@ _PATTERN_LEAST = 0.9
 #: Gaps in a period of losses, at most.
 _PATTERN_GAPS_MOST = 4
 
-Floats = NDArray[np.float64]
-Places = NDArray[np.int64]
-
 
 class Ambiguous(ValueError):
     """The stamps do not tell the rate; the text says why."""
@@ -121,7 +120,7 @@ class _Fit:
     `rival`: another interval that is as good, 0 for none."""
 
     dt: float
-    missing: Places
+    missing: Rows
     nats: float
     rival: float = 0.0
 
@@ -131,8 +130,8 @@ class _Stamps:
     """Stamps float64[n], s, and which steps [n - 1] are sleeps. `lattice`: what the stamps are rounded to, s, or 0;
     `typical`: the mean step, s; `noise`: of the lattice, s."""
 
-    time: Floats
-    asleep: NDArray[np.bool_]
+    time: Array
+    asleep: Mask
     lattice: float
     typical: float
     noise: float
@@ -148,14 +147,14 @@ class _Stamps:
         return self.lattice > _COARSE_FROM * self.typical
 
     @cached_property
-    def slept(self) -> Floats:
+    def slept(self) -> Array:
         """Beyond one usual step, so far, [n], s."""
         steps = np.diff(self.time)
         extra = np.where(self.asleep, steps - _usual(steps), 0.0)
         return np.concatenate(([0.0], np.cumsum(extra)))
 
     @cached_property
-    def awake(self) -> Floats:
+    def awake(self) -> Array:
         """The stamps without sleeps, [n], s."""
         return self.time - self.slept
 
@@ -167,7 +166,7 @@ class _Stamps:
         """Whether an interval is a multiple of the lattice, or the lattice one of it."""
         return self.multiple(dt) or _is_multiple(self.lattice, dt)
 
-    def fit(self, dt: float, missing: Places, errors: Floats, patterned: bool = True) -> _Fit:
+    def fit(self, dt: float, missing: Rows, errors: Array, patterned: bool = True) -> _Fit:
         """A law of the interval about `dt` with its errors, s, [n] or [n - 1], and the samples missing while awake."""
         n = self.time.size
         nats = _ln_losses((missing[1:] + 1)[~self.asleep], patterned) + self.ln_values(errors)
@@ -175,7 +174,7 @@ class _Stamps:
             nats += 3.0 * math.log(n) - 2.0 * math.log(math.pi)  # the lines of n pixels: about n^3 / pi^2
         return self.put_back(_Fit(dt, missing, nats))
 
-    def ln_values(self, values: Floats) -> float:
+    def ln_values(self, values: Array) -> float:
         """Nats that write values [n] to a cell by the best histogram, of cells 2^k wide at any of some places."""
         # Values of one lattice are not parted by its noise.
         part = np.floor((np.sort(values - values.min()) + 4.0 * self.noise) * (_CELL_PLACES / self.cell) + 1e-6)
@@ -204,7 +203,7 @@ class _Stamps:
         if not self.asleep.any():
             return fit
         slept = np.rint(self.slept / fit.dt).astype(np.int64)
-        missing: Places = fit.missing + np.concatenate((slept[:1], np.diff(slept)))
+        missing: Rows = fit.missing + np.concatenate((slept[:1], np.diff(slept)))
         return _Fit(_slope(np.arange(missing.size) + np.cumsum(missing), self.time), missing, fit.nats)
 
 
@@ -218,7 +217,7 @@ def _is_multiple(length: float, unit: float) -> bool:
     return round(length / unit) > 0 and _is_whole(length / unit)
 
 
-def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, Places]:
+def sampling(time: Array, noise_s: float, rate: float | None) -> tuple[float, Rows]:
     """Interval (s) and missing_before[n] of time stamps float64[n] (s, from 0, not decreasing but where
     batches of one length overlap).
 
@@ -244,7 +243,7 @@ def sampling(time: Floats, noise_s: float, rate: float | None) -> tuple[float, P
     return law.dt, law.missing
 
 
-def _stamps(time: Floats, noise_s: float) -> _Stamps:
+def _stamps(time: Array, noise_s: float) -> _Stamps:
     """Stamps with what one look shows of them. Raises Ambiguous."""
     time, steps = time - time[0], np.diff(time)
     usual = _usual(steps)
@@ -298,7 +297,7 @@ def _tried(law: _Law, stamps: _Stamps, dt: float, rate: float | None) -> list[tu
     return [(nats, fit)]
 
 
-def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
+def _asleep(time: Array, steps: Array) -> Mask:
     """bool[n - 1]: the steps between stretches of samples, whatever they last. Bursts of a bus are as short, and less
     even."""
     usual = _usual(steps)
@@ -311,7 +310,7 @@ def _asleep(time: Floats, steps: Floats) -> NDArray[np.bool_]:
     return long if even or 10 * count * _BURST_LEAST < steps.size else np.zeros_like(long)
 
 
-def _ln_losses(steps: Places, patterned: bool) -> float:
+def _ln_losses(steps: Rows, patterned: bool) -> float:
     """Nats that write steps of whole intervals [m]: samples lost one by one, in runs, in runs of any length, or in a
     pattern of a few gaps, if that can be."""
     n, lost = steps.size, int(steps.sum()) - steps.size
@@ -438,7 +437,7 @@ def _decoded(stamps: _Stamps, dt: float, share: float) -> _Fit | None:
     return best
 
 
-def _decode(time: Floats, dt: float, slack: float, first: tuple[float, float]) -> tuple[Places, int]:
+def _decode(time: Array, dt: float, slack: float, first: tuple[float, float]) -> tuple[Rows, int]:
     """missing_before[n], and the number of stamps that fit nowhere. [lo, hi]: where the sample's true time can be, of
     the `first` one given."""
     missing = np.zeros(time.size, np.int64)
@@ -499,7 +498,7 @@ def _proposed(stamps: _Stamps, rate: float | None) -> list[float]:
     return intervals
 
 
-def rhythm(gaps: Places) -> tuple[float, float]:
+def rhythm(gaps: Rows) -> tuple[float, float]:
     """Evidence, nats net, that most gaps [k] are whole multiples of one period, and the period: near the median, or a
     part of the short ones. Chance spreads the gaps evenly over it."""
     if gaps.size < 2:
@@ -524,17 +523,17 @@ def rhythm(gaps: Places) -> tuple[float, float]:
     return best
 
 
-def in_rhythm(rows: Places) -> bool:
+def in_rhythm(rows: Rows) -> bool:
     """Whether rows are whole multiples of one period apart."""
     return rhythm(np.diff(rows))[0] > _SURE_NATS
 
 
-def in_pattern(steps: NDArray[np.floating[Any]] | Places) -> bool:
+def in_pattern(steps: NDArray[np.floating[Any]] | Rows) -> bool:
     """Whether the steps of more than one interval, of those steps [n - 1], come again in periods of a few."""
     return any(np.mean(same) >= _PATTERN_LEAST for _, same in _periods(steps))
 
 
-def _periods(steps: NDArray[np.floating[Any]] | Places) -> list[tuple[int, NDArray[np.bool_]]]:
+def _periods(steps: NDArray[np.floating[Any]] | Rows) -> list[tuple[int, Mask]]:
     """By the number of gaps in a period, which of the steps of more than one interval are as a period before."""
     rows = np.flatnonzero(steps > 1.0)
     each = np.stack([np.diff(rows), steps[rows[1:]]]) if rows.size > _BURST_LEAST else np.zeros((2, 0))
@@ -542,7 +541,7 @@ def _periods(steps: NDArray[np.floating[Any]] | Places) -> list[tuple[int, NDArr
     return [(k, (each[:, k:] == each[:, :-k]).all(axis=0)) for k in periods]
 
 
-def batches_overlap(time: Floats) -> bool:
+def batches_overlap(time: Array) -> bool:
     """Whether stamps fall in a rhythm of some rows, and go on from there: batches overlap. Where rows are swapped they
     catch up."""
     steps = np.diff(time)
@@ -552,7 +551,7 @@ def batches_overlap(time: Floats) -> bool:
     return batches and float(np.median(around)) < 6.0 * float(np.median(steps))
 
 
-def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), trimmed: bool = False) -> float:
+def _slope(index: Rows, time: Array, cuts: Sequence[int] = (), trimmed: bool = False) -> float:
     """The slope of `time` against `index` by least squares, with a level of its own after each of the rows `cuts`;
     `trimmed`: without the rows that are far off, such as those of a stall."""
     parts = len(cuts) + 1
@@ -571,7 +570,7 @@ def _slope(index: Places, time: Floats, cuts: Sequence[int] = (), trimmed: bool 
         kept = near
 
 
-def _straightest(sample: Places, time: Floats, dt: float, lattice: float) -> float:
+def _straightest(sample: Rows, time: Array, dt: float, lattice: float) -> float:
     """The slope near `dt` about which the errors reach least far: of rounded stamps it is closer than least squares."""
     from scipy.optimize import minimize_scalar  # a quarter of a second to import: for coarse stamps alone
 
@@ -581,7 +580,7 @@ def _straightest(sample: Places, time: Floats, dt: float, lattice: float) -> flo
     return float(reach.x)
 
 
-def _usual(steps: Floats) -> float:
+def _usual(steps: Array) -> float:
     """The median of the steps that are no repeats."""
     return float(np.median(steps[steps > 0.0], overwrite_input=True))
 
@@ -598,7 +597,7 @@ class RateChange:
     nats: float
 
 
-def rate_changes(time: Floats) -> list[RateChange]:
+def rate_changes(time: Array) -> list[RateChange]:
     """Every change of rate in stamps float64[n], s, in order of time: where the laws of the stamps on its two sides
     have another interval.
 
@@ -606,7 +605,7 @@ def rate_changes(time: Floats) -> list[RateChange]:
     return _changes(time, 3 * _RATE_STEPS) or _changes(time, _RATE_STEPS)
 
 
-def _changes(time: Floats, least: int) -> list[RateChange]:
+def _changes(time: Array, least: int) -> list[RateChange]:
     """The changes between parts of some pieces, which have `least` rows or more."""
     size = max(least, time.size // _RATE_PIECES)
     if time.size < 6 * size:
@@ -646,14 +645,14 @@ def _changes(time: Floats, least: int) -> list[RateChange]:
     return changes
 
 
-def _interval(time: Floats, lattice: float) -> float:
+def _interval(time: Array, lattice: float) -> float:
     """Interval of the samples of a part, s. On a coarse lattice a slower rate looks like losses in a pattern."""
     law = _likeliest(_stamps(time, 0.0), None)
     patterned = lattice > _COARSE_FROM * law.dt and in_pattern(law.missing + 1)
     return float(law.dt * (1.0 + law.missing[1:].mean())) if patterned else law.dt
 
 
-def _constant(value: Floats, least: float) -> list[tuple[int, int]]:
+def _constant(value: Array, least: float) -> list[tuple[int, int]]:
     """First piece and the piece after the last of every part of one rate. `value` [pieces]: ln of the interval, whose
     changes are `least` or more. A piece with a change in it belongs to no part.
 
@@ -682,7 +681,7 @@ def _constant(value: Floats, least: float) -> list[tuple[int, int]]:
     return parts
 
 
-def _scatter(value: Floats, parts: list[tuple[int, int]]) -> float:
+def _scatter(value: Array, parts: list[tuple[int, int]]) -> float:
     """Distance from the level of its part that one piece in ten exceeds, the largest of all parts of ten pieces and of
     all together."""
     off = [np.abs(value[a:b] - np.median(value[a:b])) for a, b in parts]
@@ -692,7 +691,7 @@ def _scatter(value: Floats, parts: list[tuple[int, int]]) -> float:
 
 
 def _bend(
-    time: Floats, parts: Sequence[tuple[int, int]], level: Sequence[float], longest: Sequence[float], size: int
+    time: Array, parts: Sequence[tuple[int, int]], level: Sequence[float], longest: Sequence[float], size: int
 ) -> int:
     """First row of the second of two parts [first piece, piece after], with intervals `level`, s, of the `longest`: the
     row farthest from the line of the mean interval, gaps left out."""
@@ -704,7 +703,7 @@ def _bend(
     return first + 1 + int(np.argmax(line) if level[0] > level[1] else np.argmin(line))
 
 
-def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
+def common_step(steps: Array, tolerance: float) -> float:
     """Step, s, of the lattice that all time stamps lie on: the steps are multiples of it. 0 where there is none."""
     ordered = steps[steps > tolerance]
     ordered.sort()
@@ -725,7 +724,7 @@ def common_step(steps: NDArray[np.float64], tolerance: float) -> float:
     return float(distinct @ times / (times @ times))
 
 
-def followed_phase(x: Floats, time: Floats, frequency: float, block: int) -> tuple[Floats, float]:
+def followed_phase(x: Array, time: Array, frequency: float, block: int) -> tuple[Array, float]:
     """Phase [n], turns, of the line near a frequency in x [n] at these times, followed over blocks of so many rows; and
     the size of the line. It is whole where x is largest."""
     edges = np.arange(0, max(1, x.size // block)) * block

@@ -154,10 +154,10 @@ def clocks_of(
 
 def save(
     path: Path | str,
-    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    columns: Mapping[str, tuple[str, Array]],
     rate_hz: float,
     meta: Mapping[str, Any] | None = None,
-    t: NDArray[np.float64] | None = None,
+    t: Array | None = None,
     lsb: Mapping[str, float] | None = None,
     *,
     exact: bool = False,
@@ -191,7 +191,7 @@ def save(
             beside.write_text(json.dumps({**described, "rows": len(values)}, indent=1) + "\n", encoding="utf-8")
 
 
-def _save_exact(path: Path, header: str, values: NDArray[np.float64]) -> None:
+def _save_exact(path: Path, header: str, values: Array) -> None:
     """Write values [rows, columns] as CSV by their shortest texts that are read back to the bit."""
     opened = gzip.open if path.suffix == ".gz" else open
     with opened(path, "wt", encoding="utf-8") as file:
@@ -206,9 +206,9 @@ def _save_exact(path: Path, header: str, values: NDArray[np.float64]) -> None:
 
 def _save_npz(
     path: Path,
-    columns: Mapping[str, tuple[str, NDArray[np.float64]]],
+    columns: Mapping[str, tuple[str, Array]],
     described: dict[str, Any],
-    t: NDArray[np.float64] | None,
+    t: Array | None,
     lsb: Mapping[str, float],
 ) -> None:
     """Write the columns, whole numbers of an LSB where `lsb` has its size, and `described` as the member `meta`."""

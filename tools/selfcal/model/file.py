@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base import units
 from selfcal.base.errors import UserError, short, short_value
+from selfcal.base.grid import Array
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_MODEL_BYTES, MOST_MODEL_VALUES, MOST_RATE_HZ, read_text, reading
 from selfcal.base.units import SENSORS
 from selfcal.model.forms import FORMS, HOST_FORMS, INPUTS, NUMBER, POWER, Knots
@@ -105,7 +105,7 @@ class Prior:
         """sd of the logarithm; of a uniform prior that of a log-uniform one, as the library has it."""
         return self.sd if self.law == "log_normal" else math.log(self.max / self.min) / math.sqrt(12.0)
 
-    def ln_density(self, ln_value: NDArray[np.float64]) -> NDArray[np.float64]:
+    def ln_density(self, ln_value: Array) -> Array:
         """ln of the density in ln(parameter) [m] between the limits."""
         if self.law == "log_normal":
             within = math.log(math.erf(LOG_NORMAL_REACH / math.sqrt(2.0)) * math.sqrt(2.0 * math.pi) * self.sd)

@@ -13,11 +13,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal import _library32
-
-_Floats = NDArray[np.float64]
+from selfcal.base.grid import Array
 
 #: Most terms of one law, states of its drift and coloured noise together.
 MOST_TERMS: int = _library32.TERMS_MAX
@@ -73,7 +71,7 @@ class Sized(NamedTuple):
 #: white noise that the means lack. An oscillation is the real part of a drift of complex numbers.
 Averages = tuple[float, tuple[tuple[complex, complex], ...], float]
 #: Weight of each state now in a term some time on, and the variance that the term gains until then.
-Later = tuple[tuple[_Floats, ...], _Floats]
+Later = tuple[tuple[Array, ...], Array]
 
 
 @dataclass(frozen=True)
@@ -251,7 +249,7 @@ def averaged(x: float, block: int) -> tuple[float, float]:
     return gain, gain - (1.0 + phi + 2.0 * phi * math.expm1(-x) / rate) / rate
 
 
-def swing(period_s: float, damping: float, time_s: float) -> _Floats:
+def swing(period_s: float, damping: float, time_s: float) -> Array:
     """[2, 2]: transition over `time_s` of x'' + 2 damping w x' + w^2 x = white noise, w = 2 pi / period_s.
 
     The states are x and x' / w: both have the stationary variance of x, and do not correlate."""

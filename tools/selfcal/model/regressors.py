@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model, Regressor
 from selfcal.model.forms import KIND, Source, curved, delayed, made, played, source_of, variance_of
@@ -28,7 +28,7 @@ _SHAPES: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 Choice = tuple[Regressor, ...]
 
 
-def columns_of(regressors: Sequence[Regressor], recording: Recording) -> NDArray[np.float64]:
+def columns_of(regressors: Sequence[Regressor], recording: Recording) -> Array:
     """[n, p]: every column of `regressors`, in the unit of each, at every row of the recording, as float32 holds it.
 
     The library forms them (`selfcal_form()`), as it does on a module. A play, a delay and a curve, which it lacks, are
@@ -113,7 +113,7 @@ def column_sources(regressor: Regressor, channels: Sequence[tuple[str, str, str]
     return [source_of(regressor.form, channel, regressor.number, regressor.reference, regressor.mean_s)]
 
 
-def trailing_mean(values: NDArray[np.float64], window: int) -> NDArray[np.float64]:
+def trailing_mean(values: Array, window: int) -> Array:
     """float64[n]: mean of the last `window` values at each, of fewer at the beginning, as a module forms it."""
     if window <= 1:
         return values

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from enum import IntEnum, auto
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.base.limits import LEAST_RATE_HZ, MOST_RATE_HZ
 from selfcal.base.units import same_kind
 from selfcal.model.file import NOT_HANDLED, Group, Handling, Model, Prior
@@ -45,7 +45,7 @@ class Grid:
     """One grid dimension: `nodes` even steps; `fit` [nodes, nodes] turns node values into B-spline coefficients."""
 
     nodes: int
-    fit: NDArray[np.float64]
+    fit: Array
 
 
 @functools.cache
@@ -56,7 +56,7 @@ def make_grid(nodes: int) -> Grid:
     return Grid(nodes, np.asarray(np.linalg.inv(_basis(z, knots, 5)), np.float64))
 
 
-def _basis(z: NDArray[np.float64], knots: NDArray[np.float64], degree: int) -> NDArray[np.float64]:
+def _basis(z: Array, knots: Array, degree: int) -> Array:
     """B-splines [points, splines] at `z` by the recursion of Cox and de Boor. The same as scipy's design matrix, whose
     import takes longer than `identify` of an hour."""
     interval = np.searchsorted(knots, z, side="right") - 1

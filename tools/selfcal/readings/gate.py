@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from selfcal import _library32
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Mask, Rows
 from selfcal.base.limits import FEWEST_ROWS
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model
@@ -35,9 +36,9 @@ class Learning:
         self.gate = _library32.Gate(*astuple(table))
         self.learn_at = _library32.GATE_MEASURED_MIN
 
-    def push(self, samples: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def push(self, samples: NDArray[np.float32]) -> Mask:
         """Samples [n, axes], not beyond the end of a window; whether each is at rest."""
-        rest: NDArray[np.bool_] = np.frombuffer(self.gate.push(samples), np.uint8) == 1
+        rest: Mask = np.frombuffer(self.gate.push(samples), np.uint8) == 1
         if self.gate.last()["measured"] == 0:
             self.learn_at = _library32.GATE_MEASURED_MIN
         if self.gate.last()["measured"] >= self.learn_at:
@@ -77,9 +78,7 @@ def gated(recording: Recording, model: Model) -> Recording:
     return recording.with_rows(used, moving=True)
 
 
-def _resting(
-    samples: NDArray[np.float32], missing_before: NDArray[np.int64], table: GateTable
-) -> tuple[NDArray[np.bool_], list[int]]:
+def _resting(samples: NDArray[np.float32], missing_before: Rows, table: GateTable) -> tuple[Mask, list[int]]:
     """Whether the bank takes each of samples [n, axes]; and rows behind which a gap ended the rest: the interval in
     progress there is dropped."""
     learning = Learning(table)

@@ -12,9 +12,8 @@ from typing import Literal
 
 import numpy as np
 from markupsafe import Markup
-from numpy.typing import NDArray
 
-from selfcal.base.grid import Array, Mask, runs
+from selfcal.base.grid import Array, Mask, Rows, runs
 from selfcal.show.page_template import number, render
 
 #: Size of a panel and of its margins, in units of the picture: text of 12 units stays legible on a telephone.
@@ -142,7 +141,7 @@ class Figure:
         return looks
 
 
-def means_of(edges: NDArray[np.int64], values: Array | Mask) -> Array:
+def means_of(edges: Rows, values: Array | Mask) -> Array:
     """Mean of the finite values in each piece between `edges`; NaN without any."""
     good = np.isfinite(values)
     with np.errstate(invalid="ignore", divide="ignore"):

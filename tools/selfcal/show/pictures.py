@@ -10,15 +10,14 @@ import numpy as np
 from scipy.fft import irfft, next_fast_len, rfft, rfftfreq
 from scipy.signal import detrend
 
-from selfcal.base.grid import runs
+from selfcal.base.grid import Array, Rows, runs
 from selfcal.diagnosis.causes import CAUSES, shared
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.diagnosis.response import RECORDS
-from selfcal.diagnosis.statistics import Indices, allan_deviation, simulated, whitened_of
+from selfcal.diagnosis.statistics import allan_deviation, simulated, whitened_of
 from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.show.chart import POINTS_MOST, Band, Curve, Figure, Panel, envelope, means_of
 
@@ -249,7 +248,7 @@ def _correlation(before: State, after: State, magnitude: bool = False) -> Before
     )
 
 
-def _pieces(record: Record, count: int) -> tuple[Indices, Array]:
+def _pieces(record: Record, count: int) -> tuple[Rows, Array]:
     n = record.present.size
     edges = np.unique(np.linspace(0, n, min(count, max(1, n // 10)) + 1).astype(int))
     return edges, 0.5 * (edges[:-1] + edges[1:]) / record.rate_hz

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.bank.axis_result import LAW_LEAST
 from selfcal.base.errors import printable
+from selfcal.base.grid import Array
 from selfcal.base.output import plotter, save_picture
 from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.model.file import LARGEST
@@ -108,7 +108,7 @@ def _opacity(probability: float) -> float:
 
 def _draw(
     panel: Any,
-    time: NDArray[np.float64],
+    time: Array,
     reports: Sequence[AxisReport],
     parameter: str,
     candidates: Mapping[int, str],
@@ -152,7 +152,7 @@ def _scales(parameter: str) -> bool:
     return parameter_unit(parameter, "deg/s") not in ("1", "1/s", "")
 
 
-def _values(reports: Sequence[AxisReport], signal: str) -> NDArray[np.float64]:
+def _values(reports: Sequence[AxisReport], signal: str) -> Array:
     return np.array([report.value(signal) for report in reports])
 
 

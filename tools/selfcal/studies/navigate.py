@@ -11,10 +11,11 @@ import numpy as np
 from scipy import optimize
 from scipy.special import exprel
 
+from selfcal.base.grid import Array
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.batch.spread import Row
 from selfcal.model.file import Model
-from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N, SHEET_STABILITY, SHEET_TIME_S
 from selfcal.model.tables import make_tables
 from selfcal.studies.navigation import GPS_S, OUTAGE_S, REST_S, SCALE, FilterNoise, Filters, Part, nees, true_noise
 
@@ -63,7 +64,7 @@ def sheet_noise(factor: float = 1.0) -> list[Mapping[str, float]]:
     ]
 
 
-def identified_noise(rest: Floats) -> list[Mapping[str, float]]:
+def identified_noise(rest: Array) -> list[Mapping[str, float]]:
     """By AXES: the noise of a rest [REST_S, axes] in their units, with the spread of its posterior.
 
     N has the mean square of all laws. Where the constant is the most probable law, there is no drift. Else the drift

@@ -24,6 +24,7 @@ from selfcal.bank.blocks import blocks_of
 from selfcal.bank.library import Bank
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis import words
 from selfcal.diagnosis.carried import BankTerm, term_of, why_stays, with_terms
 from selfcal.diagnosis.finding import Diagnosed
@@ -31,7 +32,7 @@ from selfcal.diagnosis.record import Record
 from selfcal.logs.recording import Recording, as_float, bridged
 from selfcal.model.file import Model
 from selfcal.model.regressors import columns_of, mask_of, offered
-from selfcal.model.simulated_parts import AXES, SHEET_N, Floats
+from selfcal.model.simulated_parts import AXES, SHEET_N
 from selfcal.model.tables import make_tables
 from selfcal.readings.readings import look
 from selfcal.studies.navigate import bank_noise
@@ -69,7 +70,7 @@ class KnownAxis:
     in the same unit."""
 
     noise: Mapping[str, float]
-    errors: Floats
+    errors: Array
 
 
 def add_outages(
@@ -165,7 +166,7 @@ def _known(
     )
 
 
-def _readings(own: Model, name: str, recording: Recording) -> tuple[Floats, Floats, Recording]:
+def _readings(own: Model, name: str, recording: Recording) -> tuple[Array, Array, Recording]:
     """Readings [n] of an axis less their median, the columns [n, p] about their references, and the recording."""
     seen = look(recording.along(name), name, own.group_of(name))
     if seen.recording.rate_hz < 1.0:
@@ -183,8 +184,8 @@ def _readings(own: Model, name: str, recording: Recording) -> tuple[Floats, Floa
 
 
 def _learned(
-    own: Model, name: str, recording: Recording, values: Floats, columns: Floats, upto: int
-) -> tuple[Mapping[str, float], Floats]:
+    own: Model, name: str, recording: Recording, values: Array, columns: Array, upto: int
+) -> tuple[Mapping[str, float], Array]:
     """Noise of an axis and its coefficients [p], by the bank after the first `upto` readings."""
     regressors = offered(own, name)
     tables = make_tables(replace(own, regressors=regressors), recording.rate_hz, (name,), bank_rate_hz=1.0)
@@ -231,7 +232,7 @@ def flights(known: Mapping[str, KnownAxis]) -> dict[str, dict[str, Any]]:
     return by_outage
 
 
-def _white(seconds: int) -> dict[str, Floats]:
+def _white(seconds: int) -> dict[str, Array]:
     """White noise [s] of each of AXES, the same at every call."""
     random = np.random.default_rng(0)
     return {name: random.standard_normal(seconds) for name in AXES}

@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.table import Table
 
 from selfcal.adequacy.identify import chosen_axes
@@ -26,7 +25,7 @@ from selfcal.bank.blocks import MOST_DENSE
 from selfcal.bank.priors import for_record
 from selfcal.base import units
 from selfcal.base.errors import UserError, first_line, note, printable
-from selfcal.base.grid import runs
+from selfcal.base.grid import Array, runs
 from selfcal.base.output import console_of, print_line, table_of
 from selfcal.base.progress import bar
 from selfcal.batch.spread import record_seeds, spread, workers
@@ -153,7 +152,7 @@ def problem_of(recording: Recording, name: str, model: Model, decimate: float | 
     return Problem(y, dt_s, alone, laws), int(np.isfinite(mean).sum()) - y.size
 
 
-def longest_stretch(mean: NDArray[np.float64]) -> NDArray[np.float64]:
+def longest_stretch(mean: Array) -> Array:
     """The longest run of finite values."""
     start, end = max(runs(np.isfinite(mean)), key=lambda run: run[1] - run[0])
     return mean[start:end]

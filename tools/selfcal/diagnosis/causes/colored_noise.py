@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.causes import quantization_noise
 from selfcal.diagnosis.finding import Finding
@@ -17,7 +18,6 @@ from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit, best
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, net, normal_entry
-from selfcal.likelihood.statemodel import Array
 from selfcal.model.file import Model
 from selfcal.model.laws import RATIO_LIMITS
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis import channel_looks, hidden
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Simulated, Written, shown, sized
 from selfcal.diagnosis.channel_looks import Channel, form_of
@@ -18,7 +19,6 @@ from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.joint import SIZE_WIDTHS, act_apart
 from selfcal.likelihood.state import ALIKE, EVIDENT, NET_LEAST, Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.model.forms import formed
 from selfcal.model.regressors import coefficient_unit

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from selfcal._reference import Random
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, count_key, medians, positive
 from selfcal.likelihood.state import Look
-from selfcal.likelihood.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis import swing
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Key, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes import periodic
@@ -22,7 +23,7 @@ from selfcal.diagnosis.statistics import states_of
 from selfcal.diagnosis.swing import Swing
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import ALIKE, Look, State, net, of_parameter
-from selfcal.likelihood.statemodel import PERIOD_LIMITS, Array, Matrices
+from selfcal.likelihood.statemodel import PERIOD_LIMITS, Matrices
 from selfcal.model.file import Model
 from selfcal.model.laws import DAMPING_LIMITS, RATIO_LIMITS
 from selfcal.model.laws import swing as turned

@@ -7,12 +7,12 @@ from dataclasses import replace
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Extension, Grouping, Key, Scored, Simulated, Written, shown
 from selfcal.diagnosis.model_tree import add_handling
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import NET_LEAST, Look, State, net, normal_entry
-from selfcal.likelihood.statemodel import Array
 
 #: ln of the number of looks, by 1350 clean records at 1 and 10 Hz. The two numbers of a mixture are at their limits in
 #: most of them: 5 instead of 1350 / e gained 2.5 nats.

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.fft import next_fast_len, rfft
 
+from selfcal.base.grid import Array, Mask
 from selfcal.diagnosis import swing
 from selfcal.diagnosis.cause import Cause, Grouping, Key, Scored, Simulated, Written
 from selfcal.diagnosis.finding import Diagnosed
@@ -18,7 +19,6 @@ from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Shape
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import ALIKE, FittedColumn, Look, State, net, normal_entry
-from selfcal.likelihood.statemodel import Array, Mask
 
 #: Fewer turns in a record than this are drift.
 TURNS_LEAST = 1.5

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, positive, shown
 from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.record import Record
@@ -21,7 +22,6 @@ from selfcal.likelihood.columns import SMALLER
 from selfcal.likelihood.edges import EDGE, EDGES_APART, Scan, edge, raised, scan
 from selfcal.likelihood.fit import Fit, moved, run
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array
 
 #: Places of a step among which pairs are looked for, of blocks.
 PAIR_PLACES = 96

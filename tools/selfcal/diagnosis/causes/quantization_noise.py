@@ -16,12 +16,13 @@ from typing import Any
 import numpy as np
 
 from selfcal.base import units
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Extension, Grouping, Simulated, Written, positive, shown
 from selfcal.diagnosis.model_tree import add_law, digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.fit import Fit
 from selfcal.likelihood.state import NET_LEAST, Look, State, net, normal_entry
-from selfcal.likelihood.statemodel import Array, Terms
+from selfcal.likelihood.statemodel import Terms
 from selfcal.model.laws import RATIO_LIMITS
 
 #: The prior of the spectral ratio reaches so many times either way about the recording's, and never above 1.

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft
 
+from selfcal.base.grid import Array, Rows
 from selfcal.diagnosis.cause import Cause, Grouping, Scored, shown
 from selfcal.diagnosis.causes.cross_axis import leaks, without_axis
 from selfcal.diagnosis.finding import Diagnosed, Finding
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_EITHER
 from selfcal.likelihood.state import ALIKE, NET_LEAST, Look, State, gain_for, net, normal_entry
-from selfcal.likelihood.statemodel import Array
 
 #: Bands are thirds of an octave, of so many bins of the spectrum at least.
 OCTAVE_PARTS, BINS_LEAST = 3, 16
@@ -84,7 +84,7 @@ class Pair:
         return np.sqrt(np.maximum(total, 1e-300) / np.maximum(count, 1.0))
 
     @cached_property
-    def edges(self) -> NDArray[np.int64]:
+    def edges(self) -> Rows:
         """First bins of the bands, from the slowest to the fastest, and the end of the last."""
         edges = [self.u.size // 2 + 1]
         while edges[-1] > BINS_LEAST:

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from selfcal._reference import Random
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Grouping, Scored, Simulated, count_key
-from selfcal.likelihood.statemodel import Array
 
 
 def _spoil(row: Array, keys: Mapping[str, Any], rate_hz: float, lsb: float, random: Random) -> None:

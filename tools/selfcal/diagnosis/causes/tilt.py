@@ -14,12 +14,12 @@ import numpy as np
 
 from selfcal.base import units
 from selfcal.base.errors import UserError
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, shown
 from selfcal.diagnosis.causes import step
 from selfcal.diagnosis.finding import Diagnosed
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.state import NET_LEAST, Look, State, normal_entry
-from selfcal.likelihood.statemodel import Array
 
 #: Share by which the specific force at rest may differ from standard gravity.
 GRAVITY_SHARE_MOST = 0.1

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, Written, medians, positive, shown
 from selfcal.diagnosis.model_tree import digits
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood import columns
 from selfcal.likelihood.columns import LN_SLOW, Number, Shape
 from selfcal.likelihood.state import NET_LEAST, FittedColumn, Look, State, log_normal
-from selfcal.likelihood.statemodel import Array
 
 #: The fastest time constant looked for, samples.
 FASTEST = 5.0

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaincinv
 
+from selfcal.base.grid import Array, Mask
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Scored, Simulated, positive, shown
 from selfcal.diagnosis.causes import flicker, variance_change, vibration
 from selfcal.diagnosis.record import Record
 from selfcal.likelihood.columns import LN_SLOW, SMALLER, top
 from selfcal.likelihood.edges import scan, steady
 from selfcal.likelihood.state import NET_LEAST, NONE, SCREEN, Look, State, mixture, net
-from selfcal.likelihood.statemodel import Array, Mask
 
 #: Tried first: amplitudes over the white noise of a block, dwell times in blocks.
 AMPLITUDES = (0.5, 0.75, 1.1, 1.6, 2.4, 3.6)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import uniform_filter1d
 
-from selfcal.base.grid import Rows
+from selfcal.base.grid import Array, Rows
 from selfcal.diagnosis.cause import (
     Cause,
     Extension,
@@ -38,7 +38,6 @@ from selfcal.likelihood.columns import LN_EITHER, LN_SLOW, NEARLY
 from selfcal.likelihood.edges import WEIGHT_LEAST, raised
 from selfcal.likelihood.fit import run
 from selfcal.likelihood.state import NET_LEAST, Look, State, gain_for, ln_looks, mixture, net, normal_entry
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import SIDE_CHANNELS
 from selfcal.readings.moves import LEVEL
 

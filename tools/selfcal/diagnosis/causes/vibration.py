@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.diagnosis import channel_looks
 from selfcal.diagnosis.cause import Cause, Channels, Grouping, Key, Simulated, Written, shown
 from selfcal.diagnosis.channel_looks import Channel
 from selfcal.diagnosis.record import Record, smoothed
 from selfcal.likelihood.columns import LN_SLOW
 from selfcal.likelihood.state import Look, State
-from selfcal.likelihood.statemodel import Array
 from selfcal.logs.recording import bridged
 from selfcal.model.forms import variance_of
 

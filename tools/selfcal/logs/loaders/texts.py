@@ -13,7 +13,7 @@ from typing import BinaryIO, NoReturn, cast
 from selfcal.base.errors import UserError, printable, short_value
 from selfcal.base.limits import MOST_COLUMNS, MOST_META_BYTES, read_text, reading
 from selfcal.logs.loaders import TEXT, ZIP
-from selfcal.logs.loaders.table import Field, Rows, Table, meta_place, parse_meta
+from selfcal.logs.loaders.table import Field, Table, TableRows, meta_place, parse_meta
 from selfcal.logs.loaders.text_table import Opened, TextReader
 
 #: Where an app writes a sensor twice, the one to read comes first: what the part measured, before an estimate of it.
@@ -50,7 +50,7 @@ class TextTable(Table):
     skip_bad: bool
     only: tuple[str, str] | None
 
-    def rows(self, path: Path, fields: Sequence[Field]) -> Rows:
+    def rows(self, path: Path, fields: Sequence[Field]) -> TableRows:
         path = self.text.path
         meta = dict(self.meta)
         with ExitStack() as files:
@@ -81,7 +81,7 @@ class TextTable(Table):
             reader.fail(row, None if number is None else fields[number].name, what)
 
         notes = (skipped,) if reader.skipped else ()
-        return Rows(path, fields, columns, fail, meta, reader.origin_s, reader.places, notes, reader.damaged)
+        return TableRows(path, fields, columns, fail, meta, reader.origin_s, reader.places, notes, reader.damaged)
 
 
 def read(path: Path, knows: Callable[[Text], Knows], skip_bad: bool) -> list[Table]:

@@ -13,8 +13,9 @@ import math
 
 import numpy as np
 
+from selfcal.base.grid import Array
 from selfcal.model.laws import NAMED
-from selfcal.studies.methods.problem import FIRST_LEVEL_SD, Answer, Floats, Problem, Value, ln_moments, logarithmic
+from selfcal.studies.methods.problem import FIRST_LEVEL_SD, Answer, Problem, Value, ln_moments, logarithmic
 from selfcal.studies.methods.recursive import FORGET, KEEP
 
 #: The parameters stay within this many sd of the prior's mean: a poor first step leads no further.
@@ -64,7 +65,7 @@ def _run(problem: Problem, law: str) -> dict[str, Value]:
     return logarithmic(names, ln, covariance)
 
 
-def transition(law: str, ln: Floats, dt: float) -> tuple[Floats, Floats, Floats, Floats, float, Floats]:
+def transition(law: str, ln: Array, dt: float) -> tuple[Array, Array, Array, Array, float, Array]:
     """F (diagonal, so its own transpose), Q and R of level and drift, each followed by its derivatives in ln theta."""
     d = ln.size
     F, dF, Q, dQ, dR = np.eye(2), np.zeros((d, 2, 2)), np.zeros((2, 2)), np.zeros((d, 2, 2)), np.zeros(d)

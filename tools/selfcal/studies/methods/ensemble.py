@@ -9,14 +9,14 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from selfcal.adequacy.drawn import draw_parameters, simulate_bank_samples
+from selfcal.base.grid import Array, Mask
 from selfcal.batch.spread import Row
 from selfcal.model.file import Group, Model, Prior
 from selfcal.model.laws import NAMED
 from selfcal.studies.methods import Rival
-from selfcal.studies.methods.problem import Answer, Floats, Problem
+from selfcal.studies.methods.problem import Answer, Problem
 
 #: The method that errors are compared with.
 REFERENCE = "ml"
@@ -96,7 +96,7 @@ def _criteria(rows: Sequence[Row]) -> list[str]:
     return sorted({key.split(".")[1] for key in stated if key.startswith("weight.")})
 
 
-def _column(rows: Sequence[Row], key: str) -> Floats:
+def _column(rows: Sequence[Row], key: str) -> Array:
     return np.array([math.nan if row.get(key) is None else row[key] for row in rows], dtype=float)
 
 
@@ -126,15 +126,15 @@ def _errors(mine: Sequence[Row], reference: Sequence[Row] | None, name: str, pri
     return entry
 
 
-def _ln_clipped(value: Floats, prior: Prior) -> Floats:
+def _ln_clipped(value: Array, prior: Prior) -> Array:
     return np.log(np.clip(value, prior.min, prior.max))
 
 
-def _rms(error: Floats) -> float:
+def _rms(error: Array) -> float:
     return math.sqrt(float((error**2).mean())) if error.size else math.nan
 
 
-def _ratio(ours: Floats, theirs: Floats) -> tuple[float, float, float]:
+def _ratio(ours: Array, theirs: Array) -> tuple[float, float, float]:
     """Ratio of two rms errors of the same records, with 2.5 % and 97.5 % of a bootstrap that resamples the records."""
     if not ours.size or not theirs.any():
         return math.nan, math.nan, math.nan
@@ -150,7 +150,7 @@ def _choice(rows: Sequence[Row], criterion: str, law: str) -> dict[str, float]:
     weight = np.array([_column(rows, f"weight.{criterion}.{weighed}") for weighed in laws])
     true = weight[laws.index(law)]
     score = np.log(np.maximum(np.nan_to_num(true), LEAST_WEIGHT))
-    hit: NDArray[np.bool_] = true >= np.nan_to_num(weight).max(axis=0)
+    hit: Mask = true >= np.nan_to_num(weight).max(axis=0)
     return {
         "hit_rate": float(hit.mean()),
         "log_score": float(score.mean()),
