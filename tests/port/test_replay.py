@@ -26,7 +26,7 @@ from selfcal.logs import recording as recording_module
 from selfcal.logs.recording import Recording, load
 from selfcal.model.file import Model
 from selfcal.model.tables import make_tables
-from selfcal.show import plot as plot_module
+from selfcal.show import run_plot as plot_module
 from selfcal.verbs.identify import identify
 from selfcal.verbs.replay import replay
 from selfcal.wire.replay import build, run_firmware, write_rows

@@ -9,7 +9,7 @@ import pytest
 from matplotlib import pyplot
 
 from selfcal.model.file import Model
-from selfcal.show.plot import plot_run
+from selfcal.show.run_plot import plot_run
 from selfcal.wire.dbc_file import BY_PLACE, Names
 from selfcal.wire.frames import AxisReport, wire_names
 

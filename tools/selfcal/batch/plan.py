@@ -17,7 +17,6 @@ import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -30,7 +29,7 @@ from selfcal.bank.axis_result import HALF_90
 from selfcal.base import units
 from selfcal.base.errors import UserError, short
 from selfcal.base.grid import Array, bisected
-from selfcal.base.output import plotter, print_lines, save_picture
+from selfcal.base.output import print_lines
 from selfcal.base.units import duration_words
 from selfcal.batch.spread import Row, spread
 from selfcal.diagnosis.separate import SHARE
@@ -40,7 +39,6 @@ from selfcal.model.forms import made
 from selfcal.model.laws import PLACES, Law
 from selfcal.model.regressors import channels_of, column_sources, offered
 from selfcal.model.tables import make_tables
-from selfcal.show.plot import COLORS
 
 SCHEMA = "selfcal.plan/1"
 #: Bank samples of the shortest record, and of the longest.
@@ -325,31 +323,6 @@ def _half_interval(law: Law, truth: Mapping[str, float], parameter: str, rate_hz
         return math.inf
     variance = float(covariance[law.parameters.index(parameter), law.parameters.index(parameter)])
     return HALF_90 * math.sqrt(variance) if variance > 0.0 else math.inf
-
-
-def picture(document: Mapping[str, Any], path: Path | str) -> None:
-    """Draw the metrics over the length: median and middle four fifths of the records, and the wish."""
-    wishes = [wish for wish in document["wishes"] if wish["curve"]]
-    size = (7.0, 2.9 * len(wishes))
-    figure, panels = plotter().subplots(len(wishes), 1, figsize=size, squeeze=False, sharex=True)
-    for panel, wish, color in zip(panels[:, 0], wishes, COLORS * len(wishes), strict=False):
-        hours = np.array([point["duration_s"] for point in wish["curve"]]) / 3600.0
-        q10, q50, q90 = (np.maximum([point[key] for point in wish["curve"]], 1e-6) for key in ("q10", "q50", "q90"))
-        panel.fill_between(hours, q10, q90, color=color, alpha=0.25, linewidth=0.0, label="four records of five")
-        panel.plot(hours, q50, color=color, label="median")
-        panel.axhline(wish["most"], color="black", linewidth=1.0, linestyle="--", label="wanted")
-        if wish["duration_s"] is not None:
-            panel.axvline(wish["duration_s"] / 3600.0, color="black", linewidth=1.0, linestyle=":", label="planned")
-        panel.set_xscale("log")
-        panel.set_yscale("log")
-        law = wish["wish"].startswith("law")
-        panel.set_ylabel("1 - P of the true law" if law else "half the 90 % interval")
-        panel.set_title(wish["wish"], loc="left", fontweight="bold")
-        panel.grid(True, which="major", alpha=0.3)
-        panel.legend(fontsize="x-small")
-    panels[-1, 0].set_xlabel("length of the recording, h")
-    figure.tight_layout()
-    save_picture(figure, path, dpi=110)
 
 
 def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:

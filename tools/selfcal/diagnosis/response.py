@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from selfcal.base import units
-from selfcal.base.errors import UserError, printable
+from selfcal.base.errors import UserError
 from selfcal.base.grid import Array
-from selfcal.base.output import console_of, plotter, print_line, save_picture, table_of
+from selfcal.base.output import console_of, print_line, table_of
 from selfcal.diagnosis import transfer
 from selfcal.diagnosis.estimators import methods_beside
 from selfcal.diagnosis.record import Record
@@ -426,48 +425,3 @@ def show(document: Mapping[str, Any], *, to_stderr: bool = False) -> None:
         line(f"ratio of spectra: {spectra['hold_answer']} of {spectra['bands']} coherent bands hold the answer")
     else:
         line("ratio of spectra: no band is coherent beyond chance")
-
-
-def plot_response(document: Mapping[str, Any], path: Path | str) -> None:
-    """Save gain, phase and coherence over frequency. Raises UserError if the file cannot be written."""
-    figure, (gain, phase, coherence) = plotter().subplots(
-        3, 1, figsize=(8.0, 8.6), sharex=True, layout="constrained", height_ratios=(3, 3, 2)
-    )
-    column, axis = document["input"], document["output"]
-    found = document["structure"] if "estimate" in document else "no structure"
-    found = found if document["influence"] else "no influence"
-    figure.suptitle(
-        f"{printable(Path(document['recording']['path']).name)}: {column['column']} -> {axis['axis']}, {found}\n"
-        f"source: {document['source']['verdict']}",
-        parse_math=False,
-    )
-    seen = {key: np.array(values) for key, values in document["empirical"].items()}
-    clear = seen["coherence"] > seen["coherence_by_chance"]
-    for panel, key in ((gain, "gain"), (phase, "phase_deg")):
-        for which, color, label in ((clear, "black", "ratio of spectra, 90 %"), (~clear, "0.75", "... by chance")):
-            error = [seen[key] - seen[f"{key}_q05"], seen[f"{key}_q95"] - seen[key]]
-            shown = [np.where(which, values, np.nan) for values in (seen[key], *error)]
-            panel.errorbar(
-                seen["frequency_hz"], shown[0], shown[1:], color=color, marker="o", markersize=3.5, linestyle="",
-                elinewidth=1, label=label,
-            )  # fmt: skip
-        if band := document.get("frequency_response"):
-            at = band["frequency_hz"]
-            panel.fill_between(at, band[f"{key}_q05"], band[f"{key}_q95"], color="tab:blue", alpha=0.3, linewidth=0)
-            panel.plot(at, band[key], color="tab:blue", label=f"{document['structure']}, 90 %")
-        panel.grid(True, alpha=0.3)
-    gain.set_xscale("log")
-    gain.set_yscale("log")
-    if clear.any():
-        gain.set_ylim(bottom=0.2 * float(seen["gain"][clear].min()))
-    gain.set_ylabel(f"gain, {units.typeset(coefficient_unit(axis['unit'], column['unit']))}")
-    gain.legend(fontsize="small", frameon=False)
-    phase.set_ylabel("phase, degrees")
-    coherence.plot(seen["frequency_hz"], seen["coherence"], color="black", marker="o", markersize=3.5)
-    coherence.plot(seen["frequency_hz"], seen["coherence_by_chance"], color="0.6", linestyle="--", label="by chance")
-    coherence.set_ylim(0.0, 1.02)
-    coherence.set_ylabel("coherence")
-    coherence.set_xlabel("frequency, Hz")
-    coherence.legend(fontsize="small", frameon=False)
-    coherence.grid(True, alpha=0.3)
-    save_picture(figure, path, dpi=110)

@@ -235,8 +235,9 @@ class Identification(Document):
     def plot(self, path: Path | str | None = None, *, datasheet: bool = False) -> Picture | None:
         """The Allan deviation of each axis with the model's, as `identify --plot` has it: a picture, which a notebook
         shows, or the file `path`. `datasheet`: in the units of data sheets. Raises UserError."""
-        from selfcal.base.output import check_picture, png_of
+        from selfcal.base.output import check_picture
         from selfcal.show.allan_plot import figure_of, plot_allan
+        from selfcal.show.plots import png_of
 
         if path is None:
             return Picture(png_of(figure_of(self, datasheet=datasheet), dpi=90))

@@ -60,7 +60,7 @@ def monitor(
     from selfcal.base.ending import hold_signals
     from selfcal.base.output import check_picture, check_writable, print_line, write_json
     from selfcal.logs.framelog import FrameLog, check_suffix
-    from selfcal.show.plot import plot_run
+    from selfcal.show.run_plot import plot_run
     from selfcal.wire.dbc_file import check_node
     from selfcal.wire.frame_writer import FrameWriter
     from selfcal.wire.frames import Streams, axis_unit, open_bus, serial_ports

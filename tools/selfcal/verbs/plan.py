@@ -77,7 +77,7 @@ def plan(
     longest `duration_s`, and `rates` with the lengths that other rates would take.
     """
     from selfcal.base.output import check_picture, check_writable, write_json
-    from selfcal.batch.plan import SCHEMA, PlannedRecords, Wish, cycling, picture, rates, refusal
+    from selfcal.batch.plan import SCHEMA, PlannedRecords, Wish, cycling, rates, refusal
     from selfcal.batch.spread import record_seeds
     from selfcal.diagnosis.separate import SHARE
     from selfcal.logs.recording import list_of
@@ -148,7 +148,9 @@ def plan(
     }
     write_json(document, json)
     if plot is not None:
-        picture(document, plot)
+        from selfcal.show.plots import plot_plan
+
+        plot_plan(document, plot)
     return document
 
 

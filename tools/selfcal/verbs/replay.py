@@ -54,8 +54,8 @@ def replay(
     from selfcal.model.file import Model
     from selfcal.model.regressors import from_time
     from selfcal.readings.gate import gate_of_recording as gate_of
-    from selfcal.show.plot import plot_run
     from selfcal.show.results import Identification
+    from selfcal.show.run_plot import plot_run
     from selfcal.wire.frames import wire_names
     from selfcal.wire.on_wire import places, sent
     from selfcal.wire.replay import LONGEST_PERIOD_S, TARGETS, build, run_firmware, wire_document

@@ -48,7 +48,6 @@ def response(
         SCHEMA,
         answers_of,
         inputs_of,
-        plot_response,
     )
     from selfcal.logs.recording import check_column, list_of, load
     from selfcal.model.file import Model
@@ -104,6 +103,8 @@ def response(
         **(parts[0] if len(parts) == 1 else {"inputs": parts}),
     }
     if plot is not None:
+        from selfcal.show.plots import plot_response
+
         plot_response(document, plot)
     write_json(document, json)
     return document

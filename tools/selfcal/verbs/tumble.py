@@ -57,7 +57,6 @@ def tumble(
     from selfcal.calibration.tumble_document import tumble_document
     from selfcal.calibration.tumble_export import FORMS, write_calibration
     from selfcal.calibration.tumble_rests import RESTS_MOST, tumble_of
-    from selfcal.calibration.tumble_show import plot as picture
     from selfcal.logs.recording import list_of, load
     from selfcal.model.file import Model
 
@@ -86,7 +85,9 @@ def tumble(
     for form, file in ((("yaml", output),) if output is not None else ()) + ((export,) if export is not None else ()):
         write_calibration(form, file, accel, gyro, document)
     if plot is not None:
-        picture(document, plot)
+        from selfcal.show.plots import plot_tumble
+
+        plot_tumble(document, plot)
     write_json(document, json)
     return document
 

@@ -12,14 +12,12 @@ import numpy as np
 from selfcal.bank.axis_result import LAW_LEAST
 from selfcal.base.errors import printable
 from selfcal.base.grid import Array
-from selfcal.base.output import plotter, save_picture
 from selfcal.base.units import factor, known, parameter_unit, same_kind, typeset
 from selfcal.model.file import LARGEST
+from selfcal.show.plots import COLORS, plotter, save_picture
 from selfcal.wire.dbc_file import BY_PLACE, PLACE_NAMES, Names
 from selfcal.wire.frames import AxisReport, axis_unit
 
-#: Colours of the hypotheses, in the model's order.
-COLORS = ("tab:green", "tab:blue", "tab:red", "tab:purple", "tab:orange", "tab:olive", "tab:brown", "tab:cyan")
 #: Share of first reports that set no scale: their intervals are the prior's.
 UNSCALED_SHARE = 0.2
 
