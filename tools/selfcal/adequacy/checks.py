@@ -88,12 +88,7 @@ def drift_check(tables: Tables, group: Group, result: AxisResult) -> dict[str, d
 
 
 def with_rate(
-    judged: Judged,
-    values: Array,
-    missing_before: Rows,
-    step: float,
-    tables: Tables,
-    result: AxisResult,
+    judged: Judged, values: Array, missing_before: Rows, step: float, tables: Tables, result: AxisResult
 ) -> Judged:
     """The same with the rates of a `drift_in_average` that failed: `bank_hz`, and `decimate_hz` of averages that show
     the white noise.

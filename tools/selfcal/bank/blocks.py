@@ -99,11 +99,7 @@ def kept_out(samples: NDArray[np.floating[Any]], group: Group) -> dict[str, Mask
 
 
 def blocks_of(
-    samples: NDArray[np.floating[Any]],
-    missing_before: Rows,
-    block: int,
-    group: Group,
-    columns: Array | None = None,
+    samples: NDArray[np.floating[Any]], missing_before: Rows, block: int, group: Group, columns: Array | None = None
 ) -> Blocks:
     """Average `samples` [n] in blocks on the even grid of sample instants; saturated and stuck samples are kept out.
     `columns` [n, p] of the regressors are averaged over the same samples."""

@@ -23,10 +23,7 @@ MOST_LINES, OPEN_LINES, MOST_ROWS, MOST_PICTURES = 150, 15, 100, 48
 KINDS = {
     "failed": ("Beyond a limit: set these aside", "beyond a limit, or with the cause asked for"),
     "unlike": ("Unlike the batch: look at these first", "unlike the batch"),
-    "drifting": (
-        "Drifting from recording to recording: measure these again, calibrate them more often",
-        "drifting",
-    ),
+    "drifting": ("Drifting from recording to recording: measure these again, calibrate them more often", "drifting"),
     "not_judged": ("Not judged: record these again, or longer", "not judged"),
 }
 #: Limits of a chart of individuals and of a chart of moving ranges (n = 2), over the mean moving range.

@@ -58,12 +58,7 @@ def gains(
 
 
 def _of_axis(
-    model: Model,
-    tree: Mapping[str, Any],
-    record: Record,
-    found: Mapping[str, Diagnosed],
-    name: str,
-    second: Recording,
+    model: Model, tree: Mapping[str, Any], record: Record, found: Mapping[str, Diagnosed], name: str, second: Recording
 ) -> tuple[list[HeldOut], HeldOut]:
     findings = found[name].by_gain
     if name not in second.columns:

@@ -108,10 +108,7 @@ def entry_of(
     """The finding of all axes for the document."""
     units = {name: recording.columns[name].unit for name in shared.names}
     record = next(axis.record for axis in found.values() if axis.hidden is shared)
-    states = {
-        **record.axes,
-        **{name: axis.state for name, axis in found.items() if axis.hidden is shared},
-    }
+    states = {**record.axes, **{name: axis.state for name, axis in found.items() if axis.hidden is shared}}
     return hidden.entry(shared, states, units, record.start_s, stated=model.hidden_input is not None)
 
 

@@ -427,11 +427,7 @@ def _refuted(look: Look, held_out: HeldOut | None) -> bool:
 
 
 def _looked(
-    axis: Diagnosed,
-    record: Record,
-    causes: Sequence[Looks],
-    worth: dict[Looks, float],
-    seen: dict[Looks, list[Look]],
+    axis: Diagnosed, record: Record, causes: Sequence[Looks], worth: dict[Looks, float], seen: dict[Looks, list[Look]]
 ) -> list[Look]:
     """The looks of `causes`, the most worth first; what has no name comes after every cause that has one. `seen` are
     those at this state. A cause waits while its `worth`, when it was last looked at, is less than the best has now."""

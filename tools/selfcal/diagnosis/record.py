@@ -22,16 +22,7 @@ from selfcal.model.file import Regressor as Stated
 from selfcal.model.forms import variance_of
 from selfcal.model.regressors import columns_of, offered
 from selfcal.readings.held import Held
-from selfcal.readings.readings import (
-    Readings,
-    copied,
-    evened,
-    look,
-    mostly_beyond,
-    own_rows,
-    readings_of,
-    thinned,
-)
+from selfcal.readings.readings import Readings, copied, evened, look, mostly_beyond, own_rows, readings_of, thinned
 
 #: Samples that a diagnosis needs at least.
 FEWEST = 200

@@ -103,11 +103,7 @@ class Recording:
     def clock(self) -> Clock:
         """The clock of all columns that have none of their own."""
         return Clock(
-            self.rate_hz,
-            self.missing_before,
-            self.off_grid_s,
-            moving_before=self.moving_before,
-            moving=self.moving,
+            self.rate_hz, self.missing_before, self.off_grid_s, moving_before=self.moving_before, moving=self.moving
         )
 
     @property

@@ -148,8 +148,6 @@ def plot_tumble(document: Mapping[str, Any], path: Path | str) -> None:
     axes.set_xlabel("side that is up, rest by rest")
     axes.set_ylabel("|f| - g, ug")
     axes.set_title(
-        f"{name_of(document['recordings'][0])}: residuals, bars hold 90 % of the noise",
-        fontsize=10,
-        parse_math=False,
+        f"{name_of(document['recordings'][0])}: residuals, bars hold 90 % of the noise", fontsize=10, parse_math=False
     )
     save_picture(figure, path, 150)

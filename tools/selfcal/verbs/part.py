@@ -29,8 +29,7 @@ def part(
         Sequence[str], option("Number of its data sheet, or gx.N=... (repeat for more)", metavar="N=0.012deg/sqrt(h)")
     ] = (),
     axes: Annotated[
-        Sequence[str],
-        option("Column that is an axis, beside gx to az (repeat for more)", "--axis", metavar="NAME"),
+        Sequence[str], option("Column that is an axis, beside gx to az (repeat for more)", "--axis", metavar="NAME")
     ] = (),
     **reading: Unpack[Reading],
 ) -> Model:

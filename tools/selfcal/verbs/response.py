@@ -41,14 +41,7 @@ def response(
     from selfcal.base.output import check_picture, check_writable, write_json
     from selfcal.diagnosis.diagnose import BELOW_LATTICE
     from selfcal.diagnosis.record import record_from
-    from selfcal.diagnosis.response import (
-        LINES,
-        REFUSED_FROM,
-        SAMPLES_MOST,
-        SCHEMA,
-        answers_of,
-        inputs_of,
-    )
+    from selfcal.diagnosis.response import LINES, REFUSED_FROM, SAMPLES_MOST, SCHEMA, answers_of, inputs_of
     from selfcal.logs.recording import check_column, list_of, load
     from selfcal.model.file import Model
     from selfcal.readings.gate import gated

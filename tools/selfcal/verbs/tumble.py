@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 
 
 def tumble(
-    logs: Annotated[
-        Data,
-        argument(f"One log with turns, or a log a position: {READ}", "LOG...", kind=list[Path]),
-    ],
+    logs: Annotated[Data, argument(f"One log with turns, or a log a position: {READ}", "LOG...", kind=list[Path])],
     *,
     model: ModelFile = None,
     latitude: Annotated[

@@ -432,11 +432,7 @@ def _watch(
 
 
 def wire_document(
-    recording: Recording,
-    model: Model,
-    history: Mapping[str, Sequence[AxisReport]],
-    why: Mapping[str, str],
-    gate: bool,
+    recording: Recording, model: Model, history: Mapping[str, Sequence[AxisReport]], why: Mapping[str, str], gate: bool
 ) -> dict[str, Any]:
     """The document `selfcal.identify/1` of what telemetry carried."""
     identified: dict[str, Identified | UserError] = {}

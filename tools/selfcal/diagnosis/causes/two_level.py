@@ -188,10 +188,7 @@ def _jumps(upper: Mask) -> int:
 def _stays(upper: Mask) -> list[tuple[float, float]]:
     """Blocks at the lower and at the upper level, and jumps away from each."""
     change = np.diff(upper.astype(int))
-    return [
-        (float((~upper).sum()), float((change > 0).sum())),
-        (float(upper.sum()), float((change < 0).sum())),
-    ]
+    return [(float((~upper).sum()), float((change > 0).sum())), (float(upper.sum()), float((change < 0).sum()))]
 
 
 def _dwell(time: float, count: float, dt: float) -> dict[str, Any]:

@@ -106,8 +106,7 @@ class Reading(TypedDict, total=False):
     no_time: Annotated[bool, option("Leave the time column out; takes --rate", "--no-time")]
     skip_bad: Annotated[bool, option("Skip lines of a text that are no rows, and count them", "--skip-bad")]
     sources: Annotated[
-        Sequence[str],
-        option("Sensor to read of a log that has several (repeat for more)", "--source", metavar="NAME"),
+        Sequence[str], option("Sensor to read of a log that has several (repeat for more)", "--source", metavar="NAME")
     ]
     dbc: Annotated[Path | str | None, option("Signals of a log of CAN frames", metavar="FILE.dbc")]
 

@@ -73,10 +73,7 @@ def chosen(path: object, parts: Sequence[Share], wanted: Sequence[str]) -> tuple
 
 
 def _by_rate(
-    path: object,
-    sources: dict[str, list[Share]],
-    axes: dict[str, frozenset[str]],
-    sensors: Sequence[str],
+    path: object, sources: dict[str, list[Share]], axes: dict[str, frozenset[str]], sensors: Sequence[str]
 ) -> tuple[list[str], list[str]]:
     """The sources to read, and those left out for their lower rates. Raises UserError."""
     if all(not axes[sensor] & axes[other] for k, sensor in enumerate(sensors) for other in sensors[:k]):

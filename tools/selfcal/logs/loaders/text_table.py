@@ -56,8 +56,7 @@ _NOT_FINITE = re.compile(r"[-+]?(nan|inf(inity)?)", re.ASCII | re.IGNORECASE)
 _MISSING = re.compile(r"(nan?|#?n/a|#nv|null|none|-+|\?)?", re.ASCII | re.IGNORECASE)
 #: A date with a time of day (ISO 8601), in quotes or not.
 _ISO = re.compile(
-    r"(?:\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?|\d{8}T\d{6}(?:[.,]\d+)?)(?:Z|[-+]\d\d:?\d\d)?",
-    re.ASCII,
+    r"(?:\d{4}-\d\d-\d\d[T ]\d\d:\d\d(?::\d\d(?:[.,]\d+)?)?|\d{8}T\d{6}(?:[.,]\d+)?)(?:Z|[-+]\d\d:?\d\d)?", re.ASCII
 )
 #: A date or a time of day in any form.
 _CLOCK = re.compile(r"(\d{1,4}[./-]\d{1,2}[./-]\d{1,4}|\d{1,2}:\d\d)\b.*", re.ASCII)

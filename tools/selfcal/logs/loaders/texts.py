@@ -17,10 +17,7 @@ from selfcal.logs.loaders.table import Field, Table, TableRows, meta_place, pars
 from selfcal.logs.loaders.text_table import Opened, TextReader
 
 #: Where an app writes a sensor twice, the one to read comes first: what the part measured, before an estimate of it.
-_BETTER = (
-    ("gyroscopeuncalibrated", "gyroscope"),
-    ("accelerometeruncalibrated", "totalacceleration", "accelerometer"),
-)
+_BETTER = (("gyroscopeuncalibrated", "gyroscope"), ("accelerometeruncalibrated", "totalacceleration", "accelerometer"))
 
 
 @dataclass(frozen=True)
