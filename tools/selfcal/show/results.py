@@ -344,7 +344,7 @@ class Diagnosis(Document):
     axes: dict[str, DiagnosedAxis]
     model: dict[str, Any]
     navigation: dict[str, Any] | None
-    _shown_by = "findings"
+    _shown_by = "diagnosis_lines"
 
     def _rows(self) -> Iterator[dict[str, Any]]:
         """Axis, cause, evidence and each number of its estimate, of what acts on all axes too; `value`: no number. Of
